@@ -1,4 +1,4 @@
-"""A distance field over the planes of a grid, a few at a time: what every way of baking is made of."""
+"""The baker of a distance field, a few planes at a time."""
 
 from collections.abc import Collection, Mapping
 from typing import TypeVar
@@ -38,11 +38,11 @@ T = TypeVar("T", bound=np.generic)
 
 
 class Baker:
-    """The channels of a field over splats at the cells of `layout`.
+    """Channels of a field over splats at the cells of `layout`.
 
-    Nothing depends on how the planes are cut or on the number of threads, to the bit. counts: ``se_without_value``,
-    the cells where a kernel field has no distance and the exact one stands in; ``se_over_estimates``, those where it
-    exceeds the exact one by more than `RESOLUTION`; the same of gpdf.
+    The cut into planes and the thread count change no bit. counts: ``se_without_value``, cells with exact distance
+    instead of the kernel's; ``se_over_estimates``, those where it exceeds the exact one by `RESOLUTION`; likewise
+    gpdf.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Baker:
         threads: int = 0,
         device: Memory | None = None,
     ) -> None:
-        """splats: those of the field; device: a card that computes instead of the processor, without masks.
+        """device: a card to use, without masks.
 
         Raises as `Spheres.of`; UsageError for unknown channels, or without sdf.
         """
@@ -82,16 +82,15 @@ class Baker:
         self.on_device = None if device is None else device_field(self.spheres, fields, config, device)
 
     def close(self) -> None:
-        """Give a card's memory back."""
+        """Free a card's memory."""
         if self.on_device is not None:
             self.on_device.close()
 
     @property
     def bound_margin(self) -> float:
-        """What `bound` stands below the exact distance at a cell's centre [m].
+        """Exact distance at a cell's centre minus `bound` [m].
 
-        Half a cell's diagonal (the exact distance changes by no more than one moves), and what float32 may lose: of
-        coordinates relative to the grid's middle, and of the distance.
+        Half a cell's diagonal (hard is 1-Lipschitz), plus float32 rounding.
         """
         box = self.layout.box
         reach = np.abs(self.spheres.points.clusters.centers[:, self.spheres.points.is_point.view(np.bool_)]).max()
@@ -108,19 +107,19 @@ class Baker:
         return shape if CHANNELS[channel][1] == 1 else (*shape, CHANNELS[channel][1])
 
     def bake(self, first: int, last: int, out: Planes, mask: UInt8 | None = None) -> None:
-        """Fill the channels `out` (last - first, Y, Z) of the x-planes [first, last), whole blocks of 8 cells.
+        """Fill `out` with x-planes [first, last), whole blocks of 8 cells.
 
-        mask (blocks of the grid) uint8: where it is zero, a block of `out` keeps what it has.
+        mask (blocks of the grid): zero where `out` keeps its values.
         """
         per_plane = 40 * self.layout.shape[1] * self.layout.shape[2]
-        step = BLOCK * max(1, (64 << 20) // (BLOCK * per_plane))  # bytes beside the channels
+        step = BLOCK * max(1, (64 << 20) // (BLOCK * per_plane))  # bytes besides the channels
         for begin in range(first, last, step):
             end = min(begin + step, last)
             part = {name: values[begin - first : end - first] for name, values in out.items()}
             self._bake_planes(begin, end, part, mask)
 
     def span(self, first: int, last: int, mask: UInt8 | None = None) -> GridSpan:
-        """The cells of the x-planes [first, last), in the frame of the spheres."""
+        """Cells of x-planes [first, last), in the spheres' frame."""
         origin = self.layout.origin - self.spheres.points.anchor
         return GridSpan(
             origin=origin, voxel=self.layout.voxel, shape=self.layout.shape, first=first, last=last, mask=mask
@@ -136,7 +135,6 @@ class Baker:
             out[name][... if where is None else where] = made[name]
 
     def _made(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
-        """The channels of the span's cells, those `where` alone (then in one row)."""
         cells = None if where is None else np.flatnonzero(where)
         made, entry = self._by_processor(span, cells) if self.on_device is None else self._by_device(span)
         if self.probability is not None:
@@ -151,7 +149,6 @@ class Baker:
         return made
 
     def _by_processor(self, span: GridSpan, cells: NDArray[np.int64] | None) -> _Made:
-        """The distances of the span's cells, or of some, and the entry of the nearest sphere where it is wanted."""
         exact, exact_gradient, entry = self._hard(span)
         hard = _picked(exact, cells)
         gradient = None if exact_gradient is None else _picked(exact_gradient, cells)
@@ -172,7 +169,6 @@ class Baker:
         return made, None if entry is None else _picked(entry, cells)
 
     def _by_device(self, span: GridSpan) -> _Made:
-        """As `_by_processor`, of whole spans."""
         assert self.on_device is not None
         wanted = {*self.channels, "entry"} if "label" in self.channels else set(self.channels)
         found = self.on_device.bake(span, wanted, margin=self.bound_margin)
@@ -204,7 +200,6 @@ class Baker:
     def _chosen(
         self, hard: Float32, gradient: Float32 | None, kernels: Mapping[str, tuple[Float32, Float32 | None]]
     ) -> tuple[Float32, Float32 | None]:
-        """The distance that the configuration names, and its gradient."""
         if self.kernel_name is None:
             return hard, gradient
         smooth, smooth_gradient = kernels[self.kernel_name]
@@ -216,12 +211,10 @@ class Baker:
 
 
 def _picked(values: NDArray[T], cells: NDArray[np.int64] | None) -> NDArray[T]:
-    """Values (X, Y, Z) or (X, Y, Z, 3) of all cells, or of some in one row."""
     return values if cells is None else values.reshape(-1, *values.shape[3:])[cells]
 
 
 def _cells(mask: UInt8, span: GridSpan) -> Bool:
-    """A mask of blocks as one of the span's cells."""
     blocks = mask[span.first // BLOCK : -(-span.last // BLOCK)].view(np.bool_)
     for axis in range(3):
         blocks = np.repeat(blocks, BLOCK, axis=axis)

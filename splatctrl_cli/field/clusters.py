@@ -1,6 +1,7 @@
-"""The splats of a field as spheres: checked, and clustered once, for every distance made of them.
+"""Splats of a field as spheres, checked and clustered once.
 
-Points are sorted along a space-filling curve into clusters of 16, those into groups of 16, a box around each."""
+A space-filling curve sorts points into clusters of 16, these into groups of 16, boxed.
+"""
 
 from dataclasses import dataclass
 
@@ -11,16 +12,16 @@ from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Offsets
 from splatctrl_cli.records import Box, Float32, Float64, UInt8
 
-_BITS = 10  # of each coordinate in a Hilbert code
+_BITS = 10  # per coordinate of a Hilbert code
 _GROUPS = 8  # their number is a multiple of this
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClusteredPoints:
-    """N points as C clusters, relative to an anchor near them (float32 keeps 0.1 um within a metre or two).
+    """N points as C clusters, relative to an anchor.
 
-    anchor (3,) float64 [m], world; source (16 C,) int64, the point behind each entry (0 where spare);
-    is_point (16 C,) uint8, 0 where spare.
+    float32 then keeps 0.1 um within a metre or two. anchor (3,) [m], world; source (16 C,): point of each entry;
+    is_point (16 C,): 0 if spare.
     """
 
     anchor: Float64
@@ -34,22 +35,22 @@ class ClusteredPoints:
         return int(np.count_nonzero(self.is_point))
 
     def relative(self, points_world: NDArray[np.floating]) -> Float32:
-        """Points (Q, 3), world -> (Q, 3) float32 relative to the anchor."""
+        """Return world points (Q, 3) relative to the anchor."""
         return np.ascontiguousarray(points_world - self.anchor, dtype=np.float32)
 
     def laid_out(self, values: NDArray[np.floating], *, spare: float) -> Float64:
-        """Values (N,) -> (16 C,) float64, `spare` where there is no point."""
+        """Values (N,) -> (16 C,), `spare` without a point."""
         return np.where(self.is_point, np.asarray(values, dtype=np.float64)[self.source], spare)
 
     def gathered(self, values: NDArray[np.float64]) -> Float64:
-        """Values (16 C,) of the entries -> (N,) of the points."""
+        """Values (16 C,) -> (N,)."""
         result = np.empty(self.num_points)
         is_point = self.is_point.view(np.bool_)
         result[self.source[is_point]] = values[is_point]
         return result
 
     def offsets(self, values: NDArray[np.floating], *, spare: float = SPARE_OFFSET) -> Offsets:
-        """The offset of each of the N points (N,), laid out, with the largest of each cluster and group."""
+        """Lay out offsets (N,), with each cluster's and group's largest."""
         laid_out = self.laid_out(values, spare=spare).astype(np.float32)
         by_cluster = laid_out.reshape(-1, LANES).max(axis=1)
         by_group = np.full(_padded(len(by_cluster) // LANES, _GROUPS), spare, np.float32)
@@ -60,8 +61,8 @@ class ClusteredPoints:
 def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None) -> ClusteredPoints:
     """Cluster points (N, 3) [m], N > 0.
 
-    The anchor is the middle of `frame`, and the curve runs through it; of the points' own box where it is None. With
-    the same frame, points that two sets share keep their order and their coordinates to the bit.
+    Anchor and curve follow `frame`, by default the points' box. With one frame, points of two sets keep order and
+    coordinates to the bit.
     """
     points = np.asarray(points_world, dtype=np.float64)
     lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
@@ -82,7 +83,6 @@ def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None)
 
 
 def _boxes(relative: Float32, num_points: int) -> Float32:
-    """Boxes (6, C + G) around the points of each cluster, then of each group; spare ones stand far away."""
     num_clusters = len(relative) // LANES
     num_groups = num_clusters // LANES
     boxes = np.full((6, num_clusters + _padded(num_groups, _GROUPS)), SPARE_PLACE, dtype=np.float32)
@@ -100,10 +100,9 @@ def _padded(count: int, multiple: int) -> int:
 
 
 def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np.int64]:
-    """Places (N,) along a Hilbert curve: what is near on the curve is near in space, with no jumps.
+    """Places (N,) along a Hilbert curve, whose neighbours are near in space.
 
-    Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004): from the highest bit down, each axis is
-    reflected or swapped with the first by what its bit says, then the bits are Gray-coded and interleaved.
+    Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004).
     """
     last = 2**_BITS - 1
     cells = np.clip((points - lower) / max(extent, 1e-30) * last, 0, last).astype(np.int64).T.copy()
@@ -129,24 +128,24 @@ def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np
 
 @dataclass(frozen=True, kw_only=True)
 class Spheres:
-    """N spheres; points: their centres, clustered; radii (N,) [m]."""
+    """N spheres: clustered centres, radii (N,) [m]."""
 
     points: ClusteredPoints
     radii: Float64
 
     @classmethod
     def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
-        """centers (N, 3) [m], world; radii (N,) [m], zero allowed; frame as in `cluster_points`.
+        """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
 
-        Raises NotEvaluableError where there is none, InputError for a wrong shape, a value that is not finite (naming
-        the index), or a negative radius.
+        Raises NotEvaluableError without any, InputError for a wrong shape, a value not finite, or a negative
+        radius.
         """
         center_array, radius_array = _checked(centers, radii)
         return cls(points=cluster_points(center_array, frame), radii=radius_array)
 
 
 def checked_points(points: NDArray[np.floating]) -> Float64:
-    """Query points (Q, 3) as float64. Raises InputError for another shape or a value that is not finite."""
+    """Return points as float64. Raises InputError unless (Q, 3) and finite."""
     array = shaped_points(points)
     if not np.isfinite(array).all():
         raise not_finite(array)
@@ -154,7 +153,7 @@ def checked_points(points: NDArray[np.floating]) -> Float64:
 
 
 def shaped_points(points: NDArray[np.floating]) -> Float64:
-    """Query points (Q, 3) as float64. Raises InputError for another shape."""
+    """Return points as float64. Raises InputError unless (Q, 3)."""
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"query points: expected shape (Q, 3), got {array.shape}")
@@ -162,7 +161,7 @@ def shaped_points(points: NDArray[np.floating]) -> Float64:
 
 
 def not_finite(points: Float64) -> InputError:
-    """The error that names the first of the points (Q, 3) that is not finite."""
+    """Error for the first point (Q, 3) not finite."""
     i = int(np.argmax(~np.isfinite(points).all(axis=1)))
     return InputError(f"query point {i}: expected finite coordinates, got {points[i].tolist()}")
 

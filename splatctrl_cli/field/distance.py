@@ -1,7 +1,4 @@
-"""Distance fields over splats: exact, two kernel fields, and the smaller of exact and kernel; sphere marching.
-
-Positive outside.
-"""
+"""Distance fields over splats: exact, kernel, and the smaller. Positive outside."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -22,18 +19,15 @@ from splatctrl_cli.records import DistanceField, Float32, Float64
 
 
 class SphereField:
-    """Exact distance to a union of spheres, ``hard(x) = min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz.
-
-    Exact outside the spheres; inside, minus the depth below the nearest-in-that-sense sphere's surface.
-    """
+    """Exact distance to a union of spheres, ``hard(x) = min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz."""
 
     def __init__(self, centers: ArrayLike, radii: ArrayLike, *, threads: int = 1) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m], zero allowed. Raises as `Spheres.of`."""
+        """centers (N, 3) [m], world; radii (N,) [m]. Raises as `Spheres.of`."""
         self._hold(Spheres.of(centers, radii), threads)
 
     @classmethod
     def over(cls, spheres: Spheres, *, threads: int = 1) -> "SphereField":
-        """The field of spheres that are already clustered."""
+        """Make the field of clustered spheres."""
         field = cls.__new__(cls)
         field._hold(spheres, threads)
         return field
@@ -44,20 +38,20 @@ class SphereField:
         self._threads = threads
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m] and the gradient (Q, 3) of the nearest (zero at its centre)."""
+        """Distance and gradient, as in `DistanceField.query`; zero gradient at a centre."""
         local = self.spheres.points.relative(checked_points(points))
         score, gradient, _ = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
-        """points (Q, 3) [m] -> the index (Q,) of the sphere that gives the distance."""
+        """points (Q, 3) [m] -> index (Q,) of the sphere."""
         local = self.spheres.points.relative(checked_points(points))
         entry = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)[2]
         return self.spheres.points.source[entry]
 
 
 class LogSumExpField(ABC):
-    """A field that is a log-sum-exp over splats: what `GpdfField` and `SeField` share."""
+    """A log-sum-exp over splats."""
 
     spheres: Spheres
 
@@ -72,13 +66,13 @@ class LogSumExpField(ABC):
         weights: str = FieldConfig.weights,
         threads: int = 1,
     ) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m]; length_scale l and truncation [m]. Raises as `Spheres.of`."""
+        """centers (N, 3) [m], world; radii (N,), length_scale, truncation [m]. Raises as `Spheres.of`."""
         config = FieldConfig(length_scale=length_scale, noise=noise, truncation=truncation, weights=weights)
         self._hold(Spheres.of(centers, radii), config, threads)
 
     @classmethod
     def over(cls, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Self:
-        """The field of spheres that are already clustered."""
+        """Make the field of clustered spheres."""
         field = cls.__new__(cls)
         field._hold(spheres, config, threads)
         return field
@@ -88,23 +82,23 @@ class LogSumExpField(ABC):
 
     @abstractmethod
     def terms(self) -> LogSumExp:
-        """What it is made of, laid out for the kernels."""
+        """Return its terms, laid out for the kernels."""
 
     @abstractmethod
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3); NaN where it has no distance."""
+        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """As `query_raw`, the exact distance and its gradient where it has no distance."""
+        """Return `query_raw`, exact where undefined."""
         return or_exact(self.query_raw(points), self.spheres, points)
 
 
 class GpdfField(LogSumExpField):
     """The paper's field (eq. 7 to 10, 12, 15): a GP with a Matern-1/2 kernel, in the log domain.
 
-    ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, radius and weight in the exponent, shifted by the largest
-    exponent: finite for every l and every mix of radii, where eq. 12 as printed (shifted by the nearest centre)
-    overflows for r / l > 88 in float32. With weights of either sign (cg) a sum that is not positive has no distance.
+    ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, shifted by the largest exponent: finite for every l and
+    mix of radii. Eq. 12 as printed, shifted by the nearest centre, overflows for r / l > 88 in float32. It is
+    undefined where weights of either sign (cg) give no positive sum.
     """
 
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
@@ -114,7 +108,7 @@ class GpdfField(LogSumExpField):
         tolerance = config.truncation * (1.0 if self.weights.sign is None else SIGNED_CARE)
         self.share = self.kernel.share(tolerance)
         offsets = spheres.radii + self.kernel.length * self.weights.log_size
-        # Float32 keeps what is left of the offsets to the micrometre: the largest goes in at the end, in float64.
+        # Float32 keeps the differences to the micrometre: the largest offset is added at the end, in float64.
         self._common = float(offsets.max())
         self.offsets = offsets
         self._offsets = spheres.points.offsets(offsets - self._common)
@@ -122,10 +116,10 @@ class GpdfField(LogSumExpField):
         self._threads = threads
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3); NaN where the sum is not positive.
+        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined.
 
-        ``grad f = sum_i pi_i (x - p_i) / |x - p_i|`` with pi the shares of the terms. (Eq. 11 as printed is
-        minus this, made a unit vector; `normalised` gives the unit vector.)
+        ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this,
+        normalised (`normalised`).
         """
         points_ = self.spheres.points
         score, gradient = native.matern(
@@ -140,7 +134,6 @@ class GpdfField(LogSumExpField):
         return score.astype(np.float64) - self._common, gradient.astype(np.float64)
 
     def terms(self) -> LogSumExp:
-        """See `LogSumExpField`."""
         points = self.spheres.points
         return LogSumExp(
             is_matern=True,
@@ -153,16 +146,16 @@ class GpdfField(LogSumExpField):
         )
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """`query_raw` at the cells of `span`, into distance (X, Y, Z) and gradient (X, Y, Z, 3)."""
+        """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
         native.bake_matern(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
 class SeField(LogSumExpField):
-    """The paper's Gaussian kernel in the log domain, with radii: no bias over an evenly sampled plane.
+    """The paper's Gaussian kernel in the log domain, with radii: unbiased over an evenly sampled plane.
 
-    ``f(x) = sqrt(-2 l^2 L) - sum_i pi_i r_i`` with ``L = log sum_i w_i exp(-|x - p_i|^2 / (2 l^2))`` and pi the
-    shares of its terms. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) It has no distance where L >= 0,
-    which happens near and inside the surface.
+    ``f(x) = sqrt(-2 l^2 L) - sum_i pi_i r_i`` with ``L = log sum_i w_i exp(-|x - p_i|^2 / (2 l^2))``, pi the terms'
+    shares. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) Undefined where L >= 0, near and inside the
+    surface.
     """
 
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
@@ -179,7 +172,7 @@ class SeField(LogSumExpField):
         self._threads = threads
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3), not normalised; NaN where L >= 0."""
+        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN where L >= 0."""
         points_ = self.spheres.points
         score, gradient = native.gaussian(
             points_.clusters,
@@ -195,7 +188,7 @@ class SeField(LogSumExpField):
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def query_safe(self, points: Float64) -> tuple[Float64, Float64]:
-        """The smaller of this and the exact distance, in one walk: as `SafeField` of both."""
+        """Return what `SafeField` returns, in one walk."""
         points_ = self.spheres.points
         asked = shaped_points(points)
         found = native.safe(
@@ -215,7 +208,6 @@ class SeField(LogSumExpField):
         return found
 
     def terms(self) -> LogSumExp:
-        """See `LogSumExpField`."""
         points, log_size = self.spheres.points, self.weights.log_size
         return LogSumExp(
             is_matern=False,
@@ -228,15 +220,15 @@ class SeField(LogSumExpField):
         )
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """`query_raw` at the cells of `span`, into distance (X, Y, Z) and gradient (X, Y, Z, 3)."""
+        """See `GpdfField.bake_raw`."""
         native.bake_gaussian(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
 class SafeField:
-    """The smaller of the exact distance and a kernel field, with the gradient of whichever it is.
+    """The smaller of the exact distance and a kernel field.
 
-    Row-sum lumping over-estimates the clearance to a sparse object before a dense one; with the exact distance beside
-    it, the result never exceeds the distance to the spheres. Where the kernel has no distance it is the exact one.
+    Row-sum lumping over-estimates the clearance to a sparse object before a dense one; the minimum never exceeds
+    the exact distance.
     """
 
     def __init__(self, exact: DistanceField, kernel: LogSumExpField) -> None:
@@ -245,7 +237,7 @@ class SafeField:
         self._both = kernel if isinstance(kernel, SeField) and are_of_one else None
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> the least distance (Q,) [m] and its gradient (Q, 3); the exact one wins a tie."""
+        """Distance and gradient, as in `DistanceField.query`; exact in ties."""
         if self._both is not None:
             return self._both.query_safe(points)
         distance, gradient = self._exact.query(points)
@@ -255,7 +247,7 @@ class SafeField:
 
 
 def or_exact(raw: tuple[Float64, Float64], spheres: Spheres, points: Float64) -> tuple[Float64, Float64]:
-    """Distance (Q,) and gradient (Q, 3) with those of `SphereField` where the distance is NaN."""
+    """Replace NaN distances (Q,) and their gradients (Q, 3) by exact ones."""
     distance, gradient = raw
     has_none = np.isnan(distance)
     if has_none.any():
@@ -265,12 +257,12 @@ def or_exact(raw: tuple[Float64, Float64], spheres: Spheres, points: Float64) ->
 
 
 def laid_out_sign(spheres: Spheres, sign: Float32 | None) -> Float32 | None:
-    """Signs (N,) laid out as the kernels take them (16 C,); None stays None."""
+    """Lay out signs (N,) as (16 C,); None stays None."""
     return None if sign is None else spheres.points.laid_out(sign, spare=1.0).astype(np.float32)
 
 
 def normalised(gradient: Float64) -> Float64:
-    """Unit vectors along gradients (Q, 3), eq. 11 with its sign mended; zero where the gradient is zero."""
+    """Unit gradients (Q, 3), eq. 11 with its sign corrected; 0 stays 0."""
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
 
@@ -297,19 +289,20 @@ DISTANCES: Mapping[str, _Make] = {
 
 
 def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> DistanceField:
-    """The field that ``config.distance`` names, over spheres that are already clustered."""
+    """Make the field that ``config.distance`` names."""
     return DISTANCES[config.distance](spheres, config, threads)
 
 
 def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> DistanceField:
-    """The field that ``config.distance`` names over spheres (N, 3), (N,) [m]: what a controller uses."""
+    """Make the field that ``config.distance`` names."""
     return field_over(Spheres.of(centers, radii), config, threads=threads)
 
 
 @dataclass(frozen=True, kw_only=True)
 class March:
-    """Of Q points: distance (Q,) [m] walked to the field's zero level and what the field reads at the end of it,
-    hit (Q, 3) [m] the points reached, rest (Q,) [m] what the field reads there.
+    """Result of a march from Q points.
+
+    distance (Q,) [m]: walked, plus rest; hit (Q, 3) [m]; rest (Q,) [m]: field there.
     """
 
     distance: Float64
@@ -318,12 +311,11 @@ class March:
 
 
 def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps: int = MARCH_STEPS) -> March:
-    """Walk from points (Q, 3) [m], world, to the zero level of `field`, `steps` times by what the field reads.
+    """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
-    Each step goes against the field's gradient where the point then is: with the first direction kept, a walk can
-    pass an object by. No step is longer than the `exact` distance to the spheres, so none goes through one. A field
-    that underestimates, as the Matern field does, is walked to its zero level, which stands before the spheres (by
-    `health.planar_zero_level` over a plane). Points at or behind it stay. Raises UsageError for less than one step.
+    Steps follow the local gradient: with a fixed direction, a walk can pass an object by. They are as long as the
+    field reads, at most the `exact` distance, and so cross no sphere. The Matern field's zero level stands before
+    the spheres (`health.planar_zero_level`). Points at or behind it stay. Raises UsageError for less than one step.
     """
     if steps < 1:
         raise UsageError(f"marching: expected at least 1 step, got {steps}")

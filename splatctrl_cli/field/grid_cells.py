@@ -1,4 +1,4 @@
-"""Where the cells of a distance grid stand, whether there is room for them, and what cameras saw there."""
+"""Layout of a distance grid, its memory, and what cameras saw in it."""
 
 import math
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
 
 RESOLUTION = 2e-6  # [m] float32 distances nearer than this are the same
 HALF_DIAGONAL = 0.5 * 3.0**0.5  # of a cell, in voxels
-LOSS = 2.0 * HALF_DIAGONAL  # the most that the certified distance may read too little, in voxels
+LOSS = 2.0 * HALF_DIAGONAL  # largest loss of the certified distance, in voxels
 
 Shape = tuple[int, int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
 class GridLayout:
-    """Cells (i, j, k) of size `voxel` [m], centred at ``origin + voxel (i, j, k)``, world [m]."""
+    """Cells of `voxel` [m], centred at ``origin + voxel (i, j, k)``, world [m]."""
 
     origin: Float64
     voxel: float
@@ -30,9 +30,9 @@ class GridLayout:
 
     @classmethod
     def over(cls, box: Box, voxel: float) -> "GridLayout":
-        """Cells whose centres run from the box's lower corner to its upper one or just beyond, two at least.
+        """Cover a box with centres, from lower corner to upper or just beyond, two at least.
 
-        Raises UsageError for a voxel or a box without size.
+        Raises UsageError for a voxel or box without size.
         """
         if not (np.isfinite(voxel) and voxel > 0):
             raise UsageError(f"voxel: expected a size above 0 m, got {voxel}")
@@ -46,7 +46,7 @@ class GridLayout:
 
     @property
     def box(self) -> Box:
-        """The box of the cell centres."""
+        """Box of the cell centres."""
         return Box(lower=self.origin, upper=self.origin + self.voxel * (np.array(self.shape) - 1))
 
     @property
@@ -56,19 +56,18 @@ class GridLayout:
 
 
 def bounding_box(splats: SplatSet, padding: float) -> Box:
-    """The box of the splats' spheres, widened by `padding` [m] on every side."""
+    """Box of the spheres, widened by `padding` [m] per side."""
     lower = (splats.centers - splats.radii[:, None]).min(axis=0).astype(np.float64)
     upper = (splats.centers + splats.radii[:, None]).max(axis=0).astype(np.float64)
     return Box(lower=lower - padding, upper=upper + padding)
 
 
 def check_loss(voxel: float, max_loss: float) -> None:
-    """Raise UsageError for cells [m] so large that what is read from them may be off by more than max_loss [m].
+    """Raise UsageError if cells of `voxel` [m] may lose more than max_loss [m] of distance.
 
-    The certified distance is ``max_c (hard(c) - |x - c|)`` over the eight centres c around x. The nearest of them is
-    at most half a diagonal away, and hard is 1-Lipschitz: ``hard(c) >= hard(x) - |x - c|``, so it reads at most a
-    diagonal, ``sqrt(3) voxel``, below ``hard(x)``, as it does in the middle of eight balls around the centres. The
-    interpolated exact distance is off by at most half of that, either way.
+    The certified distance is ``max_c (hard(c) - |x - c|)`` over eight centres c around x. One is within half a
+    diagonal, and hard is 1-Lipschitz, ``hard(c) >= hard(x) - |x - c|``: the loss is at most a diagonal, ``sqrt(3)
+    voxel``, as between eight balls around the centres. Interpolation errs by at most half of that.
     """
     loss = LOSS * voxel
     if loss > max_loss:
@@ -81,7 +80,7 @@ def check_loss(voxel: float, max_loss: float) -> None:
 
 
 def check_memory(layout: GridLayout, bytes_per_cell: int) -> None:
-    """Raise UsageError where a grid needs more memory than is free."""
+    """Raise UsageError if a grid needs more memory than is free."""
     needed, free = bytes_per_cell * layout.num_cells, available_memory()
     if needed > free:
         size = " x ".join(str(n) for n in layout.shape)
@@ -92,7 +91,7 @@ def check_memory(layout: GridLayout, bytes_per_cell: int) -> None:
 
 
 def check_room(what: str, needed: int, remedy: str) -> None:
-    """Raise UsageError where `what` needs more memory [bytes] than is free."""
+    """Raise UsageError if `what` needs more memory [bytes] than is free."""
     free = available_memory()
     if needed > free:
         raise UsageError(
@@ -101,7 +100,7 @@ def check_room(what: str, needed: int, remedy: str) -> None:
 
 
 def available_memory() -> int:
-    """Bytes that can be had without swapping, by the kernel's own estimate and the limit on this process's group."""
+    """Bytes free without swapping, within the control group's limit."""
     for line in (PROC / "meminfo").read_text(encoding="ascii").splitlines():
         if line.startswith("MemAvailable:"):
             return min([int(line.split()[1]) * 1024, *_group_room()])
@@ -109,7 +108,6 @@ def available_memory() -> int:
 
 
 def _group_room() -> list[int]:
-    """What a container may still take, where its control group says so."""
     try:
         limit = (CGROUP / "memory.max").read_text(encoding="ascii").strip()
         used = int((CGROUP / "memory.current").read_text(encoding="ascii"))
@@ -121,8 +119,9 @@ def _group_room() -> list[int]:
 def observed_planes(
     occupancy: OccupancyGrid | None, layout: GridLayout, thresholds: OccupancyConfig, first: int, last: int
 ) -> UInt8:
-    """What the occupancy voxel that holds each cell centre says (last - first, Y, Z), a `VoxelState`; x in
-    [first, last). Never seen outside the occupancy grid, or without one.
+    """`VoxelState` (last - first, Y, Z) at centres of x-planes [first, last).
+
+    Never seen outside the occupancy grid, or without one.
     """
     observed = np.full((last - first, *layout.shape[1:]), VoxelState.NEVER_SEEN, dtype=np.uint8)
     if occupancy is None:

@@ -1,4 +1,4 @@
-"""A baked field as a distance field again."""
+"""A baked grid as a distance field."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from splatctrl_cli.records import Bool, Box, DistanceGrid, Float32, Float64
 
 
 class GridField:
-    """Trilinear interpolation between cell centres, and the gradient of that very interpolant.
+    """Trilinear interpolation between cell centres.
 
-    Outside the box of the cell centres it reads the value at the nearest point of the box less the distance to it:
-    a lower bound of a distance, so that a robot that leaves the grid reads less clearance, never more.
-    Beside a cell that is NaN (never-seen space under the policy ``nan``) it is NaN, and so is the certified distance.
+    Outside their box it reads the value at the box's nearest point minus the distance to it. This lower bound shows
+    a robot outside less clearance, never more. Next to a NaN cell (policy ``nan``), this and the certified distance
+    are NaN.
     """
 
     def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
-        """Raises InputError where the channel is not there or the grid has a single cell along an axis."""
+        """Raises InputError without the channel or for one cell along an axis."""
         if channel not in grid.channels:
             raise InputError(f"distance grid: no channel {channel!r}", remedy=f"it has: {', '.join(grid.channels)}")
         self._values = np.ascontiguousarray(grid.channels[channel], dtype=np.float32)
@@ -36,19 +36,18 @@ class GridField:
         self.box = Box(lower=self._origin, upper=upper)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m], world -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN beside a NaN cell."""
+        """Distance and the interpolant's gradient, as in `DistanceField.query`."""
         return native.interpolate(self._values, self._origin, self._voxel, checked_points(points))
 
     def certified(self, points: Float64) -> Float64:
-        """A distance (Q,) [m] that the exact distance to the splats is not below.
+        """Lower bound (Q,) [m] of the exact distance to splats, not to objects.
 
-        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz, so this holds
-        whatever interpolation does in between. It certifies the distance to the splats (and to never-seen cells that
-        are obstacles), not to objects. NaN where `query` is. Raises InputError for a grid without the channel bound.
+        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz. It holds for
+        obstacle cells, too. NaN where `query` is. Raises InputError without the channel bound.
         """
         if self._bound is None:
             raise InputError("distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
-        # The channel holds for a whole cell: at its centre the exact distance is half a diagonal more.
+        # The channel bounds a whole cell: at its centre the exact distance is half a diagonal more.
         lowest = native.lipschitz_bound(self._bound, self._origin, self._voxel, checked_points(points))
         certified = np.asarray(lowest + HALF_DIAGONAL * self._voxel)
         if self._has_blank:
@@ -56,14 +55,14 @@ class GridField:
         return certified
 
     def contains(self, points: Float64) -> Bool:
-        """(Q,) True where a point lies in the box of the cell centres."""
+        """True for points (Q, 3) in the box of centres."""
         return self.box.contains(points)
 
 
 def exact_channel(grid: DistanceGrid) -> Float32:
-    """The exact distance (X, Y, Z) [m] at the cell centres: the channel hard, or bound and its margin together.
+    """Exact distance (X, Y, Z) [m]: the channel hard, or bound plus its margin.
 
-    Raises InputError for a grid with neither.
+    Raises InputError without either.
     """
     if "hard" in grid.channels:
         return np.asarray(grid.channels["hard"], dtype=np.float32)

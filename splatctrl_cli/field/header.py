@@ -1,4 +1,4 @@
-"""What a baked field says of itself."""
+"""The header of a baked field."""
 
 from collections.abc import Collection, Mapping
 
@@ -27,9 +27,7 @@ def field_header(
     has_occupancy: bool,
     num_unrepresented: int = 0,
 ) -> dict[str, object]:
-    """The header of what `baker` baked of `chosen`: those of `splats` that have one of `labels`, then
-    `num_unrepresented` balls around occupied voxels without a splat.
-    """
+    """Header of `baker`'s bake of `chosen`: labelled `splats`, then `num_unrepresented` balls."""
     config = baker.config
     radii: Mapping[str, float] = {
         "min": float(chosen.radii.min()),

@@ -1,4 +1,4 @@
-"""Is a splat set dense and thick enough for the field made of it, and how far are the kernel fields from exact?"""
+"""Health of a splat set for fields."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
@@ -12,10 +12,10 @@ from splatctrl_cli.config.fixed import MAX_RADIUS_SPREAD, ROUGH_LENGTH
 
 @dataclass(frozen=True, kw_only=True)
 class FieldHealth:
-    """Ratios that decide how good the field can be, and warnings where they are outside their range.
+    """Ratios that decide a field's quality, with warnings.
 
-    spacing: median distance to the nearest other splat [m] (0 for a single splat); radius: median [m];
-    planar_zero_level: height [m] at which the kernel field of a dense plane of such splats reads zero.
+    spacing: median distance to the nearest other splat [m], 0 for one; radius: median [m]; planar_zero_level:
+    height [m] where a dense plane's kernel field is zero.
     """
 
     spacing: float
@@ -27,14 +27,14 @@ class FieldHealth:
     warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for a header."""
+        """Return plain values for a header."""
         return asdict(self)
 
 
 def field_health(
     centers: NDArray[np.floating], radii: NDArray[np.floating], length: float, *, kernels: Collection[str]
 ) -> FieldHealth:
-    """Health of splats (N, 3), (N,) [m] under a length scale [m], for a field of these kernels (se, gpdf)."""
+    """Health of splats (N, 3), (N,) [m] for kernels (se, gpdf)."""
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
     return FieldHealth(
@@ -93,7 +93,7 @@ def _set_warnings(
 
 
 def median_spacing(centers: NDArray[np.floating]) -> float:
-    """Median distance from a splat (N, 3) [m] to the nearest other one; 0 for fewer than two."""
+    """Median distance from a splat (N, 3) [m] to its nearest other; 0 for one."""
     if len(centers) < 2:
         return 0.0
     points = np.asarray(centers, dtype=np.float64)
@@ -102,10 +102,10 @@ def median_spacing(centers: NDArray[np.floating]) -> float:
 
 
 def planar_zero_level(radius: float, length: float) -> float:
-    """The height z [m] over a dense plane of splats where the Matern row-sum field is zero.
+    """Height z [m] over a dense plane of splats where the Matern row-sum field is zero.
 
-    There the field reads ``z - l log(1 + z / l) - r`` (the integral of ``e^(-d/l)`` over a plane is
-    ``2 pi l (z + l) e^(-z/l)``, the row sum ``2 pi l^2``); Newton's method from above, where it is convex.
+    The field is ``z - l log(1 + z / l) - r``. (The integral of ``e^(-d/l)`` over a plane is ``2 pi l (z + l)
+    e^(-z/l)``, the row sum ``2 pi l^2``.) Newton's method starts above, where it is convex.
     """
     z = radius + length * (1.0 + np.sqrt(2.0 * radius / length))
     for _ in range(50):

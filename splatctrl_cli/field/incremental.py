@@ -1,4 +1,4 @@
-"""Which blocks of a grid an edit of the splats can have changed: the others keep what an earlier bake gave them."""
+"""Blocks of a grid that an edit of the splats can change."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from splatctrl_cli.records import Float64, SplatSet, UInt8
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """mask (blocks of the grid) uint8, 1 where a block has to be baked anew; None: all of them, for `reason`."""
+    """mask (blocks of the grid): 1 where a bake is needed; None: everywhere, for `reason`."""
 
     mask: UInt8 | None
     num_blocks: int
@@ -23,16 +23,15 @@ class Changes:
 
     @property
     def num_baked(self) -> int:
-        """Blocks that are baked anew."""
+        """Number of blocks to bake."""
         return self.num_blocks if self.mask is None else int(np.count_nonzero(self.mask))
 
 
 def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) -> Changes:
-    """The blocks where a bake of `after` by `new` can differ by a bit from that of `before` by `old`.
+    """Blocks where bakes of `before` and `after` can differ by a bit.
 
-    Both are of the same layout and configuration, `before` and `after` the splats of the field. A block can differ
-    where a splat that is in one set alone can matter in it, by the bounds by which the bake itself leaves splats out.
-    Weights are compared, too: those of a splat's neighbours change when it comes or goes. `observed` is left out.
+    Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
+    culling bounds. Weights are compared too, as neighbours' weights change; `observed` is not.
     """
     shape = blocks_of(new.layout)
     num_blocks = int(np.prod(shape))
@@ -59,7 +58,7 @@ def blocks_of(layout: GridLayout) -> tuple[int, int, int]:
 
 
 def whole_span(baker: Baker) -> GridSpan:
-    """All cells of a baker's grid, in the frame of its spheres."""
+    """All cells of a baker's grid, in its spheres' frame."""
     layout = baker.layout
     return GridSpan(
         origin=layout.origin - baker.spheres.points.anchor,
@@ -73,8 +72,9 @@ def whole_span(baker: Baker) -> GridSpan:
 def counts_after(
     counts: Mapping[str, int], old: Baker, new: Baker, mask: UInt8, slabs: Sequence[tuple[int, int]]
 ) -> dict[str, int]:
-    """The counts of kernel values over the whole grid: `counts` of the bake before, less what the blocks of `mask`
-    had then, plus what `new` counted when it baked them. `old` bakes them once more for it.
+    """Counts of kernel values in the whole grid after baking `mask`.
+
+    `old` bakes these blocks again, to subtract theirs from `counts`.
     """
     if not old.counts:
         return {}
@@ -88,7 +88,6 @@ def counts_after(
 
 
 def _reason_for_all(old: Baker, new: Baker) -> str:
-    """Why no block can keep what it has; empty where some can."""
     if new.gpdf is not None:
         return "every splat reaches every cell of gpdf"
     if new.probability is not None and new.config.probability == "paper":
@@ -116,7 +115,7 @@ def _touch(
 def _changed(
     splats: tuple[SplatSet, SplatSet], bakers: tuple[Baker, Baker], *, with_weights: bool
 ) -> tuple[UInt8, UInt8]:
-    """The entries (16 C,) of each set that are not in the other, to the bit."""
+    """Entries (16 C,) of each set missing in the other, to the bit."""
     rows = [_rows(s, b, with_weights=with_weights) for s, b in zip(splats, bakers, strict=True)]
     _, kinds = np.unique(np.concatenate(rows), return_inverse=True)
     here, there = np.split(kinds, [len(rows[0])])
@@ -129,9 +128,9 @@ def _changed(
 
 
 def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.void]:
-    """Each splat, in the order of the clusters, as bytes (N,): equal ones do the same to a field.
+    """Splats as bytes (N,), in cluster order.
 
-    Splats of one centre are told apart by their rank, as their order is that of the set and can decide the last bit.
+    A rank separates splats of one centre: their order can decide the last bit.
     """
     order = baker.spheres.points.source[baker.spheres.points.is_point.view(np.bool_)]
     centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0
@@ -146,7 +145,7 @@ def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.v
 
 
 def _ranks(centers: Float64) -> NDArray[np.int64]:
-    """How many of the rows before it each row (N, 3) is equal to."""
+    """Number of earlier rows equal to each row (N, 3)."""
     order = np.lexsort(centers.T)  # stable
     is_first = np.ones(len(centers), np.bool_)
     is_first[1:] = (np.diff(centers[order], axis=0) != 0).any(axis=1)

@@ -1,4 +1,4 @@
-"""Distance fields on a card: the kernels of `kernels.cuda.field` under the names of the configuration."""
+"""Distance fields on a card."""
 
 from collections.abc import Mapping
 from typing import Self
@@ -18,21 +18,21 @@ KERNELS: Mapping[str, type[LogSumExpField]] = {"se": SeField, "gpdf": GpdfField}
 
 
 class OnDevice:
-    """The field that ``config.distance`` names, on a device: as `field_over`, for many points at a time."""
+    """The field that ``config.distance`` names, on a device."""
 
     def __init__(self, spheres: Spheres, config: FieldConfig, device: Memory, *, threads: int = 1) -> None:
-        """The weights are made by the processor. Raises OutOfMemory."""
+        """The processor makes the weights. Raises OutOfMemory."""
         self.spheres, kernel = spheres, KERNEL_OF[config.distance]
         kernels = {} if kernel is None else {kernel: KERNELS[kernel].over(spheres, config, threads=threads)}
         self.field = device_field(spheres, kernels, config, device)
 
     @classmethod
     def of(cls, centers: ArrayLike, radii: ArrayLike, config: FieldConfig, device: Memory) -> Self:
-        """Over spheres (N, 3), (N,) [m]. Raises as `Spheres.of`."""
+        """Make the field over (N, 3), (N,) [m]. Raises as `Spheres.of`."""
         return cls(Spheres.of(centers, radii), config, device)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3)."""
+        """Distance and gradient, as in `DistanceField.query`."""
         if not len(points):
             return np.zeros(0), np.zeros((0, 3))
         found = self._asked(points, "gradient")
@@ -44,7 +44,7 @@ class OnDevice:
         return self._asked(points).distance.astype(np.float64) if len(points) else np.zeros(0)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
-        """points (Q, 3) [m] -> the index (Q,) of the sphere that gives the exact distance."""
+        """points (Q, 3) [m] -> index (Q,) of the exact distance's sphere."""
         if not len(points):
             return np.zeros(0, np.int64)
         found = self._asked(points, "entry")
@@ -55,14 +55,14 @@ class OnDevice:
         return self.field.query(checked_points(points), self.spheres.points.anchor, wanted)
 
     def close(self) -> None:
-        """Give the device's memory back."""
+        """Free the device's memory."""
         self.field.close()
 
 
 def device_field(
     spheres: Spheres, kernels: Mapping[str, LogSumExpField], config: FieldConfig, device: Memory
 ) -> DeviceField:
-    """The exact distance and `kernels` on a device, and the choice between them that ``config.distance`` names."""
+    """Put the exact distance and `kernels` on a device, for ``config.distance``."""
     chosen = KERNEL_OF[config.distance]
     choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
     terms = {name: field.terms() for name, field in kernels.items()}

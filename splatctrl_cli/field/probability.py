@@ -1,4 +1,4 @@
-"""Probability that a point is in collision: the paper's form, and one calibrated by a measured error (III-D)."""
+"""Probability of collision: the paper's, or calibrated by a measured error (III-D)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -19,56 +19,54 @@ from splatctrl_cli.records import Float32, Float64
 
 
 class CollisionProbability(Protocol):
-    """What a baked probability is made by."""
+    """A form of the collision probability."""
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
-        """Probability (X, Y, Z) at the cells of `span`, whose chosen distance [m] is `sdf`."""
+        """Probability (X, Y, Z) at the cells of `span`; sdf: chosen distance [m]."""
         ...
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
-        """Probability (Q,) at points (Q, 3) [m], whose chosen distance is sdf (Q,) [m]."""
+        """Probability (Q,) at points (Q, 3) [m]; sdf (Q,): chosen distance [m]."""
         ...
 
     def described(self) -> dict[str, object]:
-        """What it means, and its numbers, for a header."""
+        """Return its meaning and numbers, for a header."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratedProbability:
-    """``Phi((mean - clearance) / sigma)``, mean and sigma [m] the error that was measured of the field that gives the
-    clearance: what it reads too much on average, and the standard deviation.
+    """``Phi((mean - clearance) / sigma)``, with the field's measured error [m].
+
+    mean: what it reads too much; sigma: standard deviation.
     """
 
     sigma: float
     mean: float = 0.0
 
     def of(self, clearance: Float64) -> Float64:
-        """Probability of clearances of any shape [m]."""
+        """Probability of clearances [m], any shape."""
         return np.asarray(ndtr((self.mean - clearance) / self.sigma))
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
-        """As `CollisionProbability.at`."""
         return self.of(sdf)
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
-        """As `CollisionProbability.baked`."""
         return self.of(sdf.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:
-        """As `CollisionProbability.described`."""
         return {"meaning": "Phi((mean - sdf) / sigma)", "sigma": self.sigma, "mean": self.mean}
 
 
 class PaperProbability:
-    """Eq. 13 and 14 with the Matern kernel and lumped weights: a score; docs/field.md shows how far it is from one.
+    """Eq. 13 and 14 with the Matern kernel and lumped weights: only a score (docs/field.md).
 
-    ``P(o >= 1 | o > 0) = Phi((o - 1) / s) / Phi(o / s)`` with o of `GpdfField` and
-    ``s^2 = (1 - sum_i w_i k(x, p_i)^2) / 9``.
+    ``P(o >= 1 | o > 0) = Phi((o - 1) / s) / Phi(o / s)``, o of `GpdfField`, ``s^2 = (1 - sum_i w_i k(x, p_i)^2) /
+    9``.
     """
 
     def __init__(self, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> None:
-        """Raises UsageError for weights that are not lumped: eq. 13 would need a solution for each point."""
+        """Raises UsageError for weights cg: eq. 13 would need a solution per point."""
         if config.weights == "cg":
             raise UsageError(
                 "field.probability = paper: expected field.weights = rowsum or voxel, got cg",
@@ -96,11 +94,11 @@ class PaperProbability:
         return self._combined(self._gpdf.query_raw(points)[0], half.astype(np.float64))
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
-        """As `CollisionProbability.at`; the paper's form does not depend on the chosen distance."""
+        """Probability (Q,), whatever the sdf."""
         return self.of(points)
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
-        """As `CollisionProbability.baked`; the paper's form does not depend on the chosen distance."""
+        """Probability (X, Y, Z), whatever the sdf."""
         places = self._gpdf.spheres.points
         gpdf, half = np.zeros_like(sdf), np.zeros_like(sdf)
         self._gpdf.bake_raw(span, gpdf, None, threads=threads)
@@ -116,7 +114,6 @@ class PaperProbability:
         return self._combined(gpdf.astype(np.float64), half.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:
-        """As `CollisionProbability.described`."""
         return {"meaning": "eq. 13 and 14 with lumped weights: a score", "variance_divisor": VARIANCE_DIVISOR}
 
     def _combined(self, gpdf: Float64, half: Float64) -> Float64:
@@ -126,9 +123,9 @@ class PaperProbability:
 
 
 def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
-    """Eq. 14 of an occupancy o > 0 whose variance is ``(1 - explained) / 9``, of any shape.
+    """Eq. 14 of an occupancy o > 0 with variance ``(1 - explained) / 9``.
 
-    In logarithms: 1 - Phi loses what is small. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, and not zero.
+    In logarithms, as 1 - Phi loses small values. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, not zero.
     """
     deviation = np.sqrt(np.maximum(1.0 - explained, LEAST_VARIANCE) / VARIANCE_DIVISOR)
     return np.asarray(np.exp(log_ndtr((occupancy - 1.0) / deviation) - log_ndtr(occupancy / deviation)))
@@ -142,11 +139,11 @@ PROBABILITIES: Mapping[str, _Make] = {
 
 
 def make_probability(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> CollisionProbability:
-    """The probability that ``config.probability`` names."""
+    """Make the probability that ``config.probability`` names."""
     return PROBABILITIES[config.probability](spheres, config, threads)
 
 
 def probabilities(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> dict[str, CollisionProbability]:
-    """Every form that these weights have, by name: the paper's variance is not that of the full process (cg)."""
+    """Make all forms for these weights; the paper's variance does not hold for cg."""
     names = [name for name in PROBABILITIES if name != "paper" or config.weights != "cg"]
     return {name: PROBABILITIES[name](spheres, config, threads) for name in names}

@@ -1,4 +1,4 @@
-"""What a baked grid holds, in numbers: how much of it is known, and how far its gradient is from a distance's."""
+"""Statistics of a baked grid."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -13,15 +13,15 @@ from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.records import DistanceGrid, Float32
 from splatctrl_cli.voxels import VoxelState
 
-BIN = 0.05  # of the histogram of the gradient's length: bin k is about k times this
-NUM_BINS = 41  # about 0 to 2; the last one holds what is longer, too
+BIN = 0.05  # bin k of the histogram is about k times this length
+NUM_BINS = 41  # about 0 to 2; the last one includes longer ones
 
 
 @dataclass(frozen=True, kw_only=True)
 class GradientLengths:
-    """How long the gradients are: 1 for a distance (Eikonal equation), less where a kernel field is flat.
+    """Gradient lengths: 1 for a distance (Eikonal equation), less where a kernel field is flat.
 
-    histogram: cells by length, bin k within half a `bin_width` of k times that; share_near_one: within 0.05 of 1.
+    histogram: bin k is within half a `bin_width` of k times that; share_near_one: within 0.05.
     """
 
     histogram: tuple[int, ...]
@@ -33,7 +33,7 @@ class GradientLengths:
 
 @dataclass(frozen=True, kw_only=True)
 class Excess:
-    """By how much a kernel field over-estimates: it exceeds the exact distance to the spheres at `count` cells."""
+    """Cells where a kernel field exceeds the exact distance."""
 
     count: int
     share: float
@@ -42,10 +42,10 @@ class Excess:
 
 @dataclass(frozen=True, kw_only=True)
 class GridStatistics:
-    """num_blank: cells whose sdf is NaN; num_inside: whose sdf is 0 or less; lowest, highest of sdf [m].
+    """Statistics of a grid; None or empty without channels for it.
 
-    observed: cells by state. hard_share: of cells where sdf is the exact distance. excess: by kernel field, of cells
-    where it has a value of its own or stands in. Each None or empty where the grid lacks the channels for it.
+    num_blank: sdf NaN; num_inside: sdf <= 0; lowest, highest: of sdf [m]; observed: cells by state; hard_share: sdf
+    is exact; excess: by kernel field.
     """
 
     num_cells: int
@@ -60,16 +60,16 @@ class GridStatistics:
 
     @property
     def never_seen_share(self) -> float | None:
-        """Of the cells, by state: those that no camera saw, and that the robot was not in."""
+        """Share of cells neither seen nor swept."""
         return None if self.observed is None else self.observed["never_seen"] / self.num_cells
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values, as written to ``field.json``."""
+        """Return plain values, as in ``field.json``."""
         return {**asdict(self), "never_seen_share": self.never_seen_share}
 
 
 def grid_statistics(grid: DistanceGrid) -> GridStatistics:
-    """The statistics of a grid, whose channels may be memory maps: a few planes are held at a time."""
+    """Statistics of a grid, by a few planes, as channels may be memory maps."""
     totals = _Totals()
     for part in _parts(grid):
         totals.add(part)
@@ -77,8 +77,6 @@ def grid_statistics(grid: DistanceGrid) -> GridStatistics:
 
 
 class _Totals:
-    """Sums over parts of a grid."""
-
     def __init__(self) -> None:
         self.num_cells = self.num_blank = self.num_inside = self.num_hard = 0
         self.lowest, self.highest = np.inf, -np.inf
@@ -109,7 +107,7 @@ class _Totals:
             return  # bound is then of unknown space, too
         try:
             exact = exact_channel(part)
-        except InputError:  # the grid has it not
+        except InputError:  # the grid has no exact distance
             return
         self.has_exact = True
         self.num_hard += int(np.count_nonzero(np.abs(_floats(part, "sdf") - exact) <= RESOLUTION))

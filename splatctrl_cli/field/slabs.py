@@ -1,4 +1,4 @@
-"""A grid baked whole, or cut into slabs of x-planes, one at a time, so that memory need not hold it."""
+"""Bakes of a grid, whole or in slabs of x-planes to save memory."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Label, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
-SLAB_BYTES = 48 << 20  # of the channels of a slab, or what a block's planes take
-_CUBES = 64  # bytes of a cell that finding the nearest never-seen one takes, of the whole grid
-_BESIDE = 64  # bytes of a cell that baking takes beside its channels, in at most 64 MiB or a block's planes
+SLAB_BYTES = 48 << 20  # per slab's channels, or one block's planes if larger
+_CUBES = 64  # bytes per cell of the whole grid, to find the nearest never-seen one
+_BESIDE = 64  # bytes per cell in a bake besides its channels, in at most 64 MiB or a block's planes
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """What an update keeps: the grid of the bake before, where `mask` (blocks) is zero; what cameras saw is anew."""
+    """An earlier bake, valid where `mask` (blocks) is zero, with new observations."""
 
     grid: DistanceGrid
     mask: UInt8
@@ -31,12 +31,12 @@ class Kept:
 
 
 def bytes_per_cell(channels: Collection[str]) -> int:
-    """Of the channels."""
+    """Bytes of the channels."""
     return sum(np.dtype(CHANNELS[name][0]).itemsize * CHANNELS[name][1] for name in channels if name in CHANNELS)
 
 
 def slabs(layout: GridLayout, channels: Collection[str], begin: int = 0) -> Iterator[tuple[int, int]]:
-    """The x-planes [first, last) of each slab from plane `begin` on: whole blocks of planes."""
+    """Yield the x-planes [first, last) of slabs from `begin` on, whole blocks."""
     per_plane = bytes_per_cell(channels) * layout.shape[1] * layout.shape[2]
     step = BLOCK * max(1, SLAB_BYTES // (BLOCK * per_plane))
     for first in range(begin, layout.shape[0], step):
@@ -44,7 +44,7 @@ def slabs(layout: GridLayout, channels: Collection[str], begin: int = 0) -> Iter
 
 
 def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
-    """Raise UsageError where not even the planes of one block fit the memory."""
+    """Raise UsageError if one block's planes exceed the memory."""
     planes = min(BLOCK, layout.shape[0])
     check_room(
         f"slab of {' x '.join(map(str, (planes, *layout.shape[1:])))} cells:",
@@ -54,15 +54,12 @@ def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
 
 
 class UnknownSpace:
-    """`apply_unknown` for a grid that is baked in slabs: what is never seen is known before anything is baked.
-
-    num_never_seen and num_changed count the cells that were treated: never seen, and of those or near them, changed.
-    """
+    """`apply_unknown` for slabs, from never-seen cells found before the bake."""
 
     def __init__(
         self, layout: GridLayout, config: FieldConfig, occupancy: OccupancyGrid | None, thresholds: OccupancyConfig
     ) -> None:
-        """Raises NotEvaluableError where nothing was ever seen, UsageError where obstacles do not fit the memory."""
+        """Raises NotEvaluableError if nothing was seen, UsageError without memory for obstacles."""
         self.policy = config.unknown
         self.num_never_seen = self.num_changed = 0
         self._is_unknown: Bool = np.concatenate(
@@ -83,7 +80,7 @@ class UnknownSpace:
             self._cubes = Cubes.of(self._is_unknown, layout.voxel)
 
     def apply(self, planes: Planes, first: int, last: int, bound_margin: float) -> Planes:
-        """The channels of the x-planes [first, last), treated by the policy."""
+        """Treat channels of x-planes [first, last) by the policy."""
         is_unknown = self._is_unknown[first:last]
         num_unknown = int(np.count_nonzero(is_unknown))
         self.num_never_seen += num_unknown
@@ -97,16 +94,14 @@ class UnknownSpace:
         return treated
 
     def header(self) -> dict[str, object]:
-        """What it changes in a header, as `apply_unknown` does."""
+        """Return its changes of a header."""
         counts = {"never_seen": self.num_never_seen, "changed": self.num_changed}
         bound = {"bound": BOUND} if self.policy == "obstacle" else {}
         return {**bound, "unknown": self.policy, "unknown_cells": counts}
 
 
 def baked_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
-    """The channels of the x-planes [first, last), (last - first, Y, Z), before unknown space is treated; with `kept`,
-    only what it does not keep is baked.
-    """
+    """Channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
     planes = baker.allocate(last - first)
     if kept is None:
         baker.bake(first, last, planes)
@@ -131,12 +126,11 @@ def bake(
     labels: Collection[Label] = DEFAULT_LABELS,
     threads: int = 0,
 ) -> DistanceGrid:
-    """Distances to the splats with one of `labels` at cells of size ``config.voxel`` that cover `box`.
+    """Bake distances to splats with one of `labels` in cells of ``config.voxel`` over `box`.
 
-    `channels` are some of `CHANNELS`, sdf among them. Culling is exact for hard; a kernel field with row sums is too
-    large by at most ``config.truncation``. The same input gives the same bytes at any thread count. Raises UsageError
-    for a bad box or one that does not fit the memory, NotEvaluableError where no splat is left, InputError for splats
-    that are not finite.
+    channels: of `CHANNELS`, with sdf. Culling is exact for hard; with row sums, a kernel field is too large by at
+    most ``config.truncation``. Bytes do not depend on threads. Raises UsageError for a bad or too large box,
+    NotEvaluableError without splats, InputError for splats not finite.
     """
     chosen = field_splats(splats, labels)
     layout = GridLayout.over(box, config.voxel)

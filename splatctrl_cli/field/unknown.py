@@ -1,6 +1,4 @@
-"""What a field of a scene is made of, its splats and balls around occupied voxels without one; and what never-seen
-space counts as: nothing, an obstacle, or no distance at all.
-"""
+"""Spheres of a scene's field, and the treatment of never-seen space."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
@@ -22,21 +20,21 @@ NO_SPLAT = -1
 
 @dataclass(frozen=True, kw_only=True)
 class ObstacleSpheres:
-    """The N spheres of a field, balls last, as splats; index (N,) in the scene's splats, NO_SPLAT of a ball."""
+    """N spheres of a field, balls last; index (N,) of splats, NO_SPLAT for balls."""
 
     splats: SplatSet
     index: Index
 
     @property
     def num_unrepresented(self) -> int:
-        """How many are balls."""
+        """Number of balls."""
         return int(np.count_nonzero(self.index == NO_SPLAT))
 
 
 def obstacle_spheres(
     splats: SplatSet, balls: Balls | None, labels: Collection[Label] = DEFAULT_LABELS
 ) -> ObstacleSpheres:
-    """The splats and the balls with one of `labels`. Raises as `field_splats`, where there is no such ball either."""
+    """Splats and balls with one of `labels`. Raises as `field_splats` without such balls."""
     values = [int(label) for label in labels]
     is_chosen = np.isin(splats.labels, values)
     kept = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)
@@ -57,9 +55,9 @@ def obstacle_spheres(
 
 
 def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -> SplatSet:
-    """The splats with one of `labels`, in order: the robot is left out unless asked for.
+    """Splats with one of `labels`, in order; by default without the robot.
 
-    Raises NotEvaluableError where none is left, InputError for a label that is none of ours.
+    Raises NotEvaluableError without any, InputError for an unknown label.
     """
     check_labels(splats)
     kept = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
@@ -73,7 +71,7 @@ def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -
 
 
 def check_labels(splats: SplatSet) -> None:
-    """Raise InputError for a label that is none of ours."""
+    """Raise InputError for an unknown label."""
     unknown = ~np.isin(splats.labels, [int(label) for label in Label])
     if unknown.any():
         i = int(np.argmax(unknown))
@@ -85,8 +83,8 @@ def label_counts(splats: SplatSet) -> dict[str, int]:
     return {label.name.lower(): int(np.count_nonzero(splats.labels == label)) for label in Label}
 
 
-BLANKED = ("sdf", "gradient", "probability")  # by nan
-ROUNDING = 1e-6  # [m] and of a distance: what float32 may raise it by
+BLANKED = ("sdf", "gradient", "probability")  # by policy nan
+ROUNDING = 1e-6  # [m], and share of a distance: rounding of float32
 BOUND = (
     "no point of the cell is nearer to a splat's sphere or a never-seen cell; "
     "bound + bound_margin is the lesser of hard and the distance to never-seen cells at its centre"
@@ -96,15 +94,13 @@ Channels = dict[str, NDArray[np.generic]]
 
 
 def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
-    """The grid with its never-seen cells treated by `policy`, and what that changed in its header.
+    """Grid with never-seen cells treated by `policy`, and its header updated.
 
-    ``free``: distances from the splats alone. ``nan``: no sdf, gradient or probability at a never-seen cell.
-    ``obstacle``: never-seen cells are solid cubes; sdf, its gradient and bound are those of the nearer of splats
-    and cubes, the probability at a never-seen cell is 1, and bound holds for splats and cubes. A cell that only the
-    robot was in is known (`VoxelState.SWEPT_BY_ROBOT`); what lies outside the grid is not looked at.
+    ``free``: distances from splats alone. ``nan``: no sdf, gradient or probability there. ``obstacle``: solid cubes
+    of probability 1; sdf, gradient and bound are of the nearer of splats and cubes. Cells that only the robot swept
+    are known (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
 
-    Raises UsageError for another policy, InputError for a grid without `observed`, NotEvaluableError where nothing
-    was ever seen.
+    Raises UsageError for another policy, InputError without `observed`, NotEvaluableError if nothing was seen.
     """
     declared = FieldConfig.declared["unknown"]
     check(declared.holds(policy), "field.unknown", declared.expected, policy)
@@ -137,7 +133,7 @@ def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
 
 
 def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Channels:
-    """Channels (X, Y, Z) with NaN for a distance, gradient and probability where `is_unknown`."""
+    """Set distance, gradient, probability (X, Y, Z) to NaN where unknown."""
     blanked = dict(channels)
     for name in BLANKED:
         if name in channels:
@@ -150,8 +146,7 @@ def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Chan
 class Cubes:
     """The never-seen cells (X, Y, Z) of a grid as solid cubes.
 
-    distance: a lower bound [m] of the signed distance to them from each cell's centre; away (..., 3): unit vectors
-    in which it grows.
+    distance: lower bound [m] of the signed distance from cell centres; away (..., 3): unit vectors of its growth.
     """
 
     is_unknown: Bool
@@ -160,11 +155,11 @@ class Cubes:
 
     @classmethod
     def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
-        """Of a grid of which some cells are unknown, and some not.
+        """Bound the distances in a grid with known and unknown cells.
 
-        Outside, no cube is nearer than the nearest one's centre less half a diagonal, nor than the least over cubes
-        of the largest difference of a coordinate less half a cell. Inside it is minus the distance to the nearest
-        known centre, less half a cell, which the depth does not exceed.
+        Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance
+        minus half a cell. Inside: half a cell minus the distance to the nearest known centre, which the depth does
+        not exceed.
         """
         here = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
@@ -181,7 +176,7 @@ class Cubes:
         )
 
     def planes(self, first: int, last: int) -> "Cubes":
-        """The x-planes [first, last)."""
+        """X-planes [first, last)."""
         return replace(
             self,
             is_unknown=self.is_unknown[first:last],
@@ -190,7 +185,7 @@ class Cubes:
         )
 
     def joined(self, channels: Mapping[str, NDArray[np.generic]], bound_margin: float) -> tuple[Channels, int]:
-        """Channels of the nearer of what they hold and the cubes, and the number of cells whose sdf changed."""
+        """Channels of the nearer of field and cubes, and the number of changed cells."""
         joined = dict(channels)
         is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))
         joined["sdf"] = np.where(is_nearer, self.distance, channels["sdf"])

@@ -1,6 +1,4 @@
-"""Kernels of the Gaussian-process distance field, and the weights of the splats in it (paper, III-D): by row sums, by
-a voxel grid in linear time, and by the full process of eq. 8.
-"""
+"""Kernels of the distance field, and its weights (III-D)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,20 +28,16 @@ from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Float32, Float64, Index
 
 KernelValue = Callable[[Float64], Float64]
-NODES = 96  # of a block along each axis: a size that transforms fast, 7 MiB
+NODES = 96  # per axis of a block: a size with a fast transform, 7 MiB
 MAX_BLOCKS = 2000
 
 
 def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Float64:
-    """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in time linear in N.
+    """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
-    Each centre is one unit spread over the eight nodes around it (trilinear), the nodes are convolved with the
-    kernel, and each centre reads the result back from its eight nodes. What that makes of a centre's own term is
-    known, and replaced by k(0) = 1. Spreading and reading back blur the kernel by a third of h^2 along each axis: the
-    nodes are convolved with ``2 k - (mean of k at the six neighbours)``, which undoes that to second order in h.
-
-    The grid is made in blocks of `NODES`, those alone in which two centres can meet. Raises UsageError for more than
-    `MAX_BLOCKS` of them.
+    Each centre spreads one unit over eight nodes (trilinear), these are convolved, and it reads them back. Its own
+    term becomes k(0) = 1. That blurs by h^2 / 3 per axis; convolving with ``2 k - (mean of k at the six
+    neighbours)`` undoes it to second order. Raises UsageError for more than `MAX_BLOCKS` blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
     nodes = (centers - centers.min(axis=0)) / voxel
@@ -68,8 +62,8 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
 
 
 def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
-    """First node (3,) of each block, the centres that can reach its inner cells, and the centres in those."""
-    inner = NODES - 2 * reach - 1  # the cells whose eight nodes no mass from beyond the block reaches
+    """Return each block's first node (3,), centres in reach, centres inside."""
+    inner = NODES - 2 * reach - 1  # cells whose nodes no mass from beyond the block reaches
     blocks, which = np.unique(cells // inner, axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
     bounds = np.searchsorted(which.ravel()[order], np.arange(len(blocks) + 1))
@@ -86,7 +80,6 @@ def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
 
 
 def _sampled_kernel(kernel: KernelValue, voxel: float, reach: int) -> Float64:
-    """The sharpened kernel (2 reach + 1,) * 3 between nodes, zero beyond `reach` nodes."""
     axis = np.arange(-reach - 1, reach + 2) * voxel
     distance = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
     value = kernel(distance)
@@ -100,8 +93,7 @@ def _sampled_kernel(kernel: KernelValue, voxel: float, reach: int) -> Float64:
 
 
 def _own_terms(share: Float64, kernel: Float64) -> Float64:
-    """What each centre (N,) reads back of itself: the kernel between its nodes, by the products of their shares."""
-    same = share**2 + (1.0 - share) ** 2  # of an axis, that the mass and the reading fall on the same node
+    same = share**2 + (1.0 - share) ** 2  # by axis: share of mass and reading on the same node
     pair = np.stack([same, 1.0 - same])
     return np.asarray(
         sum(pair[x, :, 0] * pair[y, :, 1] * pair[z, :, 2] * kernel[x, y, z] for x, y, z in product((0, 1), repeat=3))
@@ -116,12 +108,11 @@ def _transformed_kernel(sampled: Float64) -> NDArray[np.complex128]:
 
 
 def _convolved(mass: Float64, transformed: NDArray[np.complex128]) -> Float64:
-    """The circular convolution: what wraps around stays within `reach` of the block's faces."""
+    """Convolve circularly: what wraps stays within `reach` of faces."""
     return np.asarray(irfftn(rfftn(mass) * transformed, s=mass.shape))
 
 
 def _corners(cells: Index, share: Float64) -> list[tuple[Index, Float64]]:
-    """Of the eight nodes around each centre: the index (N, 3), and the centre's share of it (N,)."""
     return [
         (cells + np.array(step), np.asarray(np.prod(np.where(step, share, 1.0 - share), axis=1)))
         for step in product((0, 1), repeat=3)
@@ -129,7 +120,6 @@ def _corners(cells: Index, share: Float64) -> list[tuple[Index, Float64]]:
 
 
 def _spread(cells: Index, share: Float64) -> Float64:
-    """Units spread over the nodes of a block (NODES,) * 3; what falls beyond it is left out."""
     mass = np.zeros(NODES**3)
     for node, part in _corners(cells, share):
         is_inside = ((node >= 0) & (node < NODES)).all(axis=1)
@@ -139,19 +129,15 @@ def _spread(cells: Index, share: Float64) -> Float64:
 
 
 def _read(density: Float64, cells: Index, share: Float64) -> Float64:
-    """The density (N,) at the centres."""
     return np.asarray(sum(part * density[tuple(node.T)] for node, part in _corners(cells, share)))
 
 
-BYTES_PER_PAIR = 44  # of the matrix and of the pairs that it is made of; 40 were measured
+BYTES_PER_PAIR = 44  # of the matrix and its pairs; 40 were measured
 
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """M of eq. 12 (N,) as ``scaled exp(log_scale)``, the iterations it took, and the largest residual that is left.
-
-    The residual is of a row, over the largest value asked for in the group of splats that the row belongs to.
-    """
+    """M of eq. 12 (N,) as ``scaled exp(log_scale)``; residual: relative to its group's largest y."""
 
     scaled: Float64
     log_scale: Float64
@@ -162,11 +148,11 @@ class Solution:
 def solve_process(
     centers: Float64, log_values: Float64, length: float, kernel: KernelValue, noise: float
 ) -> Solution:
-    """``(K(P, P) + noise I)^-1 y`` (eq. 8, 12) for centres (N, 3) [m] and y = exp(log_values) (N,).
+    """``(K(P, P) + noise I)^-1 y`` (eq. 8, 12) for centres (N, 3) [m], y = exp(log_values) (N,).
 
-    The kernel is cut off at 8 l. Splats that it does not join are groups apart, each with values scaled by its own
-    largest: y of a Matern kernel is ``e^(r / l)``, which overflows. Raises UsageError where the matrix does not fit
-    the memory or a group's values are too far apart, NotEvaluableError where the iteration does not converge.
+    The kernel is cut off at 8 l. Groups that it does not join are scaled by their largest y, as Matern's ``e^(r /
+    l)`` overflows. Raises UsageError for too little memory or too wide a spread of y, NotEvaluableError without
+    convergence.
     """
     matrix = _kernel_matrix(centers, length, kernel, noise)
     num_groups, group = connected_components(matrix, directed=False)
@@ -186,10 +172,10 @@ def solve_process(
 
 
 def conjugate_gradients(matrix: "csr_array", values: Float64, tolerance: float) -> tuple[Float64, int, float]:
-    """x (N,) with ``max |A x - y| <= tolerance``, the iterations, and that largest residual.
+    """x (N,) with ``max |A x - y| <= tolerance``, the iterations, and that residual.
 
-    A of unit diagonal needs no preconditioner. Raises NotEvaluableError where A shows a direction of no curvature,
-    or the residual stays above the tolerance for `CG_ITERATIONS`.
+    A unit diagonal needs no preconditioner. Raises NotEvaluableError if A is not positive definite or after
+    `CG_ITERATIONS`.
     """
     x = np.zeros(len(values))
     rest = values.copy()
@@ -222,7 +208,6 @@ def _not_solved(what: str) -> NotEvaluableError:
 
 
 def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: float) -> "csr_array":
-    """``K + noise I`` (N, N), zero between centres further than 8 l apart."""
     tree = cKDTree(centers)
     num_pairs = int(tree.count_neighbors(tree, KERNEL_REACH * length))
     needed, free = BYTES_PER_PAIR * num_pairs, available_memory()
@@ -260,15 +245,13 @@ class Matern12:
     length: float
 
     def value(self, distance: Float64) -> Float64:
-        """k(d)."""
         return np.asarray(np.exp(-distance / self.length))
 
     def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
-        """``log sum_j exp(-|p_i - p_j| / l)`` (N,)."""
         return _log_row_sums(points, self.length, is_matern=True, threads=threads)
 
     def share(self, tolerance: float) -> float:
-        """The share of the sum whose loss raises the distance by t [m], ``1 - exp(-t / l)``; 0.01 at most."""
+        """Share of the sum whose loss raises the distance by t [m], ``1 - exp(-t / l)``; at most 0.01."""
         return min(-float(np.expm1(-tolerance / self.length)), KERNEL_MAX_SHARE)
 
 
@@ -279,11 +262,9 @@ class SquaredExponential:
     length: float
 
     def value(self, distance: Float64) -> Float64:
-        """k(d)."""
         return np.asarray(np.exp(-0.5 * (distance / self.length) ** 2))
 
     def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
-        """``log sum_j exp(-|p_i - p_j|^2 / (2 l^2))`` (N,)."""
         return _log_row_sums(points, self.length, is_matern=False, threads=threads)
 
 
@@ -292,16 +273,15 @@ def _log_row_sums(points: ClusteredPoints, length: float, *, is_matern: bool, th
     return np.asarray(np.log(points.gathered(sums)))
 
 
-NO_LOG = -1e4  # of a weight that is exactly zero: too small to matter, and finite
+NO_LOG = -1e4  # for a weight of zero: negligible, and finite
 
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
     """w (N,) as ``sign exp(log_size)``: the occupancy is ``o(x) = sum_i w_i k_d(-r_i) k(x, p_i)``.
 
-    Without ``k_d(-r_i)`` for the Gaussian kernel, where radii enter by the shares of the terms. log_size (N,)
-    float64; sign (N,) float32 of +-1, None where all are positive; num_iterations and residual of what was solved
-    for them, None where nothing was.
+    The Gaussian kernel has no ``k_d(-r_i)``: radii enter by the terms' shares. sign (N,) +-1, None if all positive;
+    num_iterations, residual: of a solver.
     """
 
     log_size: Float64
@@ -313,21 +293,21 @@ class Weights:
 def row_sum_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
     """``w_i = 1 / (noise + sum_j k(p_i, p_j))``, j = i included: the mass-lumped inverse of eq. 15.
 
-    The diagonal of row sums stands for the kernel matrix, so that M of eq. 12 is ``w_i k_d(-r_i)``.
+    M of eq. 12 is ``w_i k_d(-r_i)``.
     """
     return _lumped(kernel.log_row_sums(spheres.points, threads=threads), noise)
 
 
 def voxel_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """`row_sum_weights` with the sums read from a voxel grid, in time linear in the number of splats (III-D)."""
+    """Return `row_sum_weights` from a voxel grid (III-D)."""
     return _lumped(np.log(voxel_row_sums(_centers(spheres), kernel.length, kernel.value)), noise)
 
 
 def process_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """The full Gaussian process of eq. 8, ``M = (K + noise I)^-1 y``: weights of either sign.
+    """Solve eq. 8, ``M = (K + noise I)^-1 y``: weights of either sign.
 
-    y is ``k_d(-r)`` for the Matern kernel, and ``w_i = M_i / k_d(-r_i)``; it is 1 for the Gaussian kernel, whose
-    ``k_d(-r) = k_d(r)`` loses the radius's sign, and ``w = M``.
+    Matern: y is ``k_d(-r)``, ``w_i = M_i / k_d(-r_i)``. Gaussian: y is 1, ``w = M``: ``k_d(-r) = k_d(r)`` loses the
+    radius's sign.
     """
     log_values = spheres.radii / kernel.length if isinstance(kernel, Matern12) else np.zeros(len(spheres.radii))
     solution = solve_process(_centers(spheres), log_values, kernel.length, kernel.value, noise)
@@ -346,16 +326,15 @@ METHODS: Mapping[str, Method] = {"rowsum": row_sum_weights, "voxel": voxel_weigh
 
 
 def weights_named(name: str, spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """The weights that the configuration names."""
+    """Weights of a configured method."""
     return METHODS[name](spheres, kernel, noise, threads)
 
 
 def _lumped(log_sums: Float64, noise: float) -> Weights:
-    with np.errstate(divide="ignore"):  # log 0 = -inf is the right log of no noise
+    with np.errstate(divide="ignore"):  # noise 0 gives log 0 = -inf, rightly
         return Weights(log_size=np.asarray(-np.logaddexp(log_sums, np.log(noise))), sign=None)
 
 
 def _centers(spheres: Spheres) -> Float64:
-    """Centres (N, 3) [m] relative to the anchor, as the kernels have them."""
     points = spheres.points
     return np.stack([points.gathered(axis.astype(np.float64)) for axis in points.clusters.centers], axis=1)

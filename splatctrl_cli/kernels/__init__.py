@@ -1,7 +1,7 @@
 """Compiled kernels: numpy in, numpy out. Imports nothing of ours.
 
-One module per instruction set is built; `native` is the best that this processor runs. SPLATCTRL_KERNELS=base or v3
-forces a plainer one; v3 (AVX2) and v4 (AVX-512) give the same bytes.
+`native` is the best for this processor's instruction set; SPLATCTRL_KERNELS=base or v3 forces a plainer one. v3
+(AVX2) and v4 (AVX-512) give the same bytes.
 """
 
 import importlib
@@ -31,19 +31,18 @@ native: Any = _best()
 
 
 def arithmetic() -> str:
-    """What results depend on: the plainest module that gives the same bytes as `native`."""
+    """Plainest module with `native`'s bytes."""
     name: str = native.__name__.rpartition(".")[2]
     return "_native_v3" if name == "_native_v4" else name
 
 
-MIN_CAP = 16  # threads that may be asked for on any machine
+MIN_CAP = 16  # threads allowed on any machine
 
 
 def num_threads(requested: int = 0) -> int:
-    """`requested`, but at most 16 or one per processor, whichever is more; one per processor where it is 0.
+    """Return `requested`, capped at 16 or the number of usable processors, whichever is more.
 
-    A processor is one that this process may use. The cap keeps thousands of threads from taking minutes to start;
-    results are the same for any number.
+    0 means one per processor. Starting thousands takes minutes; results do not depend on it.
     """
     if 0 < requested <= MIN_CAP:
         return requested

@@ -1,6 +1,6 @@
-"""Spheres on a kinematic tree, and gaps between pairs of them: typed wrappers, numpy in, numpy out.
+"""Spheres on a kinematic tree, and gaps between them.
 
-Shapes: B bodies, the first of them the base, J = B - 1 joints, S spheres, T postures, P pairs. All float64.
+Shapes: B bodies, the base first, J = B - 1 joints, S spheres, T postures, P pairs.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ REVOLUTE, PRISMATIC = 0, 1
 class Chain:
     """Body b > 0 hangs on its parent by joint b - 1: ``T_b = T_parent placement_b joint(q)``.
 
-    parent, kind (B,) int64, each parent before its body, `REVOLUTE` or `PRISMATIC`; placement (B, 3, 4), that of the
-    base its place in the world; axis (B, 3), unit; sphere_body (S,) int64; offset (S, 3) [m], in its body.
+    parent, kind (B,): parents first, `REVOLUTE` or `PRISMATIC`; placement (B, 3, 4), the base's in world; axis (B,
+    3), unit; sphere_body (S,); offset (S, 3) [m], in its body.
     """
 
     parent: Int64
@@ -29,7 +29,7 @@ class Chain:
     offset: Float64
 
     def centers(self, q: Float64, *, threads: int = 1) -> Float64:
-        """Sphere centres (T, S, 3) [m], world, at postures q (T, J)."""
+        """Sphere centres (T, S, 3) [m], world, at q (T, J)."""
         out = np.empty((len(q), len(self.sphere_body), 3))
         native.chain_centers(*self._arrays, np.ascontiguousarray(q), num_threads(threads), out)
         return out
@@ -42,7 +42,7 @@ class Chain:
         return centers, jacobians
 
     def frame(self, q: Float64, body: int, in_body: Float64) -> tuple[Float64, Float64]:
-        """The pose (3, 4), world, of a frame at `in_body` (3, 4) in a body, and its Jacobian (6, J), linear first."""
+        """World pose (3, 4) of a frame `in_body` (3, 4), Jacobian (6, J), linear first."""
         pose, jacobian = np.empty((3, 4)), np.empty((6, len(q)))
         native.chain_frame(*self._arrays, np.ascontiguousarray(q), body, in_body, pose, jacobian)
         return pose, jacobian
@@ -53,9 +53,9 @@ class Chain:
 
 
 def pair_gaps(centers: Float64, radii: Float64, pairs: Int64) -> tuple[Float64, Float64]:
-    """Gaps (P,) [m] between sphere surfaces and unit directions (P, 3) from the second centre to the first.
+    """Gaps (P,) [m] of sphere surfaces, unit directions (P, 3) from second to first centre.
 
-    centers (S, 3), radii (S,) [m]; pairs (P, 2) int64. A direction is zero where two centres coincide.
+    centers (S, 3), radii (S,) [m]; pairs (P, 2). Zero direction for coincident centres.
     """
     gap, direction = np.empty(len(pairs)), np.empty((len(pairs), 3))
     native.pair_gaps(np.ascontiguousarray(centers), radii, pairs, gap, direction)

@@ -1,7 +1,7 @@
-"""Distances to spheres and on baked grids: typed wrappers, numpy in, numpy out.
+"""Distances to spheres and on baked grids: typed wrappers.
 
-Shapes: N spheres laid out as C clusters of `LANES`, in G groups of as many clusters; Q points, (X, Y, Z) cells.
-Frames are the caller's; float32 wants an origin near the data.
+Shapes: N spheres as C clusters of `LANES`, in G groups of as many clusters; Q points, (X, Y, Z) cells. float32
+wants an origin near the data.
 """
 
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from splatctrl_cli.kernels import Float32, Float64, Int32, UInt8, native, num_th
 
 LANES = 16
 BLOCK = 8  # cells of a block along each axis
-SPARE_OFFSET = -1e30  # of an entry so far away that nothing ever takes it
+SPARE_OFFSET = -1e30  # of a spare entry: too far away to be nearest
 SPARE_PLACE = 1e15
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clusters:
-    """Spheres in groups of 16 neighbours with a box around each; C is a multiple of 16, G of 8, spare ones are far.
+    """Spheres in boxed clusters of 16; C is a multiple of 16, G of 8, spare ones far away.
 
-    centers (3, 16 C) float32 [m]; boxes (6, C + G) float32 [m], lower then upper corner, clusters then groups.
+    centers (3, 16 C) [m]; boxes (6, C + G) [m], lower then upper corner, clusters then groups.
     """
 
     centers: Float32
@@ -29,15 +29,15 @@ class Clusters:
 
     @property
     def arrays(self) -> tuple[Float32, Float32]:
-        """As the kernels take them."""
+        """Arguments of the kernels."""
         return self.centers, self.boxes
 
 
 @dataclass(frozen=True, kw_only=True)
 class Offsets:
-    """values (16 C,) float32: the o of ``|x - p| - o`` [m], or the b of ``|x - p|^2 - b`` [m^2]; -1e30 where spare.
+    """values (16 C,): o of ``|x - p| - o`` [m], or b of ``|x - p|^2 - b`` [m^2]; spare -1e30.
 
-    maxima (C + G,) float32: the largest of each cluster, then of each group.
+    maxima (C + G,): the largest of clusters, then groups.
     """
 
     values: Float32
@@ -45,16 +45,16 @@ class Offsets:
 
     @property
     def arrays(self) -> tuple[Float32, Float32]:
-        """As the kernels take them."""
+        """Arguments of the kernels."""
         return self.values, self.maxima
 
 
 @dataclass(frozen=True, kw_only=True)
 class GridSpan:
-    """The cells centred at ``origin + voxel (i, j, k)``, i in [first, last), of a grid of `shape`.
+    """The cells centred at ``origin + voxel (i, j, k)``, i in [first, last), of a grid.
 
-    origin (3,) float64 [m], in the spheres' frame; `first` is a multiple of `BLOCK`, and so is `last` unless
-    it is the grid's end. mask (blocks of the whole grid) uint8: zero where a block keeps what the channel has.
+    origin (3,) [m], in the spheres' frame; `first`, `last`: multiples of `BLOCK`, or the grid's end; mask (blocks
+    of the grid): zero where a block keeps its values.
     """
 
     origin: Float64
@@ -71,17 +71,17 @@ class GridSpan:
 
     @property
     def arrays(self) -> tuple[Float64, float, NDArray[np.int64], UInt8 | None]:
-        """Origin, voxel, sizes and mask as the kernels take them."""
+        """Arguments of the kernels."""
         sizes = np.array([*self.shape, self.first, self.last], dtype=np.int64)
         return self.origin, self.voxel, sizes, self.mask
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogSumExp:
-    """What a kernel field is made of beside its spheres, as `bake_matern` or `bake_gaussian` takes it.
+    """The terms of a kernel field.
 
-    offsets only cull; exact (16 C,): the offsets [m] of Matern, log weights of the Gaussian; radii (16 C,) [m];
-    tolerance: the share of the terms that may be left out of Matern, what that may raise the Gaussian by [m].
+    offsets: for culling; exact (16 C,): offsets [m] of Matern, log weights of the Gaussian; radii (16 C,) [m];
+    tolerance: share of the terms left out of Matern, or rise [m] of the Gaussian.
     """
 
     is_matern: bool
@@ -96,7 +96,7 @@ class LogSumExp:
 def nearest(
     spheres: Clusters, radii: Offsets, points: Float32, *, threads: int = 0
 ) -> tuple[Float32, Float32, Int32]:
-    """``min_i |x - p_i| - r_i`` (Q,) at points (Q, 3), its gradient (Q, 3), zero at a centre, its entry (Q,)."""
+    """``min_i |x - p_i| - r_i`` (Q,), its gradient (Q, 3), 0 at a centre, its entry (Q,)."""
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     entry = np.empty(len(points), np.int32)
     native.field_nearest(*spheres.arrays, *radii.arrays, points, num_threads(threads), score, gradient, entry)
@@ -113,10 +113,10 @@ def matern(
     *,
     threads: int = 0,
 ) -> tuple[Float32, Float32]:
-    """``-l log sum_i c_i exp(-(|x - p_i| - o_i) / l)`` (Q,) and its gradient (Q, 3), for points (Q, 3) float32.
+    """``-l log sum_i c_i exp(-(|x - p_i| - o_i) / l)`` (Q,) and its gradient (Q, 3).
 
-    sign (16 C,) the c, 1 where None. The terms left out are at most the share `truncation` of the sum of all sizes:
-    without signs the result is too large by at most ``-l log(1 - truncation)``. NaN where the sum is not positive.
+    sign (16 C,): c, 1 if None. Without signs, truncation of a share raises the result by at most ``-l log(1 -
+    truncation)``. NaN where the sum is not positive.
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     native.field_matern(
@@ -137,11 +137,11 @@ def gaussian(
     *,
     threads: int = 0,
 ) -> tuple[Float32, Float32]:
-    """``sqrt(-2 l^2 L) - sum_i pi_i r_i`` (Q,) and its gradient (Q, 3), for points (Q, 3) float32.
+    """``sqrt(-2 l^2 L) - sum_i pi_i r_i`` (Q,) and its gradient (Q, 3).
 
-    ``L = log sum_i c_i w_i exp(-|x - p_i|^2 / (2 l^2))`` and pi the shares of its terms. offsets ``2 l^2 log w_i -
-    common`` [m^2]; radii (16 C,) [m]; sign (16 C,) the c, 1 where None. Without signs the terms left out raise the
-    result by at most `tolerance` [m]. NaN where the root has no positive argument.
+    ``L = log sum_i c_i w_i exp(-|x - p_i|^2 / (2 l^2))``, pi the terms' shares. offsets: ``2 l^2 log w_i - common``
+    [m^2]; radii (16 C,) [m]; sign (16 C,): c, 1 if None. Without signs, truncation raises the result by at most
+    `tolerance` [m]. NaN unless the root's argument is positive.
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     native.field_gaussian(
@@ -173,9 +173,9 @@ def safe(
     *,
     threads: int = 0,
 ) -> tuple[Float64, Float64] | None:
-    """The smaller of `gaussian` and `nearest` (Q,) and its gradient (Q, 3); `nearest` where they are equal or NaN.
+    """The smaller of `gaussian` and `nearest` (Q,), its gradient (Q, 3); `nearest` if equal or NaN.
 
-    points (Q, 3) float64, in the frame that anchor (3,) is in. None where one of them is not finite.
+    points (Q, 3), in the frame of anchor (3,). None if one is not finite.
     """
     score, gradient = np.empty(len(points)), np.empty((len(points), 3))
     is_finite = native.field_safe(
@@ -196,9 +196,9 @@ def safe(
 
 
 def row_sums(spheres: Clusters, has_sphere: UInt8, length: float, *, is_matern: bool, threads: int = 0) -> Float64:
-    """``sum_j k(p_i, p_j)`` (16 C,) over the spheres where `has_sphere` (16 C,) is set, j = i included; 0 elsewhere.
+    """``sum_j k(p_i, p_j)`` (16 C,) over entries in `has_sphere` (16 C,), j = i included; else 0.
 
-    Terms are rounded to 2^-24 and added as integers: the order of the spheres does not matter to the bit.
+    Terms are rounded to 2^-24 and added as integers: order changes no bit.
     """
     total = np.empty(len(has_sphere))
     native.field_density(spheres.centers, spheres.boxes, has_sphere, is_matern, length, num_threads(threads), total)
@@ -215,7 +215,7 @@ def bake_hard(
     *,
     threads: int = 0,
 ) -> None:
-    """`nearest` at the cells of `span`, into distance (X, Y, Z), gradient (X, Y, Z, 3), entry (X, Y, Z)."""
+    """Write `nearest` at the cells of `span`; gradient is (X, Y, Z, 3)."""
     native.field_bake_hard(
         *spheres.arrays, *radii.arrays, *span.arrays, num_threads(threads), distance, gradient, entry
     )
@@ -230,7 +230,7 @@ def bake_gaussian(
     *,
     threads: int = 0,
 ) -> None:
-    """`gaussian` at the cells of `span`; the exact terms are ``log |w_i|``, the offsets ``2 l^2 log |w_i|``."""
+    """Write `gaussian` at the cells of `span`; exact: ``log |w_i|``, offsets: ``2 l^2 log |w_i|``."""
     native.field_bake_gaussian(
         *spheres.arrays,
         *terms.offsets.arrays,
@@ -255,7 +255,7 @@ def bake_matern(
     *,
     threads: int = 0,
 ) -> None:
-    """`matern` at the cells of `span`; the exact terms are the offsets in float64."""
+    """Write `matern` at the cells of `span`; exact: offsets in float64."""
     native.field_bake_matern(
         *spheres.arrays,
         *terms.offsets.arrays,
@@ -280,9 +280,9 @@ def touched_blocks(
     *,
     threads: int = 0,
 ) -> None:
-    """Set is_touched (blocks of the grid) to 1 where a sphere marked in `changed` (16 C,) can matter.
+    """Set is_touched (blocks) to 1 where spheres in `changed` (16 C,) can matter.
 
-    To `bake_hard` where `length` is None (offsets are the radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
+    They matter to `bake_hard` if `length` is None (offsets: radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
     """
     native.field_touched(
         *spheres.arrays,
@@ -296,10 +296,10 @@ def touched_blocks(
 
 
 def interpolate(values: Float32, origin: Float64, voxel: float, points: Float64) -> tuple[Float64, Float64]:
-    """Trilinear value (Q,) and the gradient (Q, 3) of that interpolant, for points (Q, 3) float64.
+    """Trilinear value (Q,) and that interpolant's gradient (Q, 3), for points (Q, 3).
 
-    values (X, Y, Z) float32 at the nodes ``origin + voxel (i, j, k)``. Outside: the value at the nearest point of the
-    box less the distance to it.
+    values (X, Y, Z) at ``origin + voxel (i, j, k)``. Outside: the value at the box's nearest point minus the
+    distance.
     """
     value, gradient = np.empty(len(points)), np.empty((len(points), 3))
     native.grid_interpolate(values, origin, voxel, points, value, gradient)
@@ -307,7 +307,7 @@ def interpolate(values: Float32, origin: Float64, voxel: float, points: Float64)
 
 
 def lipschitz_bound(values: Float32, origin: Float64, voxel: float, points: Float64) -> Float64:
-    """The largest ``value(corner) - |x - corner|`` (Q,) over the corners of each point's cell."""
+    """The largest ``value(corner) - |x - corner|`` (Q,) over corners of the cell."""
     bound = np.empty(len(points))
     native.grid_bound(values, origin, voxel, points, bound)
     return bound

@@ -1,8 +1,7 @@
-"""Anisotropic Gaussians on the rasteriser of the compiled module, with shapes checked and outputs allocated.
+"""Anisotropic Gaussians on the rasteriser.
 
-Shapes: N Gaussians, (H, W) pixels. A row of `parameters` (N, 59) float32 is centre (3) [m], log scales (3), wxyz
-quaternion (4, of any length but zero), logit opacity, then 16 spherical-harmonic coefficients each of red, green and
-blue.
+Shapes: N Gaussians, (H, W) pixels. `parameters` (N, 59): centre (3) [m], log scales (3), wxyz quaternion (4, any
+length but zero), logit opacity, 16 spherical-harmonic coefficients each of red, green, blue.
 """
 
 from typing import Any
@@ -17,7 +16,7 @@ CENTER, LOG_SCALE, QUAT, LOGIT, HARMONICS = slice(0, 3), slice(3, 6), slice(6, 1
 
 
 class GaussianRasteriser:
-    """Renders one view of Gaussians at a time; keeps its buffers between calls."""
+    """Renders a view of Gaussians; keeps its buffers."""
 
     def __init__(self, num_threads: int) -> None:
         self.num_threads = num_threads
@@ -26,14 +25,14 @@ class GaussianRasteriser:
         self._shape = (0, 0)
 
     def prepare(self, camera: Float64, parameters: Float32, degree: int = 3) -> None:
-        """Project, colour (harmonics up to `degree`), sort and bin the Gaussians for a `pack_camera` camera."""
+        """Project, colour (harmonics to `degree`), sort and bin for a `pack_camera` camera."""
         if len(self._colors) != len(parameters):
             self._colors = np.empty((len(parameters), 3), np.float32)  # the kernel keeps a pointer to it
         self._shape = (int(camera[5]), int(camera[4]))
         native.prepare_gaussians(self.native, camera, parameters, degree, self._colors, self.num_threads)
 
     def forward(self) -> Float32:
-        """Planes (5, H, W) of the prepared view: red, green, blue, depth [m], accumulated opacity."""
+        """Planes (5, H, W), as in `kernels.raster`."""
         planes = empty_planes(*self._shape)
         self.native.forward(planes, self.num_threads)
         return planes

@@ -1,6 +1,6 @@
-"""Straight edges in joint space proved free of solids and of the arm itself: a typed wrapper, numpy in, numpy out.
+"""Straight edges in joint space proved free of solids and self-collision.
 
-Shapes: E edges, J joints, R rows (M moving spheres, then P pairs). All float64.
+Shapes: E edges, J joints, R rows (M moving spheres, then P pairs).
 """
 
 from dataclasses import dataclass, replace
@@ -10,19 +10,18 @@ import numpy as np
 from splatctrl_cli.kernels import Float64, Int64, native, num_threads
 from splatctrl_cli.kernels.chain import Chain
 
-PART = 10  # spheres that are passed over together, at most
+PART = 10  # most spheres that one ball skips together
 
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeRoom:
     """An arm among solids; made by `of`.
 
-    chain: its last K spheres are middles of parts of the bodies, and a ball of radius (K,) [m] about one holds the
-    centres of that part. moving (M,), pairs (P, 2) spheres, ordered by part; taken (R,) [m] off each row; levers
-    (R, J) [m/rad]. groups (G, 4): first part, second part (-1: the solids), first row, one past the last; group_taken
-    (G,), group_levers (G, J): the largest of any of their rows. Solids are rows: balls (., 4) center and radius;
-    boxes (., 15) the rotation and shift from world into their own axes and half sizes; rods (., 15) the same with
-    radius, half length along z, and what is added to the surface all about.
+    chain: its last K spheres are centres of body parts; balls of radius (K,) [m] around them contain the parts'
+    sphere centres. moving (M,), pairs (P, 2) spheres, ordered by part; taken (R,) [m] off rows; levers (R, J)
+    [m/rad]. groups (G, 4): first part, second part (-1: solids), first row, one past the last; group_taken (G,),
+    group_levers (G, J): their rows' largest. balls (., 4): center, radius; boxes (., 15): rotation and shift from
+    world, half sizes; rods (., 15): likewise, with radius, half length along z, padding.
     """
 
     chain: Chain
@@ -40,7 +39,7 @@ class EdgeRoom:
 
     @classmethod
     def of(cls, chain: Chain, moving: Int64, pairs: Int64, taken: Float64, levers: Float64) -> "EdgeRoom":
-        """The arm of a chain without solids; moving (M,), pairs (P, 2), taken (R,), levers (R, J) in any order."""
+        """Make an arm without solids from rows in any order."""
         part, part_body, middles, radius = _parts(chain)
         between = np.concatenate(
             [np.stack([part[moving], np.full(len(moving), -1)], axis=1), part[pairs].reshape(-1, 2)]
@@ -70,7 +69,7 @@ class EdgeRoom:
         )
 
     def among(self, balls: Float64, boxes: Float64, rods: Float64) -> "EdgeRoom":
-        """The same arm among other solids."""
+        """Return the arm among other solids."""
         return replace(self, balls=balls, boxes=boxes, rods=rods)
 
     def advance(
@@ -85,12 +84,10 @@ class EdgeRoom:
         only_whole: bool,
         threads: int = 1,
     ) -> tuple[Float64, Int64]:
-        """The share (E,) of edges start (E, J) to end (E, J) that is proved free from the start, and the postures
-        (E,) that were asked.
+        """Share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,).
 
-        A row less `rounding` that is below `contact` [m] is in collision; one that an edge does not move is taken to
-        lose `still` [m] over it. Less than `give_up` [rad] before a collision is left. Where only_whole, an edge that
-        is not all free has share 0.
+        A row that less `rounding` is below `contact` [m] collides; one that an edge does not move loses `still`
+        [m]. The proof stops `give_up` [rad] before a collision. With only_whole, an edge not all free has share 0.
         """
         share, num_checks = np.empty(len(start)), np.empty(len(start), np.int64)
         native.advance_edges(
@@ -126,9 +123,7 @@ class EdgeRoom:
 
 
 def _parts(chain: Chain) -> tuple[Int64, Int64, Float64, Float64]:
-    """The part (S,) of every sphere; the body (K,) of every part, and the middle (K, 3) and radius (K,) [m] of a ball
-    in it that holds the part's centres.
-    """
+    """Part (S,) of each sphere; body (K,), middle (K, 3), radius (K,) [m] of each part."""
     part = np.empty(len(chain.sphere_body), np.int64)
     bodies: list[int] = []
     middles: list[Float64] = []
@@ -145,7 +140,6 @@ def _parts(chain: Chain) -> tuple[Int64, Int64, Float64, Float64]:
 
 
 def _split(offset: Float64, spheres: Int64) -> list[Int64]:
-    """Spheres halved along their longest extent until there are at most `PART` of them."""
     if len(spheres) <= PART:
         return [spheres]
     axis = int(np.argmax(np.ptp(offset[spheres], axis=0)))

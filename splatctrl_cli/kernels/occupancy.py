@@ -1,4 +1,4 @@
-"""The voxel kernels of the compiled module: depth integration and entity bits, in place on the grid's arrays."""
+"""Voxel kernels, in place on a grid's arrays."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,9 @@ from splatctrl_cli.kernels import Float64, UInt8, native
 
 @dataclass(frozen=True, kw_only=True)
 class DepthImage:
-    """A depth image as the kernels take it.
+    """A depth image: intrinsics (6,) fx, fy, cx, cy, width, height; T_world_camera (4, 4); depth (H, W) [m].
 
-    intrinsics (6,) float64: fx, fy, cx, cy, width, height; T_world_camera (4, 4) float64; depth (H, W) float32 [m];
-    depth nearer than min_range does not count, depth beyond max_range is no hit.
+    Below min_range depth does not count; beyond max_range it is no hit.
     """
 
     intrinsics: Float64
@@ -24,7 +23,7 @@ class DepthImage:
 
 
 def pack_grid(origin: Float64, voxel: float, shape: tuple[int, ...]) -> Float64:
-    """A grid as the kernels take it: (7,) float64."""
+    """Grid (7,) as the kernels take it."""
     return np.concatenate([origin, [voxel], shape]).astype(np.float64)
 
 
@@ -42,12 +41,11 @@ def integrate_depth(
     step: int,
     num_threads: int,
 ) -> None:
-    """Add one depth image to log_odds and num_updates (X, Y, Z); last_seen (X, Y, Z) becomes `step` where they
-    change. hits (X, Y, Z) is scratch, zero before and after.
+    """Add a depth image to log_odds and num_updates (X, Y, Z); changed voxels get last_seen `step`.
 
-    A voxel that holds a pixel's point is a hit. Else it is a miss where its centre falls on a pixel whose depth lies
-    beyond the centre; a pixel without depth takes that of the nearest one with it, up to where the two rays are
-    half a voxel apart. Depth beyond max_range frees what is nearer.
+    A voxel with a pixel's point is a hit, else a miss if its centre is before its pixel's depth. A pixel without
+    depth takes the nearest one's, while their rays are within half a voxel. Depth beyond max_range frees nearer
+    voxels. hits: scratch, zero before and after.
     """
     native.integrate_depth(
         grid, log_odds, num_updates, last_seen, hits, image.intrinsics, image.T_world_camera, image.depth,
@@ -65,7 +63,7 @@ def label_hits(
     clear_bits: int = 0,
     num_threads: int,
 ) -> None:
-    """Set or clear bits of entity (X, Y, Z) in voxels that hold the point of a pixel with chosen (H, W) not 0."""
+    """Set or clear bits of entity (X, Y, Z) at points of chosen (H, W) pixels."""
     native.label_hits(
         grid, entity, image.intrinsics, image.T_world_camera, image.depth, chosen, image.min_range, image.max_range,
         set_bits, clear_bits, num_threads,
@@ -73,5 +71,5 @@ def label_hits(
 
 
 def mark_spheres(grid: Float64, entity: UInt8, centers: Float64, radii: Float64, bits: int, num_threads: int) -> None:
-    """OR bits into the voxels of entity (X, Y, Z) that meet a sphere; centers (S, 3) [m], radii (S,) [m]."""
+    """OR bits into voxels of entity (X, Y, Z) that spheres (S, 3), (S,) [m] meet."""
     native.mark_spheres(grid, entity, centers, radii, bits, num_threads)

@@ -1,5 +1,6 @@
-"""What is asked of many points at once, compiled: views that see through them, their cubes, splats and solids near
-them. The same bytes at any thread count, those of the NumPy expressions in tests/reference/points.py.
+"""Queries of many points: views through them, cubes, nearby splats and solids.
+
+Bytes equal the NumPy expressions in tests/reference/points.py, at any thread count.
 """
 
 from collections.abc import Sequence
@@ -13,8 +14,9 @@ from splatctrl_cli.kernels import Bool, Float32, Float64, Int64, native
 
 
 def back_projected(camera: Float64, depth: Float32, chosen: Bool | None = None, num_threads: int = 1) -> Float64:
-    """Points (K, 3) [m], world, of the chosen (H, W) pixels of a depth image (H, W) [m], by default all, row after
-    row; camera (18,): `pack_camera`, but with the transform from camera to world.
+    """Points (K, 3) [m], world, of chosen (H, W) pixels of depth (H, W) [m], in row order.
+
+    camera (18,): `pack_camera`, with the transform from camera to world.
     """
     points = np.empty((depth.size if chosen is None else int(np.count_nonzero(chosen)), 3))
     pixels = None if chosen is None else np.ascontiguousarray(chosen).view(np.uint8)
@@ -25,8 +27,9 @@ def back_projected(camera: Float64, depth: Float32, chosen: Bool | None = None, 
 def seen_through(
     points: Float32, cameras: Sequence[Float64], nearest: Sequence[Float32], tolerance: float, num_threads: int = 1
 ) -> Bool:
-    """Points (N, 3) [m], world, nearer to a camera by more than `tolerance` [m] than the depth at their pixel; each
-    view is a `pack_camera` camera (18,) and its depths (H, W) [m], infinite where there is none.
+    """Points (N, 3) [m], world, more than `tolerance` [m] before the depth in some view.
+
+    Views: `pack_camera` cameras (18,), depths (H, W) [m], infinite if none.
     """
     out = np.empty(len(points), np.uint8)
     points = np.ascontiguousarray(points, np.float32)
@@ -36,9 +39,10 @@ def seen_through(
 
 @dataclass(frozen=True, kw_only=True)
 class CubeMeans:
-    """Of each of K cubes in the order of their places, x first: count (K,), mean center and color (K, 3), mean square
-    of color (K, 3), covariance (K, 6) xx, xy, xz, yy, yz, zz, and the index `nearest` (K,) of the point nearest to
-    the mean, the first of equals. Sums run in the order of the points.
+    """Statistics of K cubes ordered by place, x first, summed in the points' order.
+
+    count (K,); mean center, color, color^2 (K, 3); covariance (K, 6) xx, xy, xz, yy, yz, zz; nearest (K,): first
+    point nearest to the mean.
     """
 
     count: Float64
@@ -50,7 +54,7 @@ class CubeMeans:
 
 
 class Cubes:
-    """The K occupied cubes of edge `edge` [m] over points (N, 3) [m] with colours (N, 3)."""
+    """K occupied cubes of `edge` [m] over points (N, 3) [m]."""
 
     def __init__(self, points: Float32, edge: float, num_threads: int) -> None:
         self._points, self._num_threads = np.ascontiguousarray(points, np.float32), num_threads
@@ -60,13 +64,13 @@ class Cubes:
         return len(self._native)
 
     def members(self) -> tuple[NDArray[np.int32], Int64]:
-        """The cube of each point (N,), and the first point of each cube (K,)."""
+        """Return cubes (N,) of points, first points (K,) of cubes."""
         of_point, first = np.empty(len(self._points), np.int32), np.empty(len(self), np.int64)
         self._native.members(of_point, first, self._num_threads)
         return of_point, first
 
     def means(self, colors: Float32) -> CubeMeans:
-        """What the points of each cube have in common."""
+        """Return each cube's statistics."""
         num = len(self)
         count, nearest, covariance = np.empty(num), np.empty(num, np.int64), np.empty((num, 6))
         center, color, square = (np.empty((num, 3)) for _ in range(3))
@@ -80,24 +84,23 @@ class Cubes:
 
 
 class SplatTree:
-    """Balls, centers (N, 3) and radii (N,) [m], to look for from many points. Raises ValueError where a centre is not
-    finite.
-    """
+    """Balls, centers (N, 3), radii (N,) [m]. Raises ValueError for centres not finite."""
 
     def __init__(self, centers: Float32, radii: Float32, num_threads: int) -> None:
         self._num_threads = num_threads
         self._native: Any = native.SplatTree(np.ascontiguousarray(centers), np.ascontiguousarray(radii))
 
     def are_further(self, points: NDArray[np.floating], gap: float) -> Bool:
-        """Points (K, 3) further than `gap` [m] from each of the eight balls with the nearest centres."""
+        """Points (K, 3) further than `gap` [m] from the eight balls with nearest centres."""
         out = np.empty(len(points), np.uint8)
         self._native.are_further(np.ascontiguousarray(points, np.float64), gap, out, self._num_threads)
         return out.view(bool)
 
 
 def solid_distance(points: NDArray[np.floating], solids: Float64, num_threads: int = 1) -> Float64:
-    """Signed distance (N,) [m] of points (N, 3) to the nearest of solids (P, 16) as in `SurfaceScene`, negative
-    inside; infinite without any.
+    """Signed distance (N,) [m] of points (N, 3) to solids (P, 16) of `SurfaceScene`.
+
+    Negative inside; infinite without any.
     """
     distance, links = np.empty(len(points)), np.zeros(len(solids), np.int16)
     points = np.ascontiguousarray(points, np.float64)

@@ -1,6 +1,6 @@
-"""The splat rasteriser, image loss and optimiser of the compiled module, with shapes checked and outputs allocated.
+"""Splat rasteriser, image loss and optimiser: typed wrappers.
 
-Shapes: N splats, (H, W) pixels. `planes` are (5, H, W) float32: red, green, blue, depth [m], accumulated opacity.
+Shapes: N splats, (H, W) pixels. `planes` (5, H, W): red, green, blue, depth [m], accumulated opacity.
 """
 
 from dataclasses import astuple, dataclass
@@ -15,14 +15,14 @@ from splatctrl_cli.kernels import Float32, Float64, native
 def pack_camera(
     fx: float, fy: float, cx: float, cy: float, width: int, height: int, T_camera_world: Float64
 ) -> Float64:
-    """A camera as the kernels take it: (18,) float64."""
+    """Camera (18,) as the kernels take it."""
     return np.concatenate(
         [[fx, fy, cx, cy, width, height], T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3]]
     ).astype(np.float64)
 
 
 def empty_planes(height: int, width: int) -> Float32:
-    """Planes (5, H, W) to be written, at a whole cache line: a tile's row is one line then, not two."""
+    """Planes (5, H, W) aligned so that a tile's row is one cache line."""
     size = 5 * height * width
     memory = np.empty(size + 16, np.float32)
     first = -(memory.ctypes.data // 4) % 16
@@ -30,7 +30,7 @@ def empty_planes(height: int, width: int) -> Float32:
 
 
 class Rasteriser:
-    """Renders one view at a time and differentiates it; keeps its buffers between calls."""
+    """Renders and differentiates a view; keeps its buffers."""
 
     def __init__(self, num_threads: int) -> None:
         self.num_threads = num_threads
@@ -39,13 +39,13 @@ class Rasteriser:
         self._shape = (0, 0)
 
     def prepare(self, camera: Float64, centers: Float32, radii: Float32, opacities: Float32, colors: Float32) -> None:
-        """Project (eq. 1), sort and bin the splats for a `pack_camera` camera; arrays as in `SplatSet`."""
+        """Project (eq. 1), sort and bin splats for a `pack_camera` camera."""
         self._inputs = (centers, radii, opacities, colors)  # the kernel keeps pointers until the next call
         self._shape = (int(camera[5]), int(camera[4]))
         self.native.prepare(camera, centers, radii, opacities, colors, self.num_threads)
 
     def forward(self, out: Float32 | None = None) -> Float32:
-        """Planes (5, H, W) of the prepared view (eq. 2 and 3)."""
+        """Planes (5, H, W) (eq. 2 and 3)."""
         planes = empty_planes(*self._shape) if out is None else out
         self.native.forward(planes, self.num_threads)
         return planes
@@ -57,20 +57,20 @@ class Rasteriser:
         return gradients
 
     def project_backward(self, gradients: Float32) -> tuple[Float32, Float32]:
-        """Gradients of the centres (N, 3), world, and the radii (N,) from those of the footprints (N, 10)."""
+        """Gradients of centres (N, 3), world, and radii (N,) from `backward`'s."""
         centers, radii = self._inputs[:2]
         out = np.empty((len(radii), 4), np.float32)
         self.native.project_backward(centers, radii, gradients, out)
         return out[:, :3].copy(), out[:, 3].copy()
 
     def visible(self) -> NDArray[np.bool_]:
-        """(N,) True for splats on some tile's list."""
+        """True for splats (N,) on a tile's list."""
         out = np.empty(len(self._inputs[1]), np.uint8)
         self.native.visible(out)
         return out.astype(bool)
 
     def splats_per_tile(self) -> float:
-        """Mean length of the tile lists of the prepared view."""
+        """Mean length of the tile lists."""
         return float(self.native.splats_per_tile())
 
 
@@ -89,8 +89,8 @@ class LossTerms:
 class LossWeights:
     """Weights of eq. 4; `normalised` compares depth divided by accumulated opacity.
 
-    opacity weighs the mean transmittance where there is depth: a term of ours, 0 in the paper. background: the colour
-    that is seen through what the splats leave transparent; colour + (1 - opacity) background is compared.
+    opacity: of mean transmittance where there is depth, 0 in the paper; background: colour + (1 - opacity)
+    background is compared.
     """
 
     dssim: float
@@ -103,9 +103,7 @@ class LossWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class TargetView:
-    """What a camera saw: color (3, H, W) uint8; depth (H, W) float32 [m], 0 = none; counted (H, W) uint8, 0 = a pixel
-    whose colour and depth the map need not explain.
-    """
+    """An image: color (3, H, W); depth (H, W) [m], 0 = none; counted (H, W), 0 = ignored."""
 
     color: NDArray[np.uint8]
     depth: Float32
@@ -120,7 +118,7 @@ class ImageLoss:
         self._native: Any = native.ImageLoss()
 
     def evaluate(self, planes: Float32, view: TargetView, weights: LossWeights, out: Float32) -> LossTerms:
-        """Loss of planes (5, H, W) against a view; writes its derivative to out (5, H, W)."""
+        """Loss of planes (5, H, W); write its derivative to out (5, H, W)."""
         height, width = view.depth.shape
         w = weights
         l1, dssim, error, transmittance, squared = self._native.evaluate(
@@ -132,7 +130,7 @@ class ImageLoss:
 
 @dataclass(frozen=True, kw_only=True)
 class OptimiserSettings:
-    """Learning rates and limits of one step, in the order of the kernels; see `SceneConfig`."""
+    """Learning rates and limits, in kernel order; see `SceneConfig`."""
 
     lr_center: float
     lr_log_radius: float
@@ -148,7 +146,7 @@ class OptimiserSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Moments:
-    """Adam's state: first and second (N, 8) float32, num_steps (N,) uint32 since a slot was filled."""
+    """Adam's state: first, second (N, 8), num_steps (N,) since a slot was filled."""
 
     first: Float32
     second: Float32
@@ -163,9 +161,9 @@ def optimiser_step(
     settings: OptimiserSettings,
     seed: int,
 ) -> None:
-    """One Adam step on parameters (N, 8), in place, for the splats of the prepared view.
+    """Make one Adam step on parameters (N, 8) of the prepared view, in place.
 
-    Parameters are centre (3) [m], log radius, colour (3), logit opacity.
+    Parameters: centre (3) [m], log radius, colour (3), logit opacity.
     """
     native.optimiser_step(
         raster.native, gradients, parameters, moments.first, moments.second, moments.num_steps,

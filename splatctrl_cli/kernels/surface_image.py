@@ -1,4 +1,4 @@
-"""The depth image that a camera would measure of solids and triangles; compiled."""
+"""Rendered depth of solids and triangles: typed wrapper."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,11 +18,11 @@ links (F,) int16, numbers of at least 0. Corners that triangles of a link share 
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceScene:
-    """Solids (P) in a camera's optical frame and a mesh in the frames of links (L) [m].
+    """Solids (P) in a camera's optical frame and a mesh in link frames (L) [m].
 
-    solids (P, 16) float64: kind, the rotation (9) and shift (3) from the optical frame to the solid's own, its size:
-    half edges of a box; radius, half length along z and 0 of a cylinder or a capsule; radius, 0, 0 of a ball.
-    link_poses (L, 3, 4) lead from links to the optical frame. solid_links (P,) are numbers of at least 0.
+    solids (P, 16): kind, rotation (9) and shift (3) from optical to own frame, size: half edges of a box; radius,
+    half length along z, 0 of a cylinder or capsule; radius, 0, 0 of a ball. link_poses (L, 3, 4): link to optical
+    frame; solid_links (P,): at least 0.
     """
 
     solids: Float64
@@ -33,8 +33,9 @@ class SurfaceScene:
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceImage:
-    """depth (H, W) float32 [m] of the nearest surface, 0 = none; link (H, W) int16 of that surface, -1 = none; inside
-    (H, W) int16: the link of the solid that holds the measured point, -1 = none.
+    """depth (H, W) [m] of the nearest surface, 0 = none; link (H, W) of it.
+
+    inside (H, W): link of the solid around the measured point. -1 = none.
     """
 
     depth: Float32
@@ -53,9 +54,9 @@ def render_surface(
 ) -> SurfaceImage:
     """Cast a ray through every pixel's centre; intrinsics (6,): fx, fy, cx, cy, width, height.
 
-    measured (H, W) float32 [m], 0 = none: a measured point is inside a solid where it lies by more than `tolerance` +
-    `quadratic` depth^2 [m] behind its front and before its back along the ray; no triangle holds a point.
-    A solid that holds the camera is not seen, nor is a triangle that reaches behind the camera.
+    measured (H, W) [m], 0 = none: a point is inside a solid if over `tolerance` + `quadratic` depth^2 [m] behind
+    its front and before its back; triangles contain none. Solids around the camera and triangles that reach behind
+    it are not seen.
     """
     shape = (int(intrinsics[5]), int(intrinsics[4]))
     depth, link, inside = np.empty(shape, np.float32), np.empty(shape, np.int16), np.empty(shape, np.int16)

@@ -1,6 +1,4 @@
-"""Distances from points and balls to triangles, and what triangles enclose; compiled. The same bytes at any thread
-count.
-"""
+"""Distances to triangles; the same bytes at any thread count."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,19 +8,20 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.kernels import Bool, Float64, Int64, native
 
-INSIDE = 0.5  # of a winding number, from which a point is inside
+INSIDE = 0.5  # winding number above which a point is inside
 
 
 class TriangleTree:
-    """Triangles (F, 3, 3) [m], counter-clockwise seen from outside; they may be open and in pieces."""
+    """Triangles (F, 3, 3) [m], counter-clockwise from outside; open or in pieces, too."""
 
     def __init__(self, corners: Float64, num_threads: int = 1) -> None:
         self._num_threads = num_threads
         self._native: Any = native.TriangleTree(np.ascontiguousarray(corners, np.float64))
 
     def closest(self, points: Float64, bound: Float64 | float = np.inf) -> tuple[Float64, Int64, Float64]:
-        """The triangle nearest to each of points (N, 3) [m]: its distance (N,) [m], its number (N,), and the
-        barycentric coordinates (N, 3) of its nearest point; infinite, -1 and 0 beyond `bound` (N,) [m].
+        """Distance (N,) [m] and number (N,) of the triangle nearest to points (N, 3) [m].
+
+        Also its nearest points, barycentric (N, 3). Beyond `bound` (N,) [m]: infinite, -1, 0.
         """
         points = np.ascontiguousarray(points, np.float64)
         most = np.array(np.broadcast_to(np.float64(bound), len(points)))
@@ -31,7 +30,7 @@ class TriangleTree:
         return distance, face, shares
 
     def holds(self, points: Float64) -> Bool:
-        """Points (N, 3) [m] inside: the triangles surround them more than half (the winding number)."""
+        """Points (N, 3) [m] more than half surrounded (winding number)."""
         number = np.empty(len(points))
         self._native.winding(np.ascontiguousarray(points, np.float64), number, self._num_threads)
         return np.asarray(number > INSIDE)
@@ -39,9 +38,9 @@ class TriangleTree:
     def gaps(
         self, poses: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
     ) -> tuple[Float64, Int64]:
-        """Signed gap (T,) [m] from the nearest of balls (N, 3), (N,) [m] to the triangles, negative inside, in each
-        of poses (T, 4, 4) from the balls' frame to the triangles'; and the ball's number. Infinite and -1 without
-        any.
+        """Signed gap (T,) [m] and number of the nearest ball, negative inside.
+
+        Balls (N, 3), (N,) [m]; poses (T, 4, 4): from their frame to the triangles'. Infinite and -1 without any.
         """
         gap, ball = np.empty(len(poses)), np.empty(len(poses), np.int64)
         self._native.gaps(
@@ -62,11 +61,11 @@ def better(
     outside: Bool | None,
     num_threads: int,
 ) -> None:
-    """Lower the signed distance (N,) [m] of points (N, 3) to other surfaces, in place, where triangles are nearer.
+    """Lower signed distances (N,) [m] of points (N, 3), in place, where triangles are nearer.
 
-    poses: (4, 4), from the frame of the points to that of each tree. Triangles farther than `within` (N,) [m] do not
-    count, nor what is inside of them for points `outside` (N,). Where `enough` (N,) [m] is not negative, a distance
-    becomes any that is on the same side of `enough` and of `within`.
+    poses (4, 4): from points to each tree. Triangles beyond `within` (N,) [m] do not count, nor the inside for
+    points `outside` (N,). If `enough` (N,) [m] >= 0, any distance on the same side of `enough` and `within` will
+    do.
     """
     num = len(distance)
     native.signed_distance(

@@ -1,6 +1,6 @@
-"""The rasteriser as a torch function: for losses of one's own, and as the oracle of the fused optimiser.
+"""The rasteriser as a torch function: for other losses, and as oracle of the fused optimiser.
 
-The fitter does not use it; its loop needs no torch.
+The fitter needs no torch.
 """
 
 from typing import Any
@@ -22,10 +22,10 @@ def rasterise(
     *,
     threads: int = 0,
 ) -> torch.Tensor:
-    """Planes (5, H, W): red, green, blue, depth [m], accumulated opacity (eq. 1 to 3), differentiable.
+    """Planes (5, H, W), as in `kernels.raster` (eq. 1 to 3), differentiable.
 
-    camera (18,) as `scene.render.camera_array` gives it; centers (N, 3) [m], world; radii (N,) [m]; opacities (N,);
-    colors (N, 3); float32 on the CPU. No derivative with respect to the camera.
+    camera (18,): `scene.render.camera_array`; centers (N, 3) [m], world; radii (N,) [m]; opacities (N,); colors (N,
+    3); float32 on the CPU. No derivative by the camera.
     """
     planes: torch.Tensor = _Rasterise.apply(  # type: ignore[no-untyped-call]
         camera, centers, radii, opacities, colors, threads

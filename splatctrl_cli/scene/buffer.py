@@ -1,4 +1,4 @@
-"""A fixed budget of splat slots: parameters, Adam moments, labels. Dead slots stay, transparent, until reused."""
+"""A fixed budget of splat slots. Dead ones stay, transparent, until reused."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
 
 @dataclass(frozen=True, kw_only=True)
 class Seeds(Columns):
-    """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1], all float32."""
+    """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1]."""
 
     centers: Float32
     radii: Float32
@@ -23,7 +23,7 @@ class Seeds(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """Where seeds went: into fresh slots, into slots of dead splats, nowhere."""
+    """Numbers of seeds in fresh slots, reused slots, and none."""
 
     added: int = 0
     relocated: int = 0
@@ -36,7 +36,7 @@ class Filled:
 
 
 class SplatBuffer:
-    """M slots; arrays are changed in place and never grow."""
+    """M slots; arrays change in place and never grow."""
 
     def __init__(self, max_splats: int) -> None:
         self.parameters: Float32 = np.zeros((max_splats, 8), np.float32)
@@ -67,21 +67,18 @@ class SplatBuffer:
         return np.asarray(np.exp(self.parameters[:, LOG_RADIUS]), np.float32)
 
     def kill(self, slots: Bool) -> None:
-        """Make the slots of a mask (M,) dead: transparent, without moments, free for reuse."""
+        """Make the slots of a mask (M,) dead: transparent, without moments, reusable."""
         self.is_alive[slots] = False
         self.parameters[slots, LOGIT] = DEAD_LOGIT
         self.labels[slots] = Label.OBJECT
         self._reset(np.flatnonzero(slots))
 
     def set_radius(self, slots: NDArray[np.intp], radius: NDArray[np.floating] | float) -> None:
-        """Give the splats of slots (K,) a radius (K,) [m]."""
+        """Set radii (K,) [m] of slots (K,)."""
         self.parameters[slots, LOG_RADIUS] = np.log(radius)
 
     def fill(self, seeds: Seeds, opacity: float, keep_free: int = 0, label: Label = Label.OBJECT) -> Filled:
-        """Put seeds into dead slots, in slot order, with `opacity` and `label`; seeds beyond them are unmet.
-
-        The last `keep_free` dead slots are left alone.
-        """
+        """Put seeds into dead slots, in order, except the last `keep_free`; the rest are unmet."""
         dead = np.flatnonzero(~self.is_alive)
         slots = dead[: max(min(len(seeds), len(dead) - keep_free), 0)]
         count = len(slots)
@@ -97,10 +94,9 @@ class SplatBuffer:
         return Filled(added=count - num_reused, relocated=num_reused, unmet=len(seeds) - count)
 
     def copy(self, sources: NDArray[np.intp], opacities: Float64, radii: Float64) -> int:
-        """Make the first dead slots copies of slots `sources` (K,), with repetitions; returns how many there were.
+        """Copy slots `sources` (K,), with repetitions, into dead slots as available; return how many.
 
-        At most as many as are dead. opacities (M,) and radii (M,) [m] are what each source and its copies have from
-        now on. Labels go with the copies; moments of sources and copies start anew.
+        opacities (M,), radii (M,) [m]: new ones of sources and copies. Labels are copied; moments restart.
         """
         slots = np.flatnonzero(~self.is_alive)[: len(sources)]
         sources = sources[: len(slots)]
@@ -121,7 +117,7 @@ class SplatBuffer:
         self.num_uncertain[slots] = 0
 
     def splats(self, num_threads: int) -> SplatSet:
-        """The live splats, in slot order."""
+        """Live splats, in slot order."""
         centers, radii, colors, opacities = unpack_parameters(self.parameters, num_threads)
         alive = self.is_alive
         return SplatSet(
@@ -134,7 +130,7 @@ class SplatBuffer:
         )
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Every array by name: the buffer's whole state."""
+        """Whole state, by name."""
         return {
             "parameters": self.parameters,
             "first_moment": self.moments.first,

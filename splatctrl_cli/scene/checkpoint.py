@@ -1,4 +1,4 @@
-"""The whole state of a fitter as arrays, from which another goes on to the same bytes."""
+"""The whole state of a fitter as arrays, to continue with the same bytes."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -27,10 +27,9 @@ FRAME_NAMES = tuple(field.name for field in fields(RgbdFrame))
 
 
 def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
-    """Splats, Adam's moments, occupancy, window of frames, counters: views of what the fitter holds, not copies.
+    """Return splats, moments, occupancy, frames and counters: views, not copies.
 
-    There is no state of a random generator: each time step and each block of refining draws from one of its own,
-    seeded by its number.
+    No random state: each time step and block of refining seeds its own generator by number.
     """
     arrays: dict[str, NDArray[np.generic]] = dict(fitter.buffer.arrays())
     arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
@@ -62,7 +61,7 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
 
 
 def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
-    """Take over the state of a fitter with the same configuration, seed and workspace."""
+    """Restore the state of a fitter with the same configuration, seed and workspace."""
     for name, array in fitter.buffer.arrays().items():
         array[...] = arrays[name]
     for name in GRID_NAMES:
@@ -117,7 +116,7 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
 
 
 def workspace_of(arrays: Arrays) -> Box:
-    """The workspace of the fitter whose state this is."""
+    """Workspace of a fitter's state."""
     lower, upper = np.asarray(arrays["workspace"], np.float64)
     return Box(lower=lower, upper=upper)
 

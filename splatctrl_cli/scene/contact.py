@@ -1,4 +1,4 @@
-"""Objects beside the robot, where a camera sees least and the distance matters most."""
+"""Objects near the robot, where views are poorest and distances matter most."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,18 +20,18 @@ from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, farthest_within, 
 
 
 def is_in_contact(points_world: NDArray[np.floating], robot: RobotPosture) -> Bool:
-    """Points (N, 3) [m] within `CONTACT_REACH` of the robot's moving links."""
+    """True for points (N, 3) [m] within `CONTACT_REACH` of moving links."""
     return np.asarray(robot.distance_to_moving(points_world) < CONTACT_REACH)
 
 
 def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Bool:
-    """Pixels (H, W) of objects within `CONTACT_REACH` of the robot's moving links."""
+    """Pixels (H, W) of objects within `CONTACT_REACH` of moving links."""
     is_robot: Bool = mask.robot_depth > 0
     chosen: Bool = mask.kinds == PixelKind.OBJECT
     if not is_robot.any():
         return np.zeros_like(chosen)
     shown, reach = mask.robot_depth, pixels_of(CONTACT_REACH, frame, mask.robot_depth)
-    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT_REACH  # few, and all that may be
+    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT_REACH  # a quick superset
     chosen &= frame.depth < farthest_within(shown, reach) + CONTACT_REACH + CONTACT_THICKNESS
     chosen[chosen] = is_in_contact(world_points_at(frame, chosen), robot)
     return chosen
@@ -40,8 +40,9 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
 def count_carried(
     declared: Declarations, frame: RgbdFrame, mask: SelfMask, robot: RobotPosture, bare: RobotSurface, time_s: float
 ) -> None:
-    """Count the declared boxes that pixels of the robot needed: those that its `bare` surface, without what it
-    carries, does not explain. time_s: of the frame, from the first joint state.
+    """Count the declared boxes that explain robot pixels, where the `bare` surface does not.
+
+    time_s: of the frame, from the first joint state.
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     poses = dict(zip(surface.links, T_world_link, strict=True))
@@ -61,12 +62,11 @@ def contact_seeds(
     num_threads: int = 1,
     each: Each = map,
 ) -> Seeds:
-    """Seeds wherever an object beside the robot has no splat's centre within `contact_radius`, of half that radius:
-    larger ones stand out of a plane by more than the gaps between these are deep. mappable: pixels (H, W) of each
-    frame.
+    """Seeds on objects near the robot without a splat's centre within `contact_radius`.
 
-    The robot hides where the two meet, and a camera returns no depth at a step: so much of the surface beyond what is
-    measured is taken to be there.
+    Their radius is half of it: larger splats stand out of a plane by more than the gaps are deep. mappable: pixels
+    (H, W) of each frame. The robot hides the contact, and depth edges have no return: the surface is assumed to
+    extend that far beyond its measured part.
     """
     radius = config.contact_radius
     beside = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)
@@ -86,9 +86,9 @@ def contact_seeds(
 def hidden_objects(
     buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig
 ) -> NDArray[np.intp]:
-    """Slots (K,) of objects within `ROBOT_REACH` of the robot, its base included, that no pixel shows.
+    """Slots (K,) of objects within `ROBOT_REACH` of the robot, base included, that no pixel shows.
 
-    What an image shows there is the robot; fitting them to it would pull them out of their object.
+    Images show the robot there; fitting would pull them out of their object.
     """
     if robot is None:
         return np.zeros(0, np.intp)

@@ -1,5 +1,6 @@
-"""Rays that run through a surface which another camera measures: into a shiny thing that is measured far behind its
-place, or into a dark one that returns no depth at all.
+"""Rays through a surface that another camera measures: shiny or dark objects.
+
+Such an object is measured far behind its place, or returns no depth.
 """
 
 from collections.abc import Iterator
@@ -32,9 +33,8 @@ BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
 class Contradicted:
     """Blocks of `side` pixels (h, w) of a frame that another frame contradicts.
 
-    until (h, w) float32 [m]: the depth at which the block's rays run through the surface of another frame, 0 where
-    they do not; is_blank (h, w): the frame has no depth there. through (h, w) float32 [m]: the depth of the block's
-    own surface where rays of another frame run through it, 0 where none do.
+    until (h, w) [m]: where its rays cross another's surface, 0 = nowhere; is_blank (h, w): no depth there; through
+    (h, w) [m]: its own surface where another's rays cross it, 0 = nowhere.
     """
 
     side: int
@@ -43,16 +43,16 @@ class Contradicted:
     through: Float32
 
     def pixels(self, shape: tuple[int, ...]) -> Bool:
-        """The pixels (H, W) whose depth is of no surface: their rays run through that of another."""
+        """Pixels (H, W) whose depth is on no surface."""
         return self._spread((self.until > 0) & ~self.is_blank, shape)
 
     def unproven(self, frame: RgbdFrame) -> RgbdFrame:
-        """The frame without depth where rays of another run through its surface: its own rays prove no space free."""
+        """Frame without depth that another's rays cross: it proves no free space."""
         is_through = self._spread(self.through > 0, frame.depth.shape)
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
     def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Points (K, 3) [m], world, half a voxel apart on the rays of its blocks before the surface in question."""
+        """Points (K, 3) [m], world, half a voxel apart, on its rays before that surface."""
         end = np.maximum(self.until, self.through)
         v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
         depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
@@ -62,7 +62,6 @@ class Contradicted:
         return transform_points(frame.T_world_camera, (rays[:, None] * depths[:, None])[is_before])
 
     def _spread(self, blocks: Bool, shape: tuple[int, ...]) -> Bool:
-        """Pixels (H, W) of blocks (h, w)."""
         out = np.zeros(shape, bool)
         pixels = np.kron(blocks, np.ones((self.side, self.side), bool))
         out[: pixels.shape[0], : pixels.shape[1]] = pixels
@@ -71,9 +70,7 @@ class Contradicted:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surface:
-    """Points (K, 3) [m], world, of a frame's objects, and their block (K,) of the frame, rows and columns, and depth
-    (K,) [m]; none beside a step of depth.
-    """
+    """Object points (K, 3) [m], world, off depth edges, with block indices (K,) and depth (K,) [m]."""
 
     points: Float64
     v: Index
@@ -82,13 +79,12 @@ class _Surface:
 
 
 def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
-    """For each frame of one time step what the others, or the robot as it is drawn, contradict.
+    """Yield for each frame of a time step what other frames or the drawn robot contradict.
 
-    All rays of a block and of those beside it run through a surface that another frame measures, and end more than
-    `CONTRADICTED` [m] behind it, or return no depth: outside of a stereo shadow, within the range of depth of the
-    frame. So does a ray to a robot, drawn by its own surface, that returns no depth. Fewer than
-    `CONTRADICTING_PIXELS` blocks side by side are noise. Which of the two is wrong is not known: a ray proves no
-    space free either where others run through `SEEN_THROUGH_PIXELS` blocks of what it measures.
+    All rays of a contradicted block and its neighbours cross a surface of another frame. They end more than
+    `CONTRADICTED` [m] behind it, or return no depth, in range and outside stereo shadows. No return from the drawn
+    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong: rays
+    to `SEEN_THROUGH_PIXELS` crossed blocks prove no free space.
     """
     surfaces = [_surface(*one) for one in seen]
     through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
@@ -112,7 +108,7 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
 
 
 def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
-    """The mask, where contradicted depth is so called."""
+    """Mask with contradicted depth marked."""
     pixels = found.pixels(mask.kinds.shape)
     return replace(mask, kinds=np.where(pixels, np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
@@ -122,7 +118,7 @@ def _side(frame: RgbdFrame) -> int:
 
 
 def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
-    """Pixels (h, w, side^2) of the blocks of an image (H, W); what is over at its ends is left out."""
+    """Pixels (h, w, side^2) of an image's blocks."""
     h, w = (size // side for size in image.shape)
     parts = image[: h * side, : w * side].reshape(h, side, w, side)
     return parts.swapaxes(1, 2).reshape(h, w, side * side)
@@ -142,7 +138,7 @@ def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class _Rays:
-    """How far the rays of a frame's blocks (h, w) surely go [m], and which return nothing although they should."""
+    """Depth [m] that a block's rays reach (h, w), and blocks that unexpectedly return none."""
 
     frame: RgbdFrame
     side: int
@@ -152,7 +148,7 @@ class _Rays:
     @classmethod
     def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_Rays":
         side = _side(frame)
-        surely = cv2.erode(_blocks(frame.depth, side).min(axis=2), BESIDE)  # 0 beside lost pixels
+        surely = cv2.erode(_blocks(frame.depth, side).min(axis=2), BESIDE)  # 0 next to lost pixels
         is_lost = (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~shadowed(frame.depth, frame.intrinsics.fx)
         if frame.valid is not None:
             is_lost &= frame.valid
@@ -160,10 +156,7 @@ class _Rays:
         return cls(frame=frame, side=side, surely=surely, is_blank=np.asarray(is_blank))
 
     def run_through(self, surface: _Surface, until: Float32) -> Index:
-        """Note in `until` (h, w) how far off a surface is where the rays run through it.
-
-        Returns the surface's points behind which a ray measures something.
-        """
+        """Write the depth of crossed surface points into `until` (h, w); return those with depth behind."""
         pixel, z = pixels_at(self.frame, surface.points)
         width = self.frame.intrinsics.width
         v, u = pixel // width // self.side, pixel % width // self.side
@@ -176,7 +169,7 @@ class _Rays:
 
 
 def _side_by_side(depths: Float32, least: int) -> Float32:
-    """Depths (h, w) [m] of blocks and of their neighbours, where at least so many blocks are side by side."""
+    """Depths (h, w) [m] of blocks and neighbours, in groups of at least `least`."""
     wide = cv2.dilate(depths, BESIDE)
     num, piece = cv2.connectedComponents((wide > 0).view(np.uint8), connectivity=8)
     counts = np.bincount(piece[depths > 0], minlength=num)

@@ -1,11 +1,7 @@
-"""Space that cameras looked into and got no depth from: a dark, shiny or clear thing in full view leaves only a hole.
+"""Holes without depth, which may contain dark, shiny or clear objects.
 
-A hole is a group of pixels without depth that has depth all around it. What is in it stands somewhere on its rays,
-before what is seen beside it. Other cameras and later images that see through these rays clear them; what is left is
-where the thing may be.
-
-Depth is also lost on both sides of a step of depth: what lies in such a pixel is as likely the edge of the nearer
-surface, which goes on there, as what is behind it.
+Depth surrounds a hole. An object in it is on its rays, before what is seen around. Rays of other cameras and later
+images clear it. Depth is also lost at depth edges: the nearer surface may extend there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,16 +21,15 @@ from splatctrl_cli.scene.stereo_shadow import shadowed
 from splatctrl_cli.voxels import LostEdges
 
 BESIDE_ROBOT = np.ones((9, 9), np.uint8)  # its outline is fattened, too
-MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundred million
+MOST_POINTS = 1 << 18  # per batch: fine voxels and a large hole may need a hundred million
 
 
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
-    """Points (K, 3) [m], world, on the rays of a frame's holes, half a voxel [m] apart along each; some at a time,
-    some of them twice. The holes are found at once, the points when they are asked for.
+    """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
-    From `min_range` before the camera to the depth that is seen nearest to the pixel, on rays about a voxel apart;
-    holes up to `NARROW_HOLE` voxels wide do not count. robot_depth (H, W) [m]: of the rendered robot, 0 = none;
-    beside it what is far behind may show, so that it bounds none.
+    Some repeat. Rays are about a voxel apart, from `min_range` to the depth of the nearest pixel with depth. Holes
+    up to `NARROW_HOLE` voxels wide do not count, nor those at the robot, where background may show. robot_depth (H,
+    W) [m]: rendered, 0 = none.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
@@ -52,12 +47,10 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
 
 
 def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:
-    """How many pixels wide a voxel is at the median of depths (K,) [m]."""
     return config.voxel * frame.intrinsics.fx / float(np.median(depths))
 
 
 def _wide(pixels: Bool, width: float) -> Bool:
-    """Those of pixels (H, W) that lie in a square of them of this width."""
     side = int(width) | 1  # OpenCV shifts an even window
     opened = cv2.morphologyEx(pixels.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     return np.asarray(opened.view(bool))
@@ -66,7 +59,6 @@ def _wide(pixels: Bool, width: float) -> Bool:
 def _on_rays(
     frame: RgbdFrame, pixels: Bool, behind: Float32, apart: int, config: OccupancyConfig
 ) -> Iterator[Float64]:
-    """Points (K, 3) [m], world, before the depth behind (H, W) [m] of every pixel that is `apart` from the last."""
     v, u = np.nonzero(pixels[::apart, ::apart])
     v, u = v * apart, u * apart
     depths = np.arange(config.min_range, behind[v, u].max(initial=config.min_range), 0.5 * config.voxel)
@@ -78,14 +70,13 @@ def _on_rays(
 
 
 def _holes(is_blank: Bool, is_end: Bool) -> Bool:
-    """Pixels (H, W) without depth in groups that meet neither the image's border nor an end."""
+    """Pixels (H, W) without depth, in groups that meet neither border nor `is_end`."""
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
 
 
 def _nearest_depth(depth: Float32) -> Float32:
-    """For each pixel (H, W) the depth [m] of the nearest pixel that has one."""
     is_blank = (depth <= 0).view(np.uint8)
     _, which = cv2.distanceTransformWithLabels(is_blank, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     of_label = np.zeros(int(which.max()) + 1, np.float32)
@@ -95,23 +86,20 @@ def _nearest_depth(depth: Float32) -> Float32:
 
 
 BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
-NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its outline is lost, too, and is its own
+NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its own outline loses depth, too
 
 
 def lost_edges(
     seen: Sequence[tuple[RgbdFrame, SelfMask]], robot: RobotPosture | None, config: OccupancyConfig
 ) -> dict[str, LostEdges]:
-    """By camera, of the frames of one time step with their self-masks, a ball for each pixel without depth beside one
-    that shows an object, at the depth of the nearest object beside it. Its radius is a pixel: a surface that the
-    pixel shows ends before the next pixel's centre.
+    """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
-    One object pixel by itself is noise. Without what another frame sees through by `see_through`, and without what is
-    as near to the robot: that is its own outline.
+    Its depth is that of the nearest object next to it. Its radius is one pixel: a surface shown there ends before
+    the next centre. Lone object pixels are noise. Balls that a frame sees through by `see_through`, or that near to
+    the robot, are left out: the latter are its outline.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
-    surely = [
-        cv2.erode(frame.depth, BESIDE) for frame, _ in seen
-    ]  # 0, which sees through nothing, beside lost pixels
+    surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
     found = dict[str, LostEdges]()
     for frame, mask in seen:
         edges = _of_frame(frame, mask)

@@ -1,4 +1,4 @@
-"""The descent of the loss of eq. 4: renders the splats of a buffer and moves their parameters."""
+"""Descent of the loss of eq. 4 over the splats of a buffer."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,10 +25,10 @@ from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
 
 
 class Descent:
-    """The optimiser of a buffer's M splats; noise is drawn from the seed and the number of the iteration.
+    """Optimiser of a buffer's M splats, with noise drawn from seed and iteration.
 
-    background: the colour behind the splats, None until it is chosen. heard: called after each iteration. device:
-    where `run` and `rendering` are done, the processor if None; they raise DeviceError where it fails.
+    background: colour behind the splats, None until chosen. heard: called after each iteration. device: for `run`
+    and `rendering`, else the processor; failures raise DeviceError.
     """
 
     def __init__(
@@ -44,8 +44,9 @@ class Descent:
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
 
     def run(self, views: Sequence[View], settings: OptimiserSettings, depth: float = 1.0) -> dict[int, LossTerms]:
-        """An iteration on each view, with `depth` times the weight of the depth loss; the loss of each, by identity,
-        at the last iteration that looked at it.
+        """Run an iteration on each view; return each view's last loss, by id.
+
+        `depth` multiplies the weight of the depth loss.
         """
         weights = self._weights()
         weights = replace(weights, depth=depth * weights.depth)
@@ -70,7 +71,7 @@ class Descent:
         return terms
 
     def keep(self, views: Sequence[View]) -> None:
-        """From here on only these are looked at: images of others leave the device."""
+        """Drop other views' images from the device."""
         if self.device is not None:
             self.device.keep([view.target for view in views])
 
@@ -91,13 +92,13 @@ class Descent:
         return (self._seed << 32) + self.num_iterations
 
     def planes(self, view: View) -> Float32:
-        """Red, green, blue, depth and opacity (5, H, W) of a view, as the rasteriser blends them."""
+        """Planes (5, H, W) of a view, as in `kernels.raster`."""
         centers, radii, colors, opacities = unpack_parameters(self._buffer.parameters, self._num_threads)
         self._raster.prepare(view.camera, centers, radii, opacities, colors)
         return self._raster.forward()
 
     def rendering(self, view: View) -> Rendering:
-        """The same as an image, from the device if there is one."""
+        """Render a view, on the device if there is one."""
         if self.device is None:
             planes = self.planes(view)
         else:
@@ -106,7 +107,7 @@ class Descent:
         return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
 
     def evaluate(self, view: View) -> LossTerms:
-        """The loss of a view."""
+        """Loss of a view."""
         planes = self.planes(view)
         return self._loss.evaluate(planes, view.target, self._weights(), empty_planes(*view.target.depth.shape))
 
@@ -114,7 +115,7 @@ class Descent:
         return loss_weights(self._config, self.background or BLACK)
 
     def settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
-        """Learning rates times `rate`, those of centre and radius times `geometry`."""
+        """Learning rates times `rate`, of centre and radius times `geometry`."""
         c = self._config
         return OptimiserSettings(
             lr_center=c.lr_center * geometry,
@@ -130,9 +131,9 @@ class Descent:
         )
 
     def misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:
-        """Each view's colour error where it is mappable, and how much each slot shows (M,): blended opacity, summed.
+        """Colour error of each view where mappable, and summed blended opacity of each slot (M,).
 
-        The derivative of the sum of a colour plane with respect to a splat's colour is the sum of its weights.
+        The derivative of a summed colour plane by a splat's colour is the sum of its weights.
         """
         background = np.array(self.background, np.float32)[:, None, None]
         misfits, shown = [], np.zeros(self._config.max_splats)

@@ -1,4 +1,4 @@
-"""`SceneFitter.step`: one time step of the paper's Fig. 2, from RGB-D frames to an up-to-date splat set."""
+"""`SceneFitter.step`: one time step of the paper's Fig. 2."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -69,9 +69,9 @@ from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 
 
 class SceneFitter:
-    """Fits a fixed budget of isotropic splats to a stream of RGB-D frames.
+    """Fits a fixed budget of isotropic splats to RGB-D frames.
 
-    The whole state is in `checkpoint.fitter_state`; the same frames and seed give the same bytes at any thread count.
+    The same frames and seed give the same bytes at any thread count; `checkpoint.fitter_state` is the whole state.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class SceneFitter:
         self.workspace = workspace
         self.seed = seed
         self.num_threads = num_threads(threads)
-        self._each = ThreadPoolExecutor(self.num_threads).map  # what is asked of each view, of all of them at once
+        self._each = ThreadPoolExecutor(self.num_threads).map  # runs a function on all views at once
         self.buffer = SplatBuffer(config.max_splats)
         self.descent = Descent(config, self.buffer, seed, self.num_threads, device)
         self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
@@ -99,17 +99,17 @@ class SceneFitter:
         self.window = Window(config)
         self.shell = Shell(config, occupancy, workspace, seed, self.num_threads) if has_shell else None
         self.num_steps = 0
-        self.density: SeedDensity | None = None  # chosen by the first time step that has anything to seed
+        self.density: SeedDensity | None = None  # chosen by the first time step with seeds
         self.posture: RobotPosture | None = None
-        self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) that show what it carries
+        self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) of what it carries
         self.refined = Refined(num_blocks=0, filled=Filled(), removed=dict.fromkeys(REASONS, 0))
         self._unrepresented: Balls | None = None
-        self.bare: Balls | None = None  # of the last time step, before some were left out
-        self.seen: Seen = ()  # frames of the last time step, as its newest views have them, with their masks
-        self.objects: dict[str, Bool] = {}  # by camera, pixels (H, W) of its newest frame that show objects
+        self.bare: Balls | None = None  # of the last time step, before `confirmed`
+        self.seen: Seen = ()  # frames of the last time step, as in its newest views, with masks
+        self.objects: dict[str, Bool] = {}  # by camera, object pixels (H, W) of its newest frame
 
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
-        """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
+        """Take in the frames of one time step: integrate, remove, seed, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
         robot = robot and replace(robot, num_threads=self.num_threads)
         self._find_mounted(frames)
@@ -177,7 +177,7 @@ class SceneFitter:
         return replace(self._audit(views, filled, removed, terms), **audited(masks))
 
     def plant(self, cloud: PointCloud) -> Filled:
-        """Start from coloured points instead of depth: seeds so dense that they use a share `fill` of the budget."""
+        """Start from coloured points, seeded with a share `fill` of the budget."""
         source = Candidates(points=cloud.points, colors=cloud.colors, pixels=np.zeros(len(cloud), np.float32))
         count = max(int(self.config.fill * self.config.max_splats), 1)
         self.density = density_for([source], count, self.config)
@@ -185,10 +185,9 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def refine(self, num_iterations: int, progress: Callable[[int], None] = lambda _: None) -> AuditRow:
-        """Optimise over the window with learning rates that fall to `final_rate`; for scenes that do not move.
+        """Optimise a static scene over the window, with rates that fall to `final_rate`.
 
-        `progress` is called with the number of iterations done, after each of ten blocks; a restored fitter goes on
-        with the block after the last one done.
+        `progress` gets the iterations done after each of ten blocks; a restored fitter continues with the next.
         """
         views = [self.view(view.frame) for view in (*self.window.newest, *self.window.keyframes)]
         for block in range(self.refined.num_blocks, REFINE_BLOCKS):
@@ -208,7 +207,7 @@ class SceneFitter:
         self.descent.run(
             self.window.schedule(count, rng), settings, self.config.refine_depth ** (block / (REFINE_BLOCKS - 1))
         )
-        # What one view sees through stays here: its removal costs 0.6 dB where poses are off by millimetres.
+        # Splats that a view sees through stay: removing them costs 0.6 dB if poses are off by millimetres.
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
         if block < REFINE_BLOCKS - 2:
@@ -221,16 +220,16 @@ class SceneFitter:
         )
 
     def splats(self) -> SplatSet:
-        """The live splats."""
+        """Live splats."""
         return self.buffer.splats(self.num_threads)
 
     def shell_splats(self) -> SplatSet | None:
-        """What lies beyond the workspace, for pictures alone; None without a shell."""
+        """Splats beyond the workspace, for pictures only."""
         return None if self.shell is None else self.shell.splats()
 
     @property
     def unrepresented(self) -> Balls:
-        """What is occupied, not the robot, and has no splat, since the last time step or refining."""
+        """Occupied voxels without a splat, after the last step."""
         if self._unrepresented is None:
             seen = [view.frame.depth[::8, ::8] for view in self.window.newest]
             depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0, np.float32)
@@ -248,11 +247,11 @@ class SceneFitter:
         self._unrepresented = balls
 
     def known_voxels(self) -> KnownVoxels:
-        """What is known of space as it is now."""
+        """Present knowledge of space."""
         return self.occupancy.known(self.unrepresented)
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
-        """A frame as the optimiser takes it; mask: of a robot that is in it."""
+        """Frame as the optimiser takes it."""
         min_range = self.occupancy.config.min_range
         mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
         reach = NEAREST_REACH * (self.config.scale or 1.0)
@@ -260,7 +259,6 @@ class SceneFitter:
         return make_view(frame, mappable, self.mounted.get(frame.camera), is_robot=is_robot, reach=reach)
 
     def _find_mounted(self, frames: Sequence[RgbdFrame]) -> None:
-        """Tell apart what a camera carries, once it has been in enough places."""
         for camera in sorted({frame.camera for frame in frames} - set(self.mounted)):
             known = [view.frame for view in self.window.keyframes]
             seen = spread_views([frame for frame in [*known, *frames] if frame.camera == camera])
@@ -271,7 +269,7 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """The background: pixels without depth; if no view has depth, pixels that no planted splat covers."""
+        """Colour of pixels without depth, or without any depth, of pixels without splats."""
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]
@@ -281,7 +279,6 @@ class SceneFitter:
         return background_color([view.frame for view in views], counted)
 
     def _carry(self, robot: RobotPosture | None) -> None:
-        """Move the robot's splats with the link of the sphere they are nearest to."""
         before, self.posture = self.posture, robot
         if before is None or robot is None:
             return
@@ -289,7 +286,6 @@ class SceneFitter:
         self.buffer.centers[slots] = carried(self.buffer.centers[slots], before, robot)
 
     def _floating(self, views: Sequence[View]) -> Bool:
-        """Slots (M,) of splats that some view sees through."""
         is_floating = np.zeros(len(self.buffer.centers), bool)
         for label in (Label.OBJECT, Label.ROBOT):
             slots = np.flatnonzero(self._standing_for(label))
@@ -297,11 +293,10 @@ class SceneFitter:
         return is_floating
 
     def _relabel(self, robot: RobotPosture | None, seen: Seen) -> Bool:
-        """Label all splats anew; returns trails (M,). One that turns from robot to object gets the least radius."""
         return relabel(self.buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
-        """Remove what the optimiser moved off the robot, into the air or out, or made faint; counts in `removed`."""
+        """Remove what the optimiser moved off the robot, into air or out, or made faint."""
         drifted = self._relabel(robot, seen)
         self.buffer.kill(drifted)
         floating = self._floating(views)
@@ -329,7 +324,7 @@ class SceneFitter:
         return {reason: int(mask.sum()) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
-        """Fill dead slots at the pixels of M_add, as densely as uses `fill` of the budget on the first full view."""
+        """Fill dead slots at pixels of M_add; the first full view sets the density."""
         found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
         added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
         every = thinning(added)
@@ -369,10 +364,9 @@ class SceneFitter:
     def _fill_gaps(
         self, views: Sequence[View], masks: Sequence[SelfMask], removed: dict[str, int], half: int | None = None
     ) -> Filled:
-        """Put splats where a measured surface is far from every sphere: in one half of it a time step, by turns.
+        """Add splats where measured surfaces are far from all spheres, in alternate halves per step.
 
-        The robot's surface and everything else have spheres of their own. Where slots are missing, splats are evicted
-        for the latter every EVICT_EVERY time steps; counts in `removed`.
+        The robot's surface has spheres of its own. For other surfaces, slots are evicted every EVICT_EVERY steps.
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
@@ -401,17 +395,15 @@ class SceneFitter:
         return filled
 
     def _standing_for(self, label: Label) -> Bool:
-        """Slots (M,) of live splats that stand for the robot's surface, or for everything else."""
         is_robot: Bool = self.buffer.labels == Label.ROBOT
         return self.buffer.is_alive & (is_robot if label == Label.ROBOT else ~is_robot)
 
     def _show_contact(
         self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, steady: Sequence[Bool]
     ) -> Filled:
-        """Give objects beside the robot's moving links splats of half `contact_radius`, no farther apart than it.
+        """Give objects near moving links dense splats of half `contact_radius`.
 
-        They come from the steady pixels (H, W) of each frame alone. A single measurement may be noise, and stays in
-        the map for as long as the arm hides its place.
+        Only steady pixels count: noise would stay while the arm hides it.
         """
         if robot is None:
             return Filled()
@@ -423,13 +415,14 @@ class SceneFitter:
         seeds = contact_seeds(
             seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
         )
-        least = max((mask.reach for _, mask in seen), default=0.0)  # what noise leaves: nearer, no view tells
+        least = max((mask.reach for _, mask in seen), default=0.0)  # noise of depth: within it, no view sees through
         seeds = seeds.select(self._is_grounded(seeds.centers, views, least=least))
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
-        """Put objects' splats near the robot on what depth shows, and shrink them until they stay within it, down to
-        half of `contact_radius`; splats that no pixel shows get that radius at once.
+        """Put object splats near the robot on measured depth, and shrink those that stand out.
+
+        The least radius is half of `contact_radius`, at once for hidden splats.
         """
         if robot is None:
             return
@@ -445,7 +438,6 @@ class SceneFitter:
         self.buffer.set_radius(slots, np.where(is_hidden, np.minimum(radii, np.float32(least)), radii))
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
-        """Use dead slots that no seed needs, but for the reserve for gaps; counts in `removed`."""
         filled, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
         removed["weak"] += num_weak
         return filled
@@ -453,9 +445,7 @@ class SceneFitter:
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf
     ) -> Bool:
-        """Points (K,) of a label behind which no view sees by the smaller of `see_through` and `least` [m]: what one
-        sensor measured and another looks past was noise.
-        """
+        """Points (K,) that no view sees through by `see_through` or `least` [m]: others are noise."""
         gap = min(self.occupancy.config.see_through, least or np.inf)
         return ~seen_through(points, views, gap, self.num_threads, label)
 

@@ -1,4 +1,4 @@
-"""Sets of anisotropic Gaussians as rows of parameters, and how they look from a camera."""
+"""Anisotropic Gaussians as parameters, and their rendering."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ PER_CHANNEL = 16  # harmonics
 
 
 def parameters_of(gaussians: GaussianSet) -> Float32:
-    """Parameters (N, 59) of a set; opacities of 0 and 1 become the nearest that a logit can say."""
+    """Parameters (N, 59); opacities 0 and 1 become the nearest finite logit."""
     rows = np.zeros((len(gaussians), NUM_PARAMETERS), np.float32)
     rows[:, CENTER] = gaussians.centers
     rows[:, LOG_SCALE] = np.log(gaussians.scales)
@@ -37,7 +37,7 @@ def parameters_of(gaussians: GaussianSet) -> Float32:
 def render_gaussians(
     gaussians: GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0
 ) -> Rendering:
-    """Render `gaussians` from a pinhole camera at T_world_camera (4, 4); black where nothing is."""
+    """Render from a pinhole camera at T_world_camera (4, 4); black where empty."""
     raster = GaussianRasteriser(num_threads(threads))
     raster.prepare(camera_array(intrinsics, T_world_camera), parameters_of(gaussians))
     planes = raster.forward()

@@ -1,4 +1,4 @@
-"""The views that the optimiser looks at: the newest frame of each camera, and keyframes of cameras that move."""
+"""Views of the optimiser: newest frames, and keyframes of moving cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,8 +21,9 @@ DIRECTIONS = _STEPS / np.linalg.norm(_STEPS, axis=1, keepdims=True)  # (26, 3), 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame as the optimiser takes it; `nearest` (H, W) [m] is its `nearest_depth`, `nearest_object` that with the
-    robot's pixels told apart.
+    """A frame for the optimiser, with its `nearest_depth` (H, W) [m].
+
+    nearest_object: the same, with robot pixels counted apart.
     """
 
     frame: RgbdFrame
@@ -33,7 +34,7 @@ class View:
 
     @property
     def mappable(self) -> Bool:
-        """Pixels (H, W) whose depth the map has to explain."""
+        """Pixels (H, W) with depth to explain."""
         return np.asarray((self.target.counted != 0) & (self.target.depth > 0))
 
 
@@ -45,10 +46,10 @@ def make_view(
     is_robot: Bool | None = None,
     reach: float = NEAREST_REACH,
 ) -> View:
-    """A view of `frame`; `mappable` (H, W) are its pixels with a depth inside the workspace, `is_robot` the robot's.
+    """View of `frame`; `mappable` (H, W): pixels with depth in the workspace.
 
-    Pixels without depth count in the colour loss; pixels that are not valid, whose depth lies outside the workspace,
-    or that show what is `mounted` on the camera, do not count at all.
+    Pixels without depth count in the colour loss. Pixels that are invalid, `mounted`, or outside the workspace do
+    not count.
     """
     counted = mappable | (frame.depth <= 0)
     if frame.valid is not None:
@@ -69,11 +70,10 @@ def make_view(
 def seen_through(
     centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1, label: Label = Label.OBJECT
 ) -> Bool:
-    """Splats (N,) that float before what one of the views measured: nearer than every valid depth around their pixel.
+    """Splats (N,) that float: nearer than every valid depth around their pixel in some view.
 
-    "Around" is what `nearest_depth` says, and "nearer" by more than `tolerance` [m], so that neither a silhouette nor
-    the sensor's noise takes a splat off its surface. Finer than the voxels: a voxel that holds both a surface and the
-    air before it stays occupied. label: of the splats.
+    "Around" is as in `nearest_depth`, "nearer" by `tolerance` [m]: silhouettes and noise remove none. This is finer
+    than voxels: one with a surface and the air before it stays occupied.
     """
     cameras = [view.camera for view in views]
     nearest = [view.nearest if label == Label.ROBOT else view.nearest_object for view in views]
@@ -81,11 +81,10 @@ def seen_through(
 
 
 def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
-    """Centres (N, 3) [m], world, of which those that float up to `most` [m] lie on the measured surface.
+    """Centres (N, 3) [m], world, those that float up to `most` [m] put on the surface.
 
-    A centre floats where every view that sees its place measures a greater depth at its pixel and the next ones. It
-    goes back along the ray of the view with the smallest step, to the least of these depths. A view that measures a
-    depth more than `most` before the centre does not see its place.
+    A centre floats if all views that see it measure more depth around its pixel. It moves along the ray with the
+    smallest step. A view with depth over `most` before the centre does not see it.
     """
     least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
     for view in views:
@@ -103,9 +102,10 @@ def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
 def kept_radii(
     centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
 ) -> Float32:
-    """Radii (N,) [m] with which spheres stay within what the views measured: a sphere shrinks, down to `least` [m],
-    as long as a view sees a point of its edge before all depth of the next pixels by more than `tolerance` [m], or
-    the point that is nearest to the camera before the depth of the centre's pixel.
+    """Radii (N,) [m] that keep spheres within measured depth, at least `least` [m].
+
+    A sphere shrinks while a point of its edge floats by `tolerance` [m] before depth around its pixel in some view.
+    So it does while its nearest point floats before the centre pixel's depth.
     """
     cameras = [view.camera for view in views]
     depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]
@@ -120,7 +120,7 @@ def kept_radii(
         edge = np.ascontiguousarray(edge.reshape(-1, 3))
         floats = points.seen_through(edge, cameras, nearest, tolerance, num_threads).reshape(len(left), -1)
         is_out = floats.any(axis=1)
-        for number, camera in enumerate(cameras):  # of what is before a centre, its own pixel tells
+        for number, camera in enumerate(cameras):  # its own pixel shows what is before a centre
             before = np.ascontiguousarray(centers[left] + kept[left, None] * towards[left, number])
             is_out |= points.seen_through(before, [camera], [depths[number]], tolerance, num_threads)
         left = left[is_out & (kept[left] > least)]
@@ -129,7 +129,7 @@ def kept_radii(
 
 
 class Window:
-    """Newest views, and up to `config.window` keyframes, oldest dropped first."""
+    """Newest views and up to `config.window` keyframes; the oldest drop first."""
 
     def __init__(self, config: SceneConfig) -> None:
         self.config = config
@@ -137,7 +137,7 @@ class Window:
         self.keyframes: list[View] = []
 
     def advance(self, views: Sequence[View]) -> None:
-        """Make `views` the newest; those they replace become keyframes if their camera has moved since the last."""
+        """Make `views` the newest; replaced ones of moved cameras become keyframes."""
         fresh = {view.frame.camera for view in views}
         for old in self.newest:
             if old.frame.camera not in fresh:
@@ -153,10 +153,7 @@ class Window:
         return metres > self.config.keyframe_distance or degrees > self.config.keyframe_angle
 
     def schedule(self, num_iterations: int, rng: np.random.Generator) -> list[View]:
-        """The view of each iteration: newest views and keyframes in turn, each round in random order.
-
-        With keyframes, every round shows all newest views and as many keyframes.
-        """
+        """View of each iteration: shuffled rounds of newest views and as many keyframes."""
         views: list[View] = []
         while len(views) < num_iterations:
             count = min(len(self.keyframes), max(len(self.newest), 1))

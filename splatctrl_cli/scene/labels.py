@@ -1,4 +1,4 @@
-"""Which splats are the robot's or a person's, and which only were (III-C)."""
+"""Labels of splats, and trails of the robot and people (III-C)."""
 
 from collections.abc import Sequence
 
@@ -19,11 +19,10 @@ Seen = Sequence[tuple[RgbdFrame, SelfMask]]
 def relabel(
     buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture | None, seen: Seen = (), least: float = np.inf
 ) -> Bool:
-    """Label the splats anew; returns those (M,) that were robot or human and now are objects: trails.
+    """Relabel the splats; return trails (M,): robot or human before, object now.
 
-    Without a posture the robot's splats keep their label. A splat that the robot's pixels show is the robot's,
-    whatever a mask of people says. One of the robot's that measured depth shows to be an object stays: no trail. Its
-    radius becomes `least` [m] at most, because no object's depth has bounded it.
+    Without a posture, robot splats keep their label. Robot pixels overrule human masks. A robot splat that depth
+    shows to be an object is no trail; its radius becomes at most `least` [m], as no object's depth has bounded it.
     """
     labels = np.where(human_splats(buffer, occupancy), np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     if robot is None:
@@ -43,10 +42,9 @@ def relabel(
 def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture, seen: Seen) -> tuple[Bool, Bool]:
     """Splats (M,) of the robot, and those that a pixel shows to be an object.
 
-    By the pixel whose depth a splat explains best: one of the robot makes it the robot's, one of an object takes it
-    from the robot. A splat that no pixel shows keeps its label: what the robot hides or touches is still there, and
-    the robot's own splats stay its own where they are within `see_through` of its body. Well inside the body, in a
-    voxel that no object's pixel has hit, a splat is the robot's; and in any, where all of the robot is drawn.
+    The pixel whose depth a splat explains best decides. Splats that no pixel shows keep their label, since the
+    robot hides objects; its own must be within `see_through` of its body. Others well inside the body become robot,
+    in solid voxels only if all of it is drawn.
     """
     alive, config = buffer.is_alive, occupancy.config
     kind = shown_kinds(buffer.centers, seen, config)
@@ -62,9 +60,10 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
 
 
 def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
-    """The kind (N,) of the pixel whose depth is nearest to each of centers (N, 3) [m], world: `PixelKind.OBJECT`,
-    `ROBOT`, or `NOTHING` where none is near: within `see_through` of an object's depth, and not nearer to the robot's
-    rendered surface; within the tolerance of the robot's depth, so that what it hides is not taken for it.
+    """`PixelKind` (N,) of the pixel with depth nearest to centers (N, 3) [m], world.
+
+    OBJECT within `see_through`, unless nearer to the rendered robot; ROBOT within its tolerance, without what it
+    occludes; else NOTHING.
     """
     best = np.full(len(centers), np.inf, np.float32)
     kinds = np.full(len(centers), PixelKind.NOTHING, np.uint8)
@@ -83,10 +82,9 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
 
 
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:
-    """Splats (M,) of people: those in a voxel that a masked pixel hit.
+    """Splats (M,) in voxels that human pixels hit.
 
-    One that is human already stays so while any of the eight nearest voxels is: the optimiser moves splats about
-    their surface, and the surface is one voxel thick.
+    They stay human while one of the eight nearest voxels is: the surface is a voxel thick, and splats move.
     """
     is_in = occupancy.entity_at(buffer.centers) & Label.HUMAN > 0
     was_human = buffer.is_alive & (buffer.labels == Label.HUMAN)

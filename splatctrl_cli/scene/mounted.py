@@ -1,7 +1,7 @@
-"""Pixels that show what is mounted on a moving camera: a gripper, a bracket, the rim of a housing.
+"""Pixels of what is mounted on a moving camera, such as a gripper.
 
-They look the same in every image while the world moves past, so they belong to no place in the world: they are
-neither seeded nor compared. A known robot is told apart by its model instead (`labels`).
+They stay the same while the world moves: they are neither seeded nor compared. A known robot has a model instead
+(`labels`).
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 
 
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """At most `MOUNTED_MAX_VIEWS` frames, in order, each farther than `MOUNTED_APART` from all before it."""
+    """At most `MOUNTED_MAX_VIEWS` frames, more than `MOUNTED_APART` apart."""
     chosen: list[RgbdFrame] = []
     places: list[Float64] = []
     for frame in frames:
@@ -26,9 +26,9 @@ def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 
 
 def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None:
-    """(H, W) True where one camera's `spread_views` show what moves with it; None where they are fewer than six.
+    """Pixels (H, W) of what moves with one camera, by `spread_views`; None for fewer than six.
 
-    Such a pixel keeps its colour from view to view, is not flat, and has hardly a depth of `min_range` [m] or more.
+    They keep their colour, are not flat, and rarely have depth of `min_range` [m].
     """
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None
@@ -44,10 +44,9 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
 
 
 def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tuple[float, float, float]:
-    """Median colour in [0, 1] of the counted pixels (H, W) with no depth near them; black where they are too few.
+    """Median colour in [0, 1] of counted pixels (H, W) away from depth; black if too few.
 
-    What is too far, too dark or too bright for the sensor has no depth in a whole area; a hole in a surface has depth
-    around it.
+    Surroundings out of range, dark or bright lose depth in whole areas; a hole has depth around it.
     """
     parts = []
     for frame, mask in zip(frames, counted, strict=True):
@@ -62,7 +61,6 @@ def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tu
 
 
 def _entering(mask: Bool) -> Bool:
-    """The connected parts of a mask (H, W) that touch the image's border, without specks."""
     parts, _ = label(mask)
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     area = np.bincount(parts.ravel())

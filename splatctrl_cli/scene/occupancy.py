@@ -1,4 +1,4 @@
-"""The occupancy grid of III-C: what the depth images have seen free, occupied, or never."""
+"""The occupancy grid of III-C: space seen free, occupied, or never."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -12,7 +12,7 @@ from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_h
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
 from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, Balls, KnownVoxels, LostEdges, OccupancyGrid, Unseen
 
-MAX_STEPS = min(Unseen) - 1  # time steps that `last_seen` tells apart
+MAX_STEPS = min(Unseen) - 1  # distinct time steps in `last_seen`
 
 
 class OccupancyMap:
@@ -40,11 +40,10 @@ class OccupancyMap:
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
     def take_in(self, frames: Sequence[RgbdFrame]) -> None:
-        """Add the depth images of one time step, and set the human bit where human pixels of theirs hit.
+        """Add the depth images of one time step; human pixels set the human bit.
 
-        A voxel loses the bit when rays pass it, or when masked images hit it with other pixels alone. What nothing
-        passes and no masked image hits keeps it: who stands behind something is still there. Rays that pass take the
-        solid bit, too.
+        Rays that pass clear it, and the solid bit; other pixels of masked images clear it, too. Occluded people
+        stay.
         """
         self._begin_step(frames)
         masked = [(frame, frame.human) for frame in frames if frame.human is not None]
@@ -60,9 +59,7 @@ class OccupancyMap:
             self._label_hits(frame, mask != 0, set_bits=Label.HUMAN)
 
     def _begin_step(self, frames: Sequence[RgbdFrame]) -> None:
-        """Count a time step, by its earliest stamp. Where there are too many, every second one goes: what was seen in
-        it counts as seen in the one before.
-        """
+        """Count a time step; beyond `MAX_STEPS`, every second one merges into its predecessor."""
         if len(self.step_stamps_ns) == MAX_STEPS:
             self.step_stamps_ns = self.step_stamps_ns[::2]
             is_step = self.last_seen < min(Unseen)
@@ -70,7 +67,7 @@ class OccupancyMap:
         self.step_stamps_ns.append(min(frame.stamp_ns for frame in frames))
 
     def integrate(self, frame: RgbdFrame) -> None:
-        """Add one depth image: what its rays pass is free, where they end are hits; both are now last seen."""
+        """Add one depth image: free along its rays, hit at their ends."""
         integrate_depth(
             self._packed,
             self.log_odds,
@@ -96,8 +93,9 @@ class OccupancyMap:
         )
 
     def mark_unseen(self, points: Float64, reason: Unseen) -> None:
-        """Note why no camera saw the voxels that hold points (K, 3) [m], world. A voxel keeps what it has where one
-        did, or where it is contradicted or unanswered already.
+        """Note why no camera saw the voxels at points (K, 3) [m], world.
+
+        Seen, contradicted and unanswered voxels keep their value.
         """
         cells = np.floor((points - self.origin) / self.config.voxel + 0.5).astype(np.int64)
         i, j, k = cells[np.all((cells >= 0) & (cells < self.last_seen.shape), axis=1)].T
@@ -106,7 +104,7 @@ class OccupancyMap:
         self.last_seen[i[is_never], j[is_never], k[is_never]] = reason
 
     def unexplained(self, centers: Float64, radii: Float64) -> NDArray[np.intp]:
-        """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] whose reason may change."""
+        """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] with changeable reasons."""
         is_near = np.zeros_like(self.entity)
         mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
         voxels = np.flatnonzero(is_near)
@@ -115,22 +113,21 @@ class OccupancyMap:
         return np.asarray(voxels[is_open])
 
     def explain(self, voxels: NDArray[np.intp], reasons: NDArray[np.uint16]) -> None:
-        """Why voxels of flat indices (K,) were never seen: `Unseen` (K,)."""
+        """Set the `Unseen` reasons (K,) of voxels (K,)."""
         self.last_seen.reshape(-1)[voxels] = reasons
 
     def keep_edges(self, edges: Mapping[str, LostEdges]) -> None:
-        """By camera, instead of those of its image before; within the grid alone."""
+        """Replace these cameras' lost edges, within the grid."""
         upper = self.origin + self.config.voxel * (np.array(self.log_odds.shape) - 1)
         for camera, each in edges.items():
             self.edges[camera] = each.select(np.all((each.centers >= self.origin) & (each.centers <= upper), axis=1))
 
     def label_robot(self, centers: Float64, radii: Float64, seen: Sequence[tuple[RgbdFrame, Bool, Bool]]) -> None:
-        """Set the robot bit where the robot is, by its spheres (S, 3), (S,) [m] and its pixels, and nowhere else.
+        """Set the robot bit only where spheres (S, 3), (S,) [m] or pixels show the robot.
 
-        seen: frames of one time step, their pixels (H, W) of the robot and of objects. A voxel that an object's pixel
-        hits is solid until a ray passes it or only the robot's pixels hit it: it is not the robot's, whatever else is
-        in it. The robot's voxels become swept. When one of them becomes solid, its log-odds fall to those of one
-        hit: the robot's own pixels are no evidence of an object.
+        seen: frames of one time step, pixels (H, W) of robot and objects. A voxel that an object pixel hits is
+        solid, not robot, until rays pass or robot pixels alone hit. A swept voxel that becomes solid falls to the
+        log-odds of one hit: robot pixels do not count for an object.
         """
         was_solid = self.entity & SOLID > 0
         self.mark_robot(centers, radii)
@@ -144,10 +141,10 @@ class OccupancyMap:
         self.log_odds[is_new] = np.minimum(self.log_odds[is_new], self.config.log_odds_hit)
 
     def forget_hidden(self, centers: Float64, radii: Float64, distance: Callable[[Float32], Float64]) -> None:
-        """Take back that voxels within the robot are solid, where no solid voxel beside it is connected to them.
+        """Clear solid voxels within the robot that connect to none outside.
 
-        A robot and an object that left while it hid their contact: what else was solid there has been seen free.
-        centers (S, 3), radii (S,) [m] hold the robot; distance: points (Q, 3) -> signed distance (Q,) [m] to it.
+        Their object left while the contact was hidden. Spheres (S, 3), (S,) [m] contain the robot; distance: points
+        (Q, 3) -> signed distance (Q,) [m].
         """
         reach = radii.max() + 2.0 * self.config.voxel
         low, high = ((f - self.origin) / self.config.voxel for f in (centers.min(axis=0), centers.max(axis=0)))
@@ -164,7 +161,7 @@ class OccupancyMap:
         crop[tuple(cells[is_forgotten].T)] &= np.uint8(~SOLID & 0xFF)
 
     def mark_robot(self, centers: Float64, radii: Float64) -> None:
-        """Set the robot bit in the voxels that spheres (S, 3), (S,) [m] meet, and in no other; mark them swept."""
+        """Set the robot bit only in voxels that spheres (S, 3), (S,) [m] meet; mark these swept."""
         self.entity &= np.uint8(~Label.ROBOT & 0xFF)
         mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
 
@@ -180,14 +177,14 @@ class OccupancyMap:
         )
 
     def entity_at(self, points_world: Float32) -> NDArray[np.uint8]:
-        """Entity bits (N,) of the voxels that hold points (N, 3); 0 outside the grid."""
+        """Entity bits (N,) at points (N, 3); 0 outside."""
         cell = np.floor((points_world - self.origin) / self.config.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.entity.shape), axis=1)
         i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
         return np.where(is_inside, self.entity[i, j, k], np.uint8(0))
 
     def entity_around(self, points_world: Float32) -> NDArray[np.uint8]:
-        """Entity bits (N,) of the eight voxels nearest to each point (N, 3), together."""
+        """Entity bits (N,) of the eight nearest voxels, ORed."""
         bits = np.zeros(len(points_world), np.uint8)
         for corner in np.ndindex(2, 2, 2):
             offset = self.config.voxel * (np.array(corner, np.float32) - np.float32(0.5))
@@ -195,10 +192,10 @@ class OccupancyMap:
         return bits
 
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
-        """The largest occupancy (N,) of the eight voxels nearest to each point, and whether any was ever seen.
+        """Largest occupancy (N,) of the eight nearest voxels; True if one was seen.
 
-        A surface within half a voxel of a splat keeps it: the eight nearest centres reach that far on every side.
-        Never-seen voxels count only where all eight are (occupancy one half).
+        The eight reach half a voxel to all sides: a surface that near supports a splat. Never-seen ones count only
+        if all are (one half).
         """
         base = np.floor((points_world - self.origin) / self.config.voxel).astype(np.int64)
         limit = np.array(self.log_odds.shape) - 1
@@ -212,18 +209,18 @@ class OccupancyMap:
         return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32), is_observed
 
     def occupied_voxels(self) -> NDArray[np.intp]:
-        """Flat indices (K,) of voxels that were hit more than once (one hit may be noise) and are not the robot's."""
+        """Flat indices (K,) of voxels hit more than once, as one may be noise, except the robot's."""
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
         voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))
         return voxels[~self._may_be_robot(voxels)]
 
     def _may_be_robot(self, voxels: NDArray[np.intp]) -> Bool:
-        """Which of flat indices (K,) the robot was in, and no object since: what it left stays full for a while."""
+        """True for voxels (K,) swept, without an object since: they stay occupied a while."""
         return np.asarray(self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) == SWEPT)
 
     def swept_box(self) -> Box | None:
-        """The box around the voxels that the robot was in so far: around its path; None where it was in none."""
+        """Box of the robot's path so far; None without any."""
         is_swept = self.entity & SWEPT > 0
         found = [np.flatnonzero(is_swept.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
         if not len(found[0]):
@@ -241,7 +238,7 @@ class OccupancyMap:
         return self.centers_of(self.occupied_voxels())
 
     def grid(self) -> OccupancyGrid:
-        """A copy of the grid as it is now."""
+        """Copy of the present grid."""
         return OccupancyGrid(
             origin=self.origin.copy(),
             voxel=self.config.voxel,
@@ -251,7 +248,7 @@ class OccupancyMap:
         )
 
     def known(self, unrepresented: Balls) -> KnownVoxels:
-        """What is known of space as it is now, beside what no splat stands for."""
+        """Present knowledge of space."""
         return KnownVoxels(
             grid=self.grid(),
             last_seen=self.last_seen.copy(),
@@ -262,10 +259,9 @@ class OccupancyMap:
 
 
 class PeopleMemory:
-    """The voxels of people, and when a camera last looked at each: indices `voxels` (K,), `stamps_ns` (K,) int64.
+    """Flat indices `voxels` (K,) of people, and `stamps_ns` (K,) of their last observation.
 
-    What a camera sees as free or as something else is a person's no longer (`OccupancyMap.take_in`). What none has
-    looked at for longer than `memory` [s] is unknown: as if it had never been seen.
+    `OccupancyMap.take_in` clears voxels seen otherwise; unobserved for `memory` [s], they become never seen.
     """
 
     def __init__(self, memory: float) -> None:
@@ -274,7 +270,7 @@ class PeopleMemory:
         self.stamps_ns: NDArray[np.int64] = np.zeros(0, np.int64)
 
     def take_in(self, occupancy: OccupancyMap, frames: Sequence[RgbdFrame]) -> None:
-        """Add the depth images of one time step to a grid, and forget the people whom none has seen for too long."""
+        """Add a time step's depth images, and forget people unobserved for too long."""
         num_updates, log_odds = occupancy.num_updates.reshape(-1), occupancy.log_odds.reshape(-1)
         entity = occupancy.entity.reshape(-1)
         before = num_updates[self.voxels]
@@ -286,7 +282,7 @@ class PeopleMemory:
         entity[lost] &= np.uint8(~Label.HUMAN & 0xFF)
         log_odds[lost], num_updates[lost] = 0.0, 0
         if not len(self.voxels) and all(frame.human is None for frame in frames):
-            return  # there was nobody, and nobody came
+            return  # no people before or now
         self.voxels = np.flatnonzero(entity & Label.HUMAN)
         self.stamps_ns = np.full(len(self.voxels), now_ns, np.int64)
         is_still = np.isin(unseen, self.voxels)

@@ -1,4 +1,4 @@
-"""The robot in the scene: where its surface and its spheres are, and how its splats move with them."""
+"""The robot's surface and spheres in the scene, and its splats' motion."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,11 +14,10 @@ from splatctrl_cli.robot.surface import RobotSurface
 
 @dataclass(frozen=True, kw_only=True)
 class RobotPosture:
-    """Where the robot's spheres are: centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4).
+    """The robot's spheres and surface.
 
-    surface: the robot's collision geometry, None where its spheres are all that is known; surfaces: by frame stamp
-    [ns], where they differ; T_world_surface: likewise the poses (L, 4, 4) of the surface's links. num_threads: that
-    distances are computed on.
+    centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4); surface: None if only spheres are known;
+    surfaces: by frame stamp [ns], where different; T_world_surface: by stamp, poses (L, 4, 4) of its links.
     """
 
     centers: Float64
@@ -30,35 +29,36 @@ class RobotPosture:
     num_threads: int = 1
 
     def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
-        """The surface and the poses (L, 4, 4) of its links at a frame's stamp; of the spheres where there is none."""
+        """Surface and its links' poses (L, 4, 4) at a stamp, else of the spheres."""
         if self.surface is None:
             return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]
 
     def distance(self, points_world: NDArray[np.floating], without: Sequence[str] = ()) -> Float64:
-        """Signed distance (N,) [m] of points (N, 3) to the robot's surface at the newest stamp, negative inside; not
-        told beyond `ROBOT_REACH`. The links `without` do not count.
+        """Signed distance (N,) [m] of points (N, 3) to the robot at the newest stamp, negative inside.
+
+        Exact up to `ROBOT_REACH`; the links `without` do not count.
         """
         surface, T = self.seen_at(max(self.T_world_surface, default=0))
         return surface.distance(T, points_world, without=without, within=ROBOT_REACH, num_threads=self.num_threads)
 
     def holds(self, points_world: NDArray[np.floating], depth: float) -> Bool:
-        """Points (N, 3) [m] more than `depth` [m] within a robot of which all is drawn: no object is there."""
+        """Points (N, 3) [m] over `depth` [m] inside a fully drawn robot: no object is there."""
         if self.surface is None or not self.surface.is_drawn:
             return np.zeros(len(points_world), bool)
         return np.asarray(self.distance(points_world) < -depth)
 
     def distance_to_moving(self, points_world: NDArray[np.floating]) -> Float64:
-        """The same to the links that joints move."""
+        """Signed distance (N,) [m] to links that joints move."""
         return self.distance(points_world, () if self.surface is None else self.surface.fixed)
 
 
 def posture_of(
     robot: RobotModel, q: Float64, at_frames: Mapping[int, Float64], carried: Sequence[tuple[str, Box]] = ()
 ) -> RobotPosture:
-    """The robot at joint positions q (J,), and at those of each frame's stamp [ns].
+    """The robot at joint positions q (J,), and at each frame stamp [ns].
 
-    carried: boxes in the frames of links, which count as the robot's own surface.
+    carried: boxes in link frames, part of its surface.
     """
     spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried) if carried else robot.surface
     surfaces = {stamp: robot.surface_at(stamp) for stamp in at_frames} if robot.changes else {}
@@ -76,14 +76,13 @@ def posture_of(
     )
 
 
-POSTURE_NAMES = ("centers", "radii", "T_world_link")  # what the next time step needs to know of the last
+POSTURE_NAMES = ("centers", "radii", "T_world_link")  # kept for the next time step
 
 
 def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
-    """Points (N, 3) [m], world, moved rigidly with the link of the sphere whose surface each is nearest to.
+    """Move points (N, 3) [m], world, with the link of the nearest sphere surface.
 
-    Between two frames the arm moves by centimetres; splats that stay behind would be removed as a trail and the arm
-    re-seeded every frame. The paper does not move them.
+    Splats left behind would become trails, and the arm be seeded anew every frame. The paper does not move them.
     """
     gap = np.linalg.norm(points[:, None] - before.centers[None], axis=2) - before.radii
     sphere = np.argmin(np.abs(gap), axis=1)

@@ -1,4 +1,4 @@
-"""Whether a recording agrees with itself: cameras on where the surfaces are, and each camera's poses on a path."""
+"""Consistency of a recording: cameras agree on surfaces, poses form a path."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +15,9 @@ from splatctrl_cli.scene.seeding import world_points_at
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """How far apart two cameras place the surfaces that both see: median and lower quartile of |dz| [m], at `depth`
-    [m], over `num_pixels`. detour [m]: the least sum of medians by way of a third camera.
+    """Distance |dz| [m] between surfaces that two cameras both see: median and lower quartile.
+
+    depth [m]: of these surfaces; detour [m]: least sum of medians by way of a third camera.
     """
 
     cameras: tuple[str, str]
@@ -28,16 +29,15 @@ class Agreement:
 
     @property
     def limit(self) -> float:
-        """What two good cameras may differ by [m]: 3 cm, from 1 m on 3 % of the depth (2 % each, independent)."""
+        """Limit of good cameras [m]: 3 cm, beyond 1 m 3 % of depth (2 % each, independent)."""
         return fixed.PAIR_LIMIT * max(1.0, self.depth)
 
     @property
     def holds(self) -> bool:
-        """False where the median and the detour are above the limit, and the quartile above half of it.
+        """False if median and detour exceed the limit, and the quartile half of it.
 
-        Quartile and detour keep good cameras from failing on what only looks like one surface, front and back of a
-        thin thing seen from both sides: where poses are off, no share of the pixels agrees, and no third camera
-        agrees with both.
+        Both sides of a thin object look like one surface. Then a share of the pixels, or a third camera, still
+        agrees; with wrong poses neither does.
         """
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 
@@ -49,9 +49,9 @@ CAUSES = (
 
 
 def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) -> list[Agreement]:
-    """One for each pair of cameras with enough pixels that both see, from views of one moment or a still scene.
+    """Agreement of camera pairs with enough common pixels, in a still scene.
 
-    Views of one and the same camera are compared, too. Depth counts from `min_range` to `max_range` [m].
+    Views of one camera are paired, too. Depth counts from `min_range` to `max_range` [m].
     """
     chosen = spread(list(combinations(range(len(frames)), 2)), fixed.PAIR_MOST)
     found: dict[tuple[str, str], list[Float64]] = {}
@@ -82,7 +82,7 @@ def _agreement(cameras: tuple[str, str], rows: Float64) -> Agreement:
 
 
 def differences(a: RgbdFrame, b: RgbdFrame, min_range: float, max_range: float) -> Float64:
-    """|dz| and depth (K, 2) [m] in view b, at points of view a that land on depth of b within `PAIR_SAME_SURFACE`."""
+    """|dz| and depth (K, 2) [m] in view b, of view a's points within `PAIR_SAME_SURFACE`."""
     stride = max(1, a.intrinsics.height // fixed.PAIR_ROWS)
     is_used = np.zeros(a.depth.shape, bool)
     is_used[::stride, ::stride] = True
@@ -100,7 +100,7 @@ def differences(a: RgbdFrame, b: RgbdFrame, min_range: float, max_range: float) 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseJump:
-    """A camera that is `distance` [m] elsewhere in its next frame."""
+    """A camera that moves `distance` [m] between two frames."""
 
     camera: str
     distance: float
@@ -109,9 +109,9 @@ class PoseJump:
 
 
 def largest_jump(poses: Iterable[tuple[int, str, Float64]]) -> PoseJump | None:
-    """The furthest that a camera moved between two of its frames at most a second apart; None where there are none.
+    """Longest move of a camera between frames within a second; None without any.
 
-    poses: stamp [ns], camera and T_world_camera of each frame, by stamp.
+    poses: stamp [ns], camera and T_world_camera, by stamp.
     """
     last: dict[str, tuple[int, Float64]] = {}
     largest: PoseJump | None = None

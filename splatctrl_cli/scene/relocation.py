@@ -1,4 +1,4 @@
-"""What to do with splats that nothing needs: clones of opaque ones (3DGS-MCMC), or detail where colours are wrong."""
+"""Use of idle slots: clones (3DGS-MCMC), or detail where colours are wrong."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,11 +16,11 @@ from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thinned, thinning
 
 
 def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
-    """Opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies that stand for one isotropic splat.
+    """Opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies.
 
-    The peak is conserved, `a = 1 - (1 - alpha)^(1/N)`, and the blended opacity summed over the screen,
-    `r' = r sqrt(alpha / sum_{i=1..N} (1 - (1 - a)^i) / i)`: the 2-D rule. The 1-D rule of 3DGS-MCMC (Kheradmand et
-    al. 2024, eq. 9) loses a few percent of it.
+    The peak is conserved, `a = 1 - (1 - alpha)^(1/N)`, and the blended opacity over the screen, `r' = r sqrt(alpha
+    / sum_{i=1..N} (1 - (1 - a)^i) / i)`: the 2-D rule. The 1-D rule of 3DGS-MCMC (Kheradmand et al. 2024, eq. 9)
+    loses a few percent.
     """
     a = 1.0 - (1.0 - opacity) ** (1.0 / count)
     mass = np.zeros_like(opacity)
@@ -30,7 +30,7 @@ def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> t
 
 
 def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Indices (num_clones,) drawn in proportion to opacity, with replacement: the splats to be copied."""
+    """Draw indices (num_clones,) in proportion to opacity, with replacement."""
     total = float(opacities.sum())
     if num_clones < 1 or total <= 0.0:
         return np.zeros(0, np.intp)
@@ -48,7 +48,7 @@ def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Fil
 
 @dataclass(frozen=True, kw_only=True)
 class Misfit:
-    """One view's mean absolute colour error (H, W) against its frame, 0 where the map need not explain a pixel."""
+    """A view's mean absolute colour error (H, W), 0 in uncounted pixels."""
 
     frame: RgbdFrame
     error: Float32
@@ -60,15 +60,15 @@ def use_idle(
     config: SceneConfig,
     rng: np.random.Generator,
 ) -> tuple[Filled, int]:
-    """Put dead slots, beyond the reserve for gaps, to use as `when_idle` says; also how many weak splats gave theirs.
+    """Use dead slots beyond the reserve as `when_idle` says; return also the weak splats' number.
 
-    misfits: those of the views, and how much each slot (M,) shows in them.
+    misfits: of views, and how much each slot (M,) shows.
     """
     is_alive, reserve = buffer.is_alive, int(config.gap_reserve * config.max_splats)
     if config.when_idle == "leave" or not is_alive.any():
         return Filled(), 0
     found, shown = ([], None) if config.when_idle == "clone" else misfits()
-    if shown is None or not any(misfit.error.any() for misfit in found):  # no depth says where detail would be
+    if shown is None or not any(misfit.error.any() for misfit in found):  # no depth shows where detail would be
         return clone(buffer, int((~is_alive).sum()) - reserve, rng), 0
     weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
     is_weak = np.zeros(len(is_alive), bool)
@@ -79,10 +79,10 @@ def use_idle(
 
 
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
-    """At most `num_seeds` seeds of a pixel's size on measured surfaces, drawn by the squared colour error there.
+    """At most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
 
-    The error is a mean over 3 x 3 pixels; a pixel stands for the area of surface that it sees. No two are nearer to
-    each other than their diameters, so that several views do not seed the same spot.
+    The error is a 3 x 3 mean, weighted by a pixel's area of surface. Seeds keep their diameters apart, as views
+    share spots.
     """
     every = thinning(misfit.error > 0 for misfit in misfits)
     masks = [thinned(misfit.error > 0, every) for misfit in misfits]
@@ -101,8 +101,9 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
 
 
 def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """`count` different indices, drawn in proportion to weight (K,), of which as many are above 0: what
-    ``rng.choice(K, count, replace=False, p=weight / weight.sum())`` draws, without its checks of millions.
+    """Draw `count` different indices in proportion to weight (K,), at least `count` of them positive.
+
+    As ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, without its slow checks.
     """
     left = weight / weight.sum()
     found = np.zeros(0, np.intp)
@@ -117,7 +118,6 @@ def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.i
 
 
 def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[np.intp]) -> Seeds:
-    """The chosen (K,) of the pixels of masks (H, W), counted frame after frame, as seeds of their own size."""
     order = np.argsort(chosen, kind="stable")
     parts, first = [], 0
     for frame, mask in zip(frames, masks, strict=True):
@@ -136,7 +136,7 @@ def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[
 
 
 def _apart(points: Float32, distances: Float32) -> NDArray[np.intp]:
-    """Indices of points (K, 3), in order, that no kept one before them has within its distance (K,)."""
+    """Indices of points (K, 3) not within the distance (K,) of earlier kept ones."""
     is_taken = np.zeros(len(points), bool)
     neighbours = cKDTree(points).query_ball_point(points, distances)
     kept = []

@@ -1,4 +1,4 @@
-"""Which splats must go, and why (III-C); and which give their slots to observed surface that has none."""
+"""Removal of splats, by reason (III-C), and eviction for observed surface without splats."""
 
 import cv2
 import numpy as np
@@ -15,9 +15,10 @@ REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain"
 
 
 def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
-    """The least valid depth (H, W) [m] within `reach` [m] of each pixel, as far as that goes at the frame's median
-    depth; infinite where there is none. The robot's pixels count for themselves and their neighbours alone: beside
-    the robot, what is before everything else floats.
+    """Least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
+
+    `reach` is at the median depth. Robot pixels count only for themselves and neighbours: near the robot, what is
+    before all else floats.
     """
     depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
     valid = frame.depth[frame.depth > 0]
@@ -30,7 +31,7 @@ def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool
 
 
 def least_around(depth: Float32, half: int) -> Float32:
-    """The least value (H, W) of the square of 2 half + 1 pixels around each."""
+    """Least value (H, W) within `half` pixels."""
     window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
     return np.asarray(cv2.erode(depth, window, borderType=cv2.BORDER_REPLICATE), np.float32)
 
@@ -45,17 +46,14 @@ def removals(
     is_floating: Bool,
     counts_time: bool = True,
 ) -> dict[str, Bool]:
-    """Masks (M,) of live splats to remove, by reason; each splat under its first reason in `REASONS`.
+    """Masks (M,) of live splats to remove, each under its first reason in `REASONS`.
 
-    broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free.
-    seen_through: it floats before what a camera measured.
-    uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot or human, is no longer.
-    robot: none here; those that the optimiser moved off the robot or a person.
-    evicted: none here; those that gave their slot to surface that had none.
-    weak: none here; those that show least and are given up for detail elsewhere are counted under it by refining.
-    Updates the buffer's count of uncertain time steps,
-    where this is one. Splats whose surroundings were never seen stay, unless the
-    rule is "literal".
+    broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
+    seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: was
+    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
+
+    Splats in never-seen surroundings stay, unless the rule is "literal". `counts_time`: this is a time step, which
+    counts towards the patience.
     """
     config = occupancy.config
     centers = buffer.centers
@@ -99,10 +97,10 @@ def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tupl
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
-    """Slots (M,) of at most `num` splats to evict, and the seeds in the order in which they are to get slots.
+    """Slots (M,) of at most `num` splats to evict, and the seeds in order.
 
-    First redundant splats, those that show least first, then splats far from the robot's path, for seeds near it.
-    Only splats of objects go. shown (M,): how much each slot shows; tolerance [m]: as in `redundant`.
+    Only object splats go: redundant ones that show least, then those far from the robot's path, for seeds near it.
+    shown (M,): how much slots show; tolerance [m]: as in `redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
@@ -129,11 +127,11 @@ def redundant(
     tolerance: float,
     num_threads: int = 1,
 ) -> NDArray[np.intp]:
-    """At most `num_wanted` of the splats in `order`, the first of which all others together can do without.
+    """At most `num_wanted` splats of `order` that others can replace.
 
-    splats: N that stand for objects and people; voxels (K, 3) [m]: centres of what is occupied. A splat stands for
-    the voxels within `tolerance` [m] of its sphere (of eight splats with the nearest centres). One is redundant where
-    each of its voxels has another that stays: giving it up leaves no surface bare, to be seeded again at once.
+    splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within
+    `tolerance` [m] of its sphere, among the eight nearest centres. It may go if all its voxels keep another: this
+    bares no surface.
     """
     if not len(order) or not len(voxels) or num_wanted < 1:
         return np.zeros(0, np.intp)
@@ -155,10 +153,9 @@ def redundant(
 
 
 def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
-    """At most `num_wanted` splats (N, 3), farthest first, each of which is EVICT_NEARER or more farther from the
-    robot's path than a seed (K, 3) that gets its slot; seeds come nearest first.
+    """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
-    Farther by that much, so that no two surfaces ever take each other's slots in turn.
+    Each is EVICT_NEARER farther from the path than its seed: no two surfaces exchange slots in turn.
     """
     to_splat = distance_to_box(centers, path)
     farthest = np.argsort(-to_splat, kind="stable")[:num_wanted]

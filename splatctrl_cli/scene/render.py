@@ -1,4 +1,4 @@
-"""Renders a splat set from a camera, eq. 1 to 3 of the paper, and weighs its loss, eq. 4."""
+"""Rendering of a splat set, eq. 1 to 3 of the paper, and weights of its loss, eq. 4."""
 
 import math
 from collections.abc import Sequence
@@ -19,36 +19,36 @@ BLACK: Color = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Rendering:
-    """One view: color (H, W, 3) float32, depth (H, W) float32 [m] as eq. 3 blends it, opacity (H, W) float32."""
+    """One view: color (H, W, 3), depth (H, W) [m] as eq. 3 blends it, opacity (H, W)."""
 
     color: Float32
     depth: Float32
     opacity: Float32
 
     def normalised_depth(self) -> Float32:
-        """Depth divided by accumulated opacity (H, W) [m]; 0 where the opacity is below one half."""
+        """See `normalised_depth`."""
         return normalised_depth(self.depth, self.opacity)
 
     def before(self, background: Color) -> "Rendering":
-        """The same view with one colour behind it: color + (1 - opacity) background."""
+        """View before one colour: color + (1 - opacity) background."""
         behind = (1.0 - self.opacity)[..., None] * np.array(background, np.float32)
         return replace(self, color=self.color + behind)
 
 
 def normalised_depth(depth: Float32, opacity: Float32) -> Float32:
-    """depth / opacity (H, W) [m] where opacity >= 0.5, else 0."""
+    """Depth / opacity (H, W) [m] for opacity of 0.5 or more, else 0."""
     is_opaque = opacity >= OPAQUE_ENOUGH
     return np.where(is_opaque, depth / np.where(is_opaque, opacity, 1.0), 0.0).astype(np.float32)
 
 
 def camera_array(intrinsics: Intrinsics, T_world_camera: Float64) -> Float64:
-    """The (18,) float64 camera that the kernels take."""
+    """Camera (18,) that the kernels take."""
     k = intrinsics
     return pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, invert_transform(T_world_camera))
 
 
 def render(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0) -> Rendering:
-    """Render `splats` from a pinhole camera at T_world_camera (4, 4); black where nothing is."""
+    """Render from a pinhole camera at T_world_camera (4, 4); black where empty."""
     raster = Rasteriser(num_threads(threads))
     raster.prepare(
         camera_array(intrinsics, T_world_camera),
@@ -63,7 +63,7 @@ def render(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64, *,
 
 
 def loss_weights(config: SceneConfig, background: Color = BLACK) -> LossWeights:
-    """The weights that the image loss takes, and the colour behind the splats."""
+    """Weights of the image loss, and the colour behind the splats."""
     return LossWeights(
         dssim=config.lambda_dssim,
         color=config.lambda_color,
@@ -75,7 +75,7 @@ def loss_weights(config: SceneConfig, background: Color = BLACK) -> LossWeights:
 
 
 def mean_loss(terms: Sequence[LossTerms], config: SceneConfig) -> float | None:
-    """Mean over images of the image part of eq. 4; None where there is no image."""
+    """Mean over images of the image part of eq. 4; None without images."""
     c = config
     values = [
         c.lambda_color * ((1 - c.lambda_dssim) * t.l1 + c.lambda_dssim * t.dssim)
@@ -87,7 +87,7 @@ def mean_loss(terms: Sequence[LossTerms], config: SceneConfig) -> float | None:
 
 
 def psnr_of(terms: Sequence[LossTerms]) -> float | None:
-    """PSNR [dB] of the mean squared colour error over images; None where there is no image."""
+    """PSNR [dB] of the mean squared colour error over images; None without images."""
     if not terms:
         return None
     return -10.0 * math.log10(max(sum(t.squared for t in terms) / len(terms), 1e-12))

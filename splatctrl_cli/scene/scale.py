@@ -1,4 +1,4 @@
-"""The map's lengths follow from what was recorded: its defaults suit a table at arm's length, and are multiplied."""
+"""Scale of a map's lengths from recorded depth; defaults suit a table at arm's length."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,8 +36,9 @@ Lengths of the robot and its contacts are not among them.
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedDepth:
-    """How far away [m] what was recorded is: the median, a tenth is nearer than `nearest`, and `farthest` leaves out
-    stray pixels. noise [1/m]: `depth_noise` of the noisiest camera, 0 where no camera tells.
+    """Recorded depth [m]: median, 10th percentile `nearest`, and `farthest` without stray pixels.
+
+    noise [1/m]: `depth_noise` of the noisiest camera, 0 if unknown.
     """
 
     median: float
@@ -47,7 +48,7 @@ class RecordedDepth:
 
     @classmethod
     def of(cls, frames: Sequence[RgbdFrame]) -> "RecordedDepth | None":
-        """Of all valid pixels of `frames`, every eighth row and column; None where there is none."""
+        """Measure valid pixels of every eighth row and column; None without any."""
         seen = [frame.depth[::8, ::8] for frame in frames]
         depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0)
         if not len(depth):
@@ -59,20 +60,18 @@ class RecordedDepth:
 
 
 def depth_noise(images: Sequence[Float32]) -> float:
-    """Standard deviation [1/m] of the inverse depth of images (H, W) [m] of one camera; 0 where they do not tell.
+    """Standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
-    That of a depth z is this times z^2, as for sensors that measure disparity (Khoshelham and Elberink 2012: 1.425e-3
-    of a Kinect). The inverse depth of a plane is linear in the pixel: what a linear fit leaves of a block of pixels
-    is noise where the block lies on one surface, so that of many blocks one of the smallest is taken. Where noise of
-    neighbouring pixels is alike, a fit takes much of it away: blocks two or three times as wide say more, up to twice
-    as much; what is beyond that is shape.
+    At depth z, that is times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
+    Inverse depth of a plane is linear in the pixel: residuals of linear fits to blocks are noise, and a low
+    quantile leaves out edges. Fits absorb noise that neighbours share. Blocks two or three times as wide may raise
+    it, up to twice; more is shape.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))
 
 
 def _linear_noise(images: Sequence[Float32], times: int) -> float:
-    """`depth_noise` by blocks of so many times the side of `_block_side`."""
     left: list[Float64] = []
     for depth in images:
         side = times * _block_side(depth)
@@ -89,16 +88,16 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
 
 
 def _block_side(depth: Float32) -> int:
-    """Pixels along the side of a block: a 27th of the image, 24 of 640, as noise of neighbouring pixels is alike."""
+    """Side of a block: wide enough for noise that neighbours share."""
     return int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
 
 
 def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:
-    """`config` with what was left at its default as the recording has it; the same object where nothing changes.
+    """Return `config` with defaults fitted to the recording; the same object if nothing changes.
 
-    Lengths are multiplied by `scene.scale`, or where that is 0 by the median depth over that of a table at arm's
-    length; depth counts from half the nearest at least, and to the farthest at least. Beside a robot the scale stays,
-    and the sensor's error is that of the recording where it is larger than the default.
+    Lengths scale by `scene.scale`, or if 0, by the median depth over a table's at arm's length. min_range becomes
+    at most half the nearest depth, not below its default, max_range at least the farthest. With a robot, scale 0
+    scales nothing, and a larger recorded error replaces the default.
     """
     least = OccupancyConfig().depth_error
     if has_robot and depth.noise > least == config.occupancy.depth_error:
@@ -121,7 +120,7 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
 
 
 def in_words(config: Config, depth: RecordedDepth) -> str:
-    """What `fitted_to` chose."""
+    """Describe what `fitted_to` chose."""
     scene, occupancy = config.scene, config.occupancy
     if scene.scale == 0:
         return f"depth is noisier than usual: {1e3 * occupancy.depth_error:.2g} mm at 1 m, growing with its square"
@@ -132,7 +131,7 @@ def in_words(config: Config, depth: RecordedDepth) -> str:
 
 
 def scaled(section: Lengths, scale: float) -> Lengths:
-    """What was left at its default multiplied by the power of `scale` that a length has there."""
+    """Multiply defaults by the power of `scale` that a length has in them."""
     powers, default = POWERS[section.section], type(section)()
     kept = {key: getattr(section, key) for key in powers}
     return section.derived(

@@ -1,8 +1,7 @@
-"""Nested cubes over coloured points: where one splat will do, and where the image has detail that needs more.
+"""Nested cubes over coloured points: one splat each, more where there is detail.
 
-The paper seeds a splat per pixel. A budget far below the number of pixels has to choose; one splat per equal cube
-leaves objects as coarse as the floor. Here a cube is split in eight while its points disagree too much in colour or
-do not lie on a plane.
+The paper seeds every pixel. With fewer, equal cubes, objects are as coarse as the floor. Here a cube splits in
+eight while its points differ in colour or lie off a plane.
 """
 
 from collections.abc import Sequence
@@ -19,10 +18,9 @@ from splatctrl_cli.records import Bool, Float32, Float64
 
 @dataclass(frozen=True, kw_only=True)
 class CubeLevel:
-    """The occupied cubes of one size: points (K, 3) [m], what is common to those in each, parent (K,).
+    """Occupied cubes of one size: points (K, 3) [m], means, and parent (K,) one level up.
 
-    A cube's point is the measured one nearest to the mean of its points: the mean itself would hang in the air of a
-    concave corner. parent is the cube one level up that holds it.
+    A cube's point is the measured one nearest to the mean: in a concave corner, the mean itself hangs in air.
     """
 
     edge: float
@@ -32,14 +30,12 @@ class CubeLevel:
 
     @property
     def colors(self) -> Float64:
-        """(K, 3), the mean of each cube."""
+        """Mean colours (K, 3)."""
         return self.means.color
 
     @cached_property
     def detail(self) -> Float64:
-        """(K,), the number of points times (colour variance + SEED_BEND * least variance of position / edge^2): what
-        one splat in the cube fails to explain.
-        """
+        """Number of points times (colour variance + SEED_BEND * least position variance / edge^2), (K,)."""
         means = self.means
         color_variance = (means.square - means.color**2).sum(axis=1)
         covariance = means.covariance[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
@@ -65,7 +61,7 @@ def cube_levels(
 
 
 def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
-    """Masks (K,) per level of the cubes that stand: a cube is split while its detail exceeds `tolerance`."""
+    """Masks (K,) per level of standing cubes: one splits while its detail exceeds `tolerance`."""
     masks = []
     is_reached = np.ones(len(levels[0].points), bool)
     for level, below in zip(levels, [*levels[1:], None], strict=True):
@@ -79,7 +75,7 @@ def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
 
 
 def tolerance_for(levels: Sequence[CubeLevel], count: int) -> float:
-    """The smallest tolerance (to 1 %) that leaves at most `count` cubes; infinite where the coarsest are too many."""
+    """Least tolerance (to 1 %) for at most `count` cubes; infinite if the coarsest exceed it."""
     if len(levels[0].points) > count:
         return float("inf")
     low, high = 1e-6, float(max(level.detail.max() for level in levels)) + 1e-6

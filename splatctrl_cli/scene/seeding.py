@@ -1,4 +1,4 @@
-"""Where new splats come from: the first frames, and pixels that the map does not explain (M_add, eq. 5)."""
+"""Seeds of new splats, from first frames and unexplained pixels (M_add, eq. 5)."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -17,7 +17,7 @@ from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
 
-Each = Callable[..., Iterable[Any]]  # `map`, or one that asks all at once
+Each = Callable[..., Iterable[Any]]  # `map`, or a parallel one
 
 NO_SEEDS = Seeds(
     centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32), colors=np.zeros((0, 3), np.float32)
@@ -25,12 +25,12 @@ NO_SEEDS = Seeds(
 
 
 def world_points(frame: RgbdFrame) -> Float64:
-    """Back-projected points (H, W, 3) [m], world; meaningless where the depth is 0."""
+    """Back-projected points (H, W, 3) [m], world; meaningless where depth is 0."""
     return back_projected(_placed(frame), frame.depth).reshape(*frame.depth.shape, 3)
 
 
 def world_points_at(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Float64:
-    """Back-projected points (K, 3) [m], world, of the pixels of a mask (H, W): the same as all, then those."""
+    """Back-projected points (K, 3) [m], world, of a mask (H, W)."""
     return back_projected(_placed(frame), frame.depth, mask, num_threads)
 
 
@@ -40,17 +40,17 @@ def _placed(frame: RgbdFrame) -> Float64:
 
 
 def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
-    """Pixels (H, W) with a valid depth, not nearer than `min_range` [m], in the workspace."""
+    """Pixels (H, W) in the workspace with depth of at least `min_range` [m]."""
     is_valid = (frame.depth > 0) & (frame.depth >= min_range)
     return np.asarray(is_valid & workspace.contains(points_world))
 
 
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
-    """M_add (H, W): pixels to seed, eq. 5 with the hole term.
+    """M_add (H, W): pixels to seed, eq. 5 with a term for holes.
 
-    A mappable pixel is a hole (accumulated opacity below one half), or its depth is closer than the map's by more
-    than lambda_MDE times the median depth error. The median is over mappable pixels that the map explains, with a
-    floor and a ceiling; the map's depth is normalised by its opacity.
+    A mappable pixel is seeded if a hole (opacity below `hole_opacity`), or closer than the map by lambda_MDE times
+    the median depth error. The median is of explained mappable pixels, clipped at both ends; the map's depth is
+    normalised by opacity.
     """
     is_hole = rendering.opacity < config.hole_opacity
     error = rendering.normalised_depth() - frame.depth
@@ -62,7 +62,7 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
 
 @dataclass(frozen=True, kw_only=True)
 class Candidates(Columns):
-    """Pixels to seed: points (K, 3) [m] world, colors (K, 3) in [0, 1], pixels (K,) their size D/f [m]."""
+    """Pixels to seed: points (K, 3) [m] world, colors (K, 3) in [0, 1], pixels (K,) of size D/f [m]."""
 
     points: Float32
     colors: Float32
@@ -70,12 +70,12 @@ class Candidates(Columns):
 
 
 def thinning(masks: Iterable[Bool]) -> int:
-    """Of how many pixels of masks (H, W) one has to do, so that no more are left than are looked at together."""
+    """Return n: every n-th pixel of masks (H, W) is within `SEED_MOST_PIXELS`."""
     return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
 
 
 def thinned(mask: Bool, every: int) -> Bool:
-    """The first of every so many pixels of a mask (H, W), row after row."""
+    """Every n-th pixel of a mask (H, W), in row order."""
     if every == 1:
         return mask
     kept = np.zeros(mask.size, bool)
@@ -84,7 +84,7 @@ def thinned(mask: Bool, every: int) -> Bool:
 
 
 def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates:
-    """What the pixels of a mask (H, W) offer."""
+    """Candidates in a mask (H, W)."""
     focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
     colors = frame.color[mask].astype(np.float32) / 255.0
     return Candidates(
@@ -96,8 +96,8 @@ def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates
 
 @dataclass(frozen=True, kw_only=True)
 class SeedDensity:
-    """How densely to seed: edge [m] of the coarsest cubes, the detail from which a cube is split, and the number of
-    candidate pixels on which both were chosen.
+    """Density of seeds: coarsest edge [m], detail at which a cube splits, and the number of candidates
+    behind both.
     """
 
     edge: float
@@ -106,10 +106,10 @@ class SeedDensity:
 
 
 def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
-    """The density that spends at most `count` seeds on the candidates.
+    """Density that spends at most `count` seeds on the candidates.
 
-    Cubes start at the edge at which splats of the largest radius still cover a surface; where that is too many
-    already, at the smallest larger edge (to 5 %) that is not, but no larger than the cloud.
+    The edge starts at what the largest splats cover, and grows by 5 % while cubes are too many, up to the cloud's
+    extent.
     """
     points, colors, _ = _joined(sources)
     extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
@@ -127,13 +127,11 @@ def seeds_at(
     config: SceneConfig,
     num_threads: int = 1,
 ) -> Seeds:
-    """One seed per standing cube over the candidates of several views, finest cubes first.
+    """One seed per standing cube over the candidates, finest cubes first.
 
-    None within 0.7 edges of a live splat (L, 3): silhouettes, where the blended depth is neither surface's, would
-    otherwise ask for new splats for ever.
-
-    The paper's radius min(D/f, r_max) is one pixel; a budget far below the number of pixels needs the radius of its
-    cube instead, so r = min(max(radius_per_edge * edge, D/f), r_max).
+    None is within 0.7 edges of a live splat (L, 3): blended depth at silhouettes would ask for seeds forever. The
+    paper's radius min(D/f, r_max) is one pixel. For a smaller budget, r = min(max(radius_per_edge * edge, D/f),
+    r_max).
     """
     points, colors, pixel = _joined(sources)
     levels = cube_levels(points, colors, density.edge, SEED_LEVELS, num_threads)
@@ -154,13 +152,12 @@ def gap_seeds(
     num_threads: int = 1,
     each: Each = map,
 ) -> Seeds:
-    """Seeds where a measured surface lies further than `max_gap` [m] from every splat's sphere.
+    """Seeds where a measured surface is further than `max_gap` [m] from every sphere.
 
-    Blending can cover a pixel from splats that are not near its surface; a distance field cannot. Looked at are every
-    `stride`th pixel and row of the views (a frame and its mappable pixels (H, W)), by default every third or fewer,
-    half of `max_gap` apart, and the centres (K, 3) of occupied voxels, which remember surfaces that nothing shows
-    now; a centre may be half a voxel off its surface. With `half` 0 or 1 only every second of the rows: the other
-    half waits. `each`: as `map`, for the views.
+    Blending covers pixels with distant splats; a distance field shows the gap. Every `stride`-th pixel and row of
+    the views is checked (by default every third or fewer, about half of `max_gap`). So are occupied centres (K, 3),
+    for surfaces out of view; they may be half a voxel off. `half` 0 or 1: only every second row. `each`: a `map`
+    over views.
     """
     spheres = SplatTree(splats.centers, splats.radii, num_threads)
 
@@ -186,14 +183,12 @@ def gap_seeds(
 
 
 def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
-    """Pixels between those looked at: at least 3, and about half of `max_gap` [m] at the frame's median depth."""
     depth = frame.depth[::8, ::8]
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
 
 
 def _of_voxels(centers: Float32, splats: SplatSet) -> Candidates:
-    """Voxel centres (K, 3) in the colour of the nearest splat, grey where there is none."""
     colors = np.full((len(centers), 3), 0.5, np.float32)
     if len(splats):
         colors = splats.colors[cKDTree(splats.centers).query(centers)[1]]

@@ -1,4 +1,4 @@
-"""Which pixels of a depth image show the robot: those whose depth its own rendered surface explains (III-C)."""
+"""The self-mask: pixels whose depth the robot's rendered surface explains (III-C)."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,8 +33,10 @@ from splatctrl_cli.scene.time_steps import AuditRow
 
 
 class PixelKind(IntEnum):
-    """What a depth pixel shows. MIXED: beside the robot, a depth that is evidence of nothing. DOUBTED: an object
-    there, if another frame measured it. CONTRADICTED: behind what another frame measured on its ray.
+    """Kinds of depth pixels.
+
+    MIXED: near the robot, on no surface. DOUBTED: an object if another frame measured it. CONTRADICTED: behind what
+    another frame measured on its ray.
     """
 
     NOTHING = 0
@@ -47,10 +49,11 @@ class PixelKind(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class SelfMask:
-    """kinds (H, W) uint8 of a frame's pixels (`PixelKind`); robot_depth (H, W) float32 [m] of the rendered robot, 0 =
-    none; residuals: by link, measured less rendered depth (K,) [m] of pixels inside the robot's outline, up to
-    `MASK_FAR_OFF`; num_inside: by link, measured points inside its body that its surface does not explain; reach [m]:
-    how far before the robot, at its median depth, a thing is taken for it.
+    """The self-mask of a frame.
+
+    kinds (H, W): `PixelKind`; robot_depth (H, W) [m]: rendered, 0 = none; residuals: by link, measured minus
+    rendered depth (K,) [m] inside the outline, up to `MASK_FAR_OFF`; num_inside: by link, unexplained points inside
+    its body; reach [m]: an object this close before the robot, at its median depth, counts as robot.
     """
 
     kinds: UInt8
@@ -61,15 +64,14 @@ class SelfMask:
 
 
 def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
-    """The pixels of a frame by what they show, with the robot as it was at the frame's stamp.
+    """Self-mask of a frame, with the robot's pose at its stamp.
 
-    A pixel is robot where its depth z lies within `self_mask_tolerance` + 2 `depth_error` z^2 of the depths that the
-    rendered robot has within a few pixels: as many as the tolerance is wide at the robot's depth, so that a slanted
-    surface and an outline that is off by the calibration are explained too; of a robot drawn by triangles, so is a
-    point as near to any of them, or inside: it is seen through a slit. Spheres that stand for a link enclose its
-    surface and are not it, as boxes do what it carries: what lies inside them is robot. Everything else with a depth
-    is an object, where its piece of surface shows enough of itself (`_judge`). The robot is looked for beyond the
-    image's border, too, by 1 / `MASK_BORDER` of its width: an outline there has its fat edge inside the image.
+    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths nearby:
+    as many pixels as the tolerance spans, as surfaces slant and calibration shifts outlines. So is a point this
+    near to a triangle, or inside: slits show it. Points inside balls and carried boxes, which enclose the true
+    surface, are robot. Other depth is object, if `_judge` agrees.
+
+    The image is widened by 1 / `MASK_BORDER`: an outline just outside fattens edges inside.
     """
     k, border = frame.intrinsics, frame.intrinsics.width // MASK_BORDER
     lens = replace(k, cx=k.cx + border, cy=k.cy + border, width=k.width + 2 * border, height=k.height + 2 * border)
@@ -80,7 +82,6 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
 
 
 def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
-    """The mask by the part of the robot within the image alone."""
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     shown = surface.render(
         T_world_link,
@@ -98,7 +99,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
     edge = max(round(frame.intrinsics.width / MASK_EDGE), reach)
     wide = 2 * edge + reach + 1  # pixels, beyond which nothing is explained, doubted or inside
-    part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may go on
+    part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may extend
     depth, rendered, kinds = np.ascontiguousarray(frame.depth[part]), shown.depth[part], kinds[part]
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0
@@ -137,7 +138,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     offset = depth - rendered
     is_told = is_core & has_depth & (np.abs(offset) <= MASK_FAR_OFF)
     is_told &= link < len(surface.links) - surface.num_carried
-    is_told &= rendered - nearest < MASK_STEP  # beside a nearer part stereo may give it that part's depth
+    is_told &= rendered - nearest < MASK_STEP  # stereo may give it the depth of a nearer part next to it
     is_inside = is_core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,
@@ -150,12 +151,10 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
 
 
 def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Float32) -> None:
-    """Find the object pixels (H, W) beside the robot that are too few to believe, in place.
+    """Mark object pixels near the robot that are too few to believe, in place.
 
-    They are taken by piece of surface: neighbours whose depths differ by less than the `steps` (H, W) [m] of both.
-    A piece that goes on away from the robot is an object. Of the others one is mixed where the area [m^2] of its
-    pixels, as far as neither the sensor's error nor the outline accounts for them, is less than `MASK_SPECK`, and
-    doubted where it is less than `MASK_ALONE`.
+    A piece joins neighbours that differ by less than both `steps` [m]. It is an object if it extends away from the
+    robot. Otherwise the unexplained `area` [m^2] decides: mixed below `MASK_SPECK`, doubted below `MASK_ALONE`.
     """
     is_object, shown = kinds == PixelKind.OBJECT, np.empty(depth.shape)
     asked = is_object & beside
@@ -167,10 +166,10 @@ def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Flo
 def settled(
     frame: RgbdFrame, mask: SelfMask, others: Sequence[tuple[RgbdFrame, SelfMask]], config: OccupancyConfig
 ) -> SelfMask:
-    """A mask without doubted pixels: objects by piece where one of the other frames measured half of it.
+    """Mask with each doubted piece decided: object or mixed.
 
-    others: of other cameras at that time, and of the time step before, in which what was doubted is settled. Where
-    there are none, what is doubted counts.
+    It is an object if one of `others` measured half of it, or if there are none. others: other cameras' frames, and
+    settled ones of the last time step.
     """
     is_doubted = mask.kinds == PixelKind.DOUBTED
     if not is_doubted.any():
@@ -191,10 +190,10 @@ def settled(
 
 
 def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
-    """The masks of frames of one time step without the object pixels that the robot's outvote, which become mixed.
+    """Masks of one time step without object pixels that robot pixels outvote.
 
-    All frames vote together, in voxels of a grid with its first centre at `origin` (3,) [m]: where fewer than
-    `VOTE_SHARE` of the robot's pixels show an object, these are the robot's outline or noise of its surface.
+    All frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
+    object pixels are outline or noise, and become mixed.
     """
     parts = []
     for number, (frame, mask) in enumerate(seen):
@@ -222,7 +221,7 @@ def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: fl
 
 
 def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float32]:
-    """The pixel that shows each of points (N, 3) [m], world: its number (N,), -1 outside; and depths (N,) [m]."""
+    """Flat pixel indices (N,), -1 outside, and depths (N,) [m] of points (N, 3) [m], world."""
     k = frame.intrinsics
     there = transform_points(invert_transform(frame.T_world_camera), points)
     z = there[:, 2].astype(np.float32)
@@ -233,7 +232,6 @@ def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float
 
 
 def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Values (K,) by the name of the link that each belongs to, without links that have none."""
     order = np.argsort(links, kind="stable")
     ends = np.searchsorted(links[order], np.arange(len(names) + 1))
     parts = {name: values[order[first:end]] for name, first, end in zip(names, ends, ends[1:], strict=False)}
@@ -241,7 +239,6 @@ def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str
 
 
 def _outline(is_robot: Bool) -> tuple[slice, slice] | None:
-    """The rows and columns that hold every true pixel; None where there is none."""
     left, top, width, height = cv2.boundingRect(is_robot.view(np.uint8))
     return (slice(top, top + height), slice(left, left + width)) if width else None
 
@@ -255,7 +252,7 @@ def _grown(box: tuple[slice, slice], pixels: int, shape: tuple[int, ...]) -> tup
 
 
 def object_mask(frame: RgbdFrame) -> SelfMask:
-    """Of a frame that nobody knows the robot's place in: all its depth is of objects."""
+    """Mask without a known robot: all depth is object."""
     return SelfMask(
         kinds=(frame.depth > 0).view(np.uint8),
         robot_depth=_nothing_rendered(frame.depth.shape),
@@ -266,32 +263,33 @@ def object_mask(frame: RgbdFrame) -> SelfMask:
 
 @lru_cache
 def _nothing_rendered(shape: tuple[int, int]) -> Float32:
-    """One image for all masks without a robot: hundreds of views have one each."""
+    """One image, shared by all masks without a robot."""
     image = np.zeros(shape, np.float32)
     image.flags.writeable = False
     return image
 
 
 def of_label(mask: SelfMask, label: Label) -> Bool:
-    """Pixels (H, W) of the robot, or of everything that is not."""
+    """Pixels (H, W) of the robot, or of objects."""
     return np.asarray(mask.kinds == (PixelKind.ROBOT if label == Label.ROBOT else PixelKind.OBJECT))
 
 
 def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
-    """The frame without the depth of its pixels of a kind, which lies on no surface."""
+    """Frame with depth 0 in pixels of a kind."""
     is_of_it = mask.kinds == kind
     return replace(frame, depth=np.where(is_of_it, np.float32(0.0), frame.depth)) if is_of_it.any() else frame
 
 
 def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:
-    """By how much [m] a measured depth (...) [m] of the robot may differ from its rendered depth."""
+    """Largest difference [m] of the robot's measured and rendered depth."""
     return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinkResidual:
-    """Of one link: the median [m] of measured less rendered depth and the number of pixels that it rests on, how many
-    measured points lie inside the link unexplained, and the least `SelfMask.reach` [m] of those that show it.
+    """The residual of one link over several masks.
+
+    median [m]: of measured minus rendered depth; reach [m]: the least `SelfMask.reach`.
     """
 
     median: float | None
@@ -301,12 +299,12 @@ class LinkResidual:
 
     @property
     def sign(self) -> int:
-        """1 where the robot is measured behind its rendered surface, -1 before it."""
+        """1 behind the rendered surface, -1 before."""
         return 0 if self.median is None else int(np.sign(self.median))
 
 
 def link_residuals(masks: Sequence[SelfMask]) -> dict[str, LinkResidual]:
-    """Of the links that any of the masks saw, over all of them."""
+    """Residual of each link that a mask saw."""
     links = dict.fromkeys(link for mask in masks for link in [*mask.residuals, *mask.num_inside])
     found = {}
     for link in links:
@@ -322,7 +320,7 @@ def link_residuals(masks: Sequence[SelfMask]) -> dict[str, LinkResidual]:
 
 
 def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
-    """`link_residuals` as `AuditRow` has them, of the links that were seen or hold points."""
+    """Return `link_residuals` as in `AuditRow`."""
     found = link_residuals(masks)
     rows = {
         link: {
@@ -338,12 +336,11 @@ def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
 
 
 def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -> dict[str, Any]:
-    """For ``run.json``, over the time steps: by link the median of its steps' residuals [mm] and of their reach [mm],
-    and its pixels (`self_mask`); the largest of them by size where it is judged (`self_mask_residual_mm`, None
-    without any); points inside the robot (`inside_robot_points`), and the first step and link that had one.
+    """Part of the self-mask in ``run.json``, over all time steps.
 
-    A link is judged if `MASK_PIXELS` or more show it. Those of `holding` are left out if others remain, because the
-    surface of what they hold was itself learned.
+    `self_mask`: by link, median residual and reach [mm], and pixels; `self_mask_residual_mm`: the largest of judged
+    links, None without any; `inside_robot_points`, with the first step and link. Links with `MASK_PIXELS` are
+    judged, those in `holding` only if no others are: their surface was itself learned.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}
@@ -375,7 +372,7 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
 
 
 def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
-    """Least depth (H, W) of the chosen pixels within `reach` pixels; inf where there are none."""
+    """Least depth (H, W) of chosen pixels within `reach` pixels, else inf."""
     kept = np.full(depth.shape, np.inf, np.float32)
     cv2.copyTo(depth, chosen.view(np.uint8), kept)
     return _least_within(kept, reach)
@@ -386,7 +383,7 @@ def _least_within(image: Float32, reach: int) -> Float32:
 
 
 def farthest_within(depth: Float32, reach: int) -> Float32:
-    """Greatest depth (H, W) within `reach` pixels; 0 where there is none."""
+    """Greatest depth (H, W) within `reach` pixels, else 0."""
     return np.asarray(cv2.dilate(depth, _window(reach)), np.float32)
 
 
@@ -395,7 +392,7 @@ def _window(reach: int) -> UInt8:
 
 
 def pixels_of(length: float, frame: RgbdFrame, rendered: Float32) -> int:
-    """Pixels that a length [m] spans at the median depth of the rendered robot, at least 1."""
+    """Pixels that a length [m] spans at the robot's median depth, at least 1."""
     some = rendered[::4, ::4]
     depths = some[some > 0] if some.any() else rendered[rendered > 0]
     if not len(depths):

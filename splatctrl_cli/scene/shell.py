@@ -1,7 +1,6 @@
-"""The shell: coarse splats of what lies beyond the robot's reach, which is rendered and nothing else.
+"""The shell: coarse splats beyond the workspace, for rendering only.
 
-The map of the workspace leaves out the pixels whose depth lies beyond it. The shell is fitted to these alone and
-beside the map: it has a budget of its own and no occupancy, and the map has the same bytes without it.
+It fits pixels that the map leaves out, with its own budget; the map's bytes do not depend on it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,9 +32,7 @@ Masked = Sequence[tuple[View, Bool]]
 
 
 def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
-    """Pixels (H, W) whose depth, of `min_range` [m] or more, the map leaves out: it lies outside the workspace. Those
-    that show what is `mounted` on the camera, or that are not valid, are not among them.
-    """
+    """Valid pixels (H, W) whose depth of at least `min_range` [m] is outside the workspace."""
     depth = view.target.depth
     left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0)
     left_out &= True if view.frame.valid is None else view.frame.valid
@@ -43,9 +40,9 @@ def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
 
 
 class Shell:
-    """`scene.shell` of `scene.max_splats`, beside these, for what the views show beyond the workspace.
+    """Extra splats, `scene.shell` of `scene.max_splats`, for views beyond the workspace.
 
-    Its lengths are those of a map of what lies as far away as the first such pixels do in the median (`scale`).
+    Lengths scale by the median depth of the first such pixels.
     """
 
     def __init__(
@@ -59,11 +56,10 @@ class Shell:
         self._begin(0.0, None)
 
     def _begin(self, depth: float, density: SeedDensity | None, num_iterations: int = 0) -> None:
-        """Choose the lengths by the median depth [m], 0 where nothing was seen yet, and how densely to seed."""
         self._depth, self._density, config = depth, density, self.config
         if density is not None:
             config = scaled(config, depth / SCALE_DEPTH).derived(radius_depth=depth)
-            least, most = config.min_radius, config.max_radius  # of which either may have been set
+            least, most = config.min_radius, config.max_radius  # the user may have set either
             widest = max(least, most, config.radius_per_edge * density.edge)  # else far walls have holes
             config = config.derived(max_radius=widest)
             self._see_through = scaled(self.occupancy, depth / SCALE_DEPTH).see_through
@@ -72,7 +68,7 @@ class Shell:
         self._descent.num_iterations = num_iterations
 
     def step(self, views: Window, mounted: Mapping[str, Bool], background: Color | None) -> None:
-        """Take in the views of a time step: remove by the newest, add, optimise. The views stay as they are."""
+        """Take in a time step's views: remove, seed, optimise."""
         rng = np.random.default_rng([self._seed, self.num_steps])
         self.num_steps += 1
         self._remove(views.newest)
@@ -91,12 +87,13 @@ class Shell:
         self._remove(views.newest)
 
     def splats(self) -> SplatSet:
-        """Those that stand, none of them with its centre in the workspace."""
+        """Live splats, none centred in the workspace."""
         return self.buffer.splats(self._num_threads)
 
     def _add(self, shown: Masked) -> None:
-        """Put splats where the shell explains nothing; where too many find no slot it begins again, coarser, over all
-        that is in view and what it holds of what no longer is.
+        """Seed what the shell does not explain; restart coarser if too many seeds are unmet.
+
+        A restart seeds all views and its own splats' places.
         """
         asked = [(view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown]
         most = SHELL_UNMET * self.config.max_splats
@@ -116,27 +113,25 @@ class Shell:
         self._fill(sources, density)
 
     def _fill(self, sources: Sequence[Candidates], density: SeedDensity) -> int:
-        """Put splats on the sources, and say how many found no slot."""
         if not any(len(source) for source in sources):
             return 0
         seeds = seeds_at(sources, self.buffer.centers[self.buffer.is_alive], density, self._scaled, self._num_threads)
         return self.buffer.fill(seeds, self.config.initial_opacity).unmet
 
     def _remove(self, views: Sequence[View]) -> None:
-        """Those that moved into the workspace, became faint, or that some view sees through."""
         gone = self.workspace.contains(self.buffer.centers) | (self.buffer.opacities < self.config.min_opacity)
         gone |= seen_through(self.buffer.centers, views, self._see_through, self._num_threads)
         self.buffer.kill(self.buffer.is_alive & gone)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Its whole state, by name."""
+        """Return its whole state, by name."""
         d = self._density
         density = (0.0, 0.0, 0) if d is None else (d.edge, d.tolerance, d.num_candidates)
         counters = (self.num_steps, self._descent.num_iterations)
         return self.buffer.arrays() | {"begun": np.array([*counters, self._depth, *density])}
 
     def restore(self, arrays: Mapping[str, NDArray[np.generic]]) -> None:
-        """Take over the state of a shell with the same configuration, seed and workspace."""
+        """Restore a state of the same configuration, seed and workspace."""
         for name, array in self.buffer.arrays().items():
             array[...] = arrays[name]
         num_steps, num_iterations, depth, edge, tolerance, num_candidates = (float(x) for x in arrays["begun"])

@@ -1,4 +1,4 @@
-"""Depth averaged over time: a camera that stands still measures a surface that stands still again and again."""
+"""Depth averaged over time, for still cameras and surfaces."""
 
 from dataclasses import replace
 
@@ -13,16 +13,14 @@ from splatctrl_cli.records import Bool, RgbdFrame
 def steadied(
     frame: RgbdFrame, before: tuple[RgbdFrame, Bool] | None, is_object: Bool, config: OccupancyConfig
 ) -> tuple[RgbdFrame, Bool]:
-    """The frame with a running mean of its depth, and its steady pixels (H, W).
+    """Frame with a running mean of its depth, and its steady pixels (H, W).
 
-    A pixel of objects (H, W) is steady where it shows the same surface as before: where its depth z [m] changed by at
-    most `STEADY_SIGMAS` `depth_error` z^2, and the depths about it by at most `STEADY_MOVED` `depth_error` z^2 on
-    average. A surface that moves along the ray lags by no more than the latter. Its depth becomes the mean if it was
-    an object's before, too: the mean of the robot's surface and of what it bares would lie in mid-air.
+    An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2. Depths around
+    it may change by `STEADY_MOVED` `depth_error` z^2 on average: a moving surface lags no more. Only what was an
+    object before is averaged: a mean with the robot's surface is in mid-air.
 
-    before: the camera's last frame, averaged in the same way, and its pixels of objects; without it no pixel is
-    steady. Once the camera has moved its frames cannot be compared: the depth stays as it is, and all pixels count as
-    steady.
+    before: the camera's last averaged frame and object pixels; None: no pixel is steady. If the camera moved, depth
+    stays, and all pixels are steady.
     """
     if before is None or before[1].shape != frame.depth.shape:
         return frame, np.zeros(frame.depth.shape, bool)

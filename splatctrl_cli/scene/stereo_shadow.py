@@ -1,4 +1,4 @@
-"""Shadows of near things in a stereo camera's depth: where one imager alone sees the place, there is no depth."""
+"""Stereo shadows: places without depth that only one imager sees."""
 
 import cv2
 import numpy as np
@@ -8,17 +8,17 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index
 
 
 def shadowed(depth: Float32, focal: float) -> Bool:
-    """Pixels (H, W) without depth that lie in the shadow of something nearer in their row.
+    """Pixels (H, W) without depth in the shadow of something nearer in their row.
 
-    depth (H, W) [m], 0 = none; focal [px]. From the other imager, a baseline B away, a thing at depth z hides
-    B focal (1/z - 1/z_behind) pixels of what is behind it, always on the same side. Side and baseline are measured
-    from the image (`_baseline`); z_behind is the largest depth around the pixels without depth that are connected.
+    depth (H, W) [m], 0 = none; focal [px]. With baseline B, an object at z hides B focal (1/z - 1/z_behind) pixels
+    behind it, on one side. The image shows side and baseline; z_behind is the largest depth around connected pixels
+    without depth.
     """
     is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
-    for turn in (1, -1):  # what is nearer is at the right of its shadow, then at the left
+    for turn in (1, -1):  # the nearer object is right of its shadow, then left
         image = np.ascontiguousarray(depth[:, ::turn])
         column = np.arange(image.shape[1], dtype=np.int32)
-        following = np.where(image > 0, column, np.int32(len(column)))  # the pixel with depth from here on
+        following = np.where(image > 0, column, np.int32(len(column)))  # column of the next pixel with depth
         following = np.minimum.accumulate(following[:, ::-1], axis=1)[:, ::-1]
         baseline = _baseline(image, following, focal)
         if baseline:
@@ -31,11 +31,10 @@ def shadowed(depth: Float32, focal: float) -> Bool:
 
 
 def _baseline(depth: Float32, following: Index, focal: float) -> float:
-    """The baseline [m] that the shadows at the left of nearer things show; 0 where there are no shadows.
+    """Baseline [m] of shadows left of nearer objects; 0 without any.
 
-    following (H, W): the column of the first depth from each pixel on, W = none. A step is a pixel and the next of
-    its row with depth, nearer by `SHADOW_STEP`. Each step gives a baseline by how many pixels are lost in it. The
-    median is taken over the higher half, weighted by height: a fattened outline covers most of the low steps' shadow.
+    following (H, W): column of the next depth, W = none. Each step nearer by `SHADOW_STEP` gives a baseline by its
+    lost pixels. The median is of the higher half, weighted by height: fattened outlines cover low steps' shadows.
     """
     following = following[:, 1:]
     before = depth[:, :-1]
@@ -51,14 +50,13 @@ def _baseline(depth: Float32, following: Index, focal: float) -> float:
 
 
 def _median(values: Float64, weights: Float64) -> float:
-    """Median of values (N,), each counted by its weight (N,)."""
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
 
 
 def _behind(depth: Float32) -> Float32:
-    """Of each pixel (H, W) without depth the largest depth [m] around those that are connected to it; 0 elsewhere."""
+    """Largest depth (H, W) [m] around connected pixels without depth; 0 elsewhere."""
     is_blank = depth <= 0
     num, group = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     around = np.where(is_blank, cv2.dilate(depth, np.ones((3, 3), np.uint8)), np.float32(0.0))

@@ -1,4 +1,4 @@
-"""Groups a stream of records into time steps, finds the workspace, and what is reported of each step."""
+"""Time steps from records, the workspace's box, and a step's report."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -15,10 +15,9 @@ from splatctrl_cli.scene.seeding import thinned, thinning, world_points_at
 
 @dataclass(frozen=True, kw_only=True)
 class TimeStep:
-    """Frames taken together, at most one per camera where there is a clock, and the joint positions then.
+    """Frames taken together, at most one per camera with a clock, and joint positions.
 
-    position (J,) float64 at the last frame, in the source's joint order; None where no joint state is near.
-    velocity (J,) [1/s] then.
+    position (J,) at the last frame, in source order, None without a near joint state; velocity (J,) [1/s].
     """
 
     frames: tuple[RgbdFrame, ...]
@@ -27,7 +26,7 @@ class TimeStep:
 
     @property
     def positions(self) -> dict[int, Float64]:
-        """Joint positions (J,) at the stamp of each frame [ns]; none where no joint state is near."""
+        """Joint positions (J,) by frame stamp [ns]; may be empty."""
         if self.position is None or self.velocity is None:
             return {}
         last_ns = self.frames[-1].stamp_ns
@@ -36,32 +35,30 @@ class TimeStep:
         }
 
     def without_depth(self) -> "TimeStep":
-        """The same step as colour cameras would have seen it."""
+        """Return the step as colour cameras would see it."""
         frames = tuple(replace(frame, depth=np.zeros_like(frame.depth)) for frame in self.frames)
         return replace(self, frames=frames)
 
     @property
     def stamp_ns(self) -> int:
-        """Of the newest frame."""
+        """Stamp of the newest frame."""
         return max(frame.stamp_ns for frame in self.frames)
 
     @property
     def has_depth(self) -> bool:
-        """Whether any pixel of any frame has a depth."""
+        """True if any pixel has depth."""
         return any(bool((frame.depth > 0).any()) for frame in self.frames)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AuditRow:
-    """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames, each as the last
-    iteration that looked at it found it.
+    """Result of one time step.
 
-    dead: slots that wait to be reused. unmet: seeds that found no slot. evicted: splats that gave theirs to surface
-    without any. unrepresented: occupied voxels that no splat stands for. without_depth: frames without any valid
-    depth, which seed nothing. loss and psnr are None where no view shows anything of the workspace. self_mask: by
-    link, measured less rendered depth over the pixels within the robot's outline: `median_mm`, its `sign` and
-    `num_pixels`. inside_robot: by link, measured points inside it that its surface does not explain. blind: cameras
-    without any valid depth.
+    Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames at their last iteration, None if none
+    shows the workspace. dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface.
+    unrepresented: occupied voxels without a splat. without_depth: such frames; blind: such cameras. self_mask: by
+    link, measured minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link, unexplained
+    points inside.
     """
 
     stamp_ns: int
@@ -86,7 +83,7 @@ class AuditRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Refined:
-    """How far refining has come: blocks done, where their seeds went, and what they removed by reason."""
+    """Progress of refining: blocks done, seeds, removals by reason."""
 
     num_blocks: int
     filled: Filled
@@ -102,11 +99,10 @@ def time_steps(
     observe: Callable[[Record], None] = lambda record: None,
     repeats: Counter[str] | None = None,
 ) -> Iterator[TimeStep]:
-    """Group the frames of `cameras`: with a clock by stamp, else up to FRAMES_PER_STEP views at a time.
+    """Group frames of `cameras` by stamp, or without a clock, FRAMES_PER_STEP at a time.
 
-    With a clock, a frame whose depth equals its camera's last one to the bit shows nothing new: it is left out, and
-    counted in `repeats` by camera. observe: is shown every record on its way, of whatever camera, so that one pass
-    serves both.
+    With a clock, a frame that repeats its camera's depth is skipped, and counted in `repeats`. `observe` gets every
+    record: one pass serves both.
     """
     last_depth: dict[str, Float32] = {}
     frames: list[RgbdFrame] = []
@@ -135,7 +131,7 @@ def time_steps(
 
 
 def planar(frame: RgbdFrame) -> RgbdFrame:
-    """The same frame, its colour stored plane by plane, as the optimiser takes it: many views are then kept once."""
+    """Return the frame with colour by plane, as the optimiser takes it: views then share memory."""
     planes = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0))
     return replace(frame, color=np.moveaxis(planes, 0, 2))
 
@@ -148,7 +144,6 @@ def _is_complete(frames: Sequence[RgbdFrame], record: RgbdFrame, *, has_clock: b
 
 
 def _time_step(frames: Sequence[RgbdFrame], joints: JointState | None) -> TimeStep:
-    """Joint positions are carried to the frames' stamp by their velocities."""
     position = velocity = None
     if joints is not None and abs(frames[-1].stamp_ns - joints.stamp_ns) <= JOINTS_GAP_NS:
         elapsed = (frames[-1].stamp_ns - joints.stamp_ns) * 1e-9
@@ -158,17 +153,16 @@ def _time_step(frames: Sequence[RgbdFrame], joints: JointState | None) -> TimeSt
 
 
 def cloud_box(cloud: PointCloud) -> Box:
-    """The box of a point cloud, with a margin of 5 % and 5 cm on each side."""
+    """Box of a cloud, widened by 5 % and 5 cm per side."""
     lower, upper = cloud.points.min(axis=0).astype(np.float64), cloud.points.max(axis=0).astype(np.float64)
     margin = 0.05 * (upper - lower) + 0.05
     return Box(lower=lower - margin, upper=upper + margin)
 
 
 def depth_box(frames: Sequence[RgbdFrame], max_range: float, scale: float = 1.0) -> Box:
-    """The box of the valid depth of `frames` up to `max_range` [m], without its outermost 0.5 % on each side, and
-    with a margin of 2 % and 2 cm times the scale of the recording.
+    """Box of valid depth up to `max_range` [m], without the outer 0.5 % per side.
 
-    Raises InputError when there is no valid depth at all.
+    It is widened by 2 % and 2 cm times `scale`. Raises InputError without valid depth.
     """
     masks = [(frame.depth > 0) & (frame.depth <= max_range) for frame in frames]
     every = thinning(masks)

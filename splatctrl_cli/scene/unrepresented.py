@@ -1,6 +1,4 @@
-"""What is known to be occupied and has no splat: no distance to the splats says anything of it. By the same measure,
-whether splats and an occupancy grid are of the same scene.
-"""
+"""Occupied voxels without a splat, and agreement of splats with a grid."""
 
 import itertools
 import math
@@ -21,11 +19,10 @@ from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels, VoxelState
 
 
 def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig, error: float = 0.0) -> Balls:
-    """The occupied voxels (`OccupancyMap.occupied_voxels`) that no splat stands for, as balls.
+    """Occupied voxels that no splat represents, as balls labelled human or object.
 
-    A splat of an object or a person stands for a voxel whose centre is at most `representing_reach` from its sphere
-    (of eight splats with the nearest centres), with the sensor's error [m]. The robot's splats stand for nothing:
-    fields leave them out. A ball has the label human where its voxel does.
+    A splat represents voxels with centres within `representing_reach` of its sphere, among the eight nearest. error
+    [m]: of the sensor. Robot splats do not count: fields leave them out.
     """
     others = splats.select(splats.labels != Label.ROBOT)
     reach = representing_reach(config, occupancy.config.voxel, error)
@@ -39,10 +36,9 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
 
 
 def confirmed(found: Balls, before: Balls | None) -> Balls:
-    """The balls that touch at least `BARE_GROUP` - 1 others, directly or by others, or that are where one was before.
+    """Balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
-    Fewer are often noise that is gone with the next time step, or that gap filling has not come to. A thing that
-    moves in a map without splats to spare shows more at once. before: of the last time step, None in the first.
+    Smaller groups are often noise or gaps not yet filled. before: of the last time step, None in the first.
     """
     voxel = 2.0 * found.radius / 3**0.5
     if before is None or not len(found):
@@ -57,10 +53,9 @@ def confirmed(found: Balls, before: Balls | None) -> Balls:
 
 
 def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:
-    """How far [m] a voxel's centre may be from a splat's sphere that stands for it.
+    """Largest distance [m] of a voxel's centre from a sphere that represents it.
 
-    `max_gap` and half a voxel, beyond which gap filling adds a splat, and the sensor's error [m]; at most a voxel's
-    diagonal.
+    That is `max_gap` and half a voxel, as in gap filling, plus the sensor's error [m]; at most a voxel's diagonal.
     """
     return min(config.max_gap + 0.5 * voxel + error, 3**0.5 * voxel)
 
@@ -68,8 +63,9 @@ def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) ->
 def bare_voxels(
     occupancy: OccupancyMap, splats: SplatSet, workspace: Box, config: SceneConfig, half: int | None = None
 ) -> Float32:
-    """Centres (K, 3) [m] of occupied voxels in the workspace that gap filling has to look at: all but those surely
-    near a splat. With `half` 0 or 1 of every second voxel: the other half waits.
+    """Centres (K, 3) [m] of occupied voxels for gap filling, not surely near a splat.
+
+    `half` 0 or 1 takes every second voxel.
     """
     voxels = occupancy.occupied_voxels()
     voxels = voxels[workspace.contains(occupancy.centers_of(voxels))]
@@ -79,13 +75,13 @@ def bare_voxels(
 
 
 def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Bool:
-    """Voxels (X, Y, Z) whose centres are within `reach` [m] of a sphere wherever in its voxel that has its centre.
+    """Voxels (X, Y, Z) within `reach` [m] of a sphere, wherever its centre is in its voxel.
 
-    Most of what is occupied, at a tenth of the cost of looking for the nearest splat.
+    This settles most, at a tenth of the cost of a search.
     """
     voxel, shape = occupancy.config.voxel, occupancy.log_odds.shape
     cells = np.floor((splats.centers - occupancy.origin) / voxel + 0.5).astype(np.int64)
-    is_inner = np.all((cells > 0) & (cells < np.array(shape) - 1), axis=1)  # so that no neighbour is outside
+    is_inner = np.all((cells > 0) & (cells < np.array(shape) - 1), axis=1)  # keeps all neighbours inside
     home, radii = np.ravel_multi_index(tuple(cells[is_inner].T), shape), splats.radii[is_inner]
     is_near = np.zeros(shape, bool)
     for step in itertools.product((-1, 0, 1), repeat=3):
@@ -97,9 +93,10 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 
 @dataclass(frozen=True, kw_only=True)
 class GridAgreement:
-    """on_surface: share of the splats of objects and people that are in or next to a voxel that is not free, of
-    those that are outside the grid, or in or next to a voxel that was seen; represented: share of the num_voxels
-    occupied voxels that a splat or a ball stands for. NaN of none. num_splats: all of objects and people.
+    """Agreement of splats with a grid; NaN without any.
+
+    on_surface: share of object and human splats at a voxel that is not free, among splats outside the grid or at a
+    seen voxel. "At" means in or next to. represented: share of num_voxels occupied voxels with a splat or ball.
     """
 
     on_surface: float
@@ -109,17 +106,16 @@ class GridAgreement:
 
     @property
     def holds(self) -> bool:
-        """Whether both shares are what a reconstruction leaves; False where there is nothing to compare."""
+        """True if both shares reach a reconstruction's."""
         return self.on_surface >= SPLATS_ON_SURFACE and self.represented >= OCCUPIED_WITH_SPLATS
 
 
 def agreement_with_grid(
     splats: SplatSet, known: KnownVoxels, scene: SceneConfig, occupancy: OccupancyConfig
 ) -> GridAgreement:
-    """How far splats and what is known of voxels agree: for the final map, or a snapshot and its splats.
+    """Agreement of splats with the voxels of their map or snapshot.
 
-    Voxels that the robot was in are left out. Either share finds splats in other units or moved; `represented` finds
-    splats that were taken away, as balls are only where there were none when the map was written.
+    Swept voxels are left out. Both shares detect wrong units or moved splats, `represented` missing ones.
     """
     grid = known.grid
     states = grid.states(occupancy.free_below, occupancy.occupied_above)
@@ -128,7 +124,7 @@ def agreement_with_grid(
     is_inside = np.all((cell >= 0) & (cell < states.shape), axis=1)
     cells = tuple(cell[is_inside].astype(np.int64).T)
     may_hold = maximum_filter(np.isin(states, (VoxelState.OCCUPIED, VoxelState.UNCERTAIN)), size=3)
-    was_seen = maximum_filter(states != VoxelState.NEVER_SEEN, size=3)  # what is farther than depth counts is not
+    was_seen = maximum_filter(states != VoxelState.NEVER_SEEN, size=3)  # space beyond the depth range is not
     num_told = was_seen[cells].sum() + np.count_nonzero(~is_inside)
     least = max(
         float(np.log(occupancy.occupied_above / (1 - occupancy.occupied_above))), 1.5 * occupancy.log_odds_hit

@@ -1,4 +1,4 @@
-"""Why cameras never saw a voxel beside the robot: what is before it in each image of a time step."""
+"""Reasons why cameras never saw a voxel near the robot."""
 
 import cv2
 import numpy as np
@@ -13,11 +13,11 @@ from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
 from splatctrl_cli.scene.stereo_shadow import shadowed
 from splatctrl_cli.voxels import Unseen
 
-OUTLINE = np.ones((5, 5), np.uint8)  # beside the robot, its outline loses depth too
+OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
 
 
 def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> None:
-    """Note for the voxels within `ASKED_REACH` of the robot that no camera ever saw why not (`Unseen`)."""
+    """Note `Unseen` for never-seen voxels within `ASKED_REACH` of the robot."""
     voxels = occupancy.unexplained(robot.centers, robot.radii + ASKED_REACH)
     points = occupancy.centers_of(voxels)
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
@@ -28,7 +28,7 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> 
 
 
 def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> NDArray[np.uint16]:
-    """Why one frame does not show points (K, 3) [m]: `Unseen` (K,)."""
+    """Return why a frame does not show points (K, 3) [m]: `Unseen` (K,)."""
     pixel, z = pixels_at(frame, points)
     is_in_view = pixel >= 0
     if frame.valid is not None:

@@ -1,3 +1,1 @@
-"""The fit on a CUDA device. Optional: the extra `cuda` (cuda-core, cuda-bindings, NVRTC); imports nothing of ours
-beyond `kernels`.
-"""
+"""The fit on a CUDA device, with the extra `cuda` (cuda-core, cuda-bindings, NVRTC)."""

@@ -1,4 +1,4 @@
-"""A CUDA card: memory over the driver, kernels and graphs over cuda-core."""
+"""A CUDA card, over its driver and cuda-core."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,11 +12,10 @@ from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.memory import FIT, Array, DeviceError, Graph, Launch, OutOfMemory
 from splatctrl_cli.kernels.cuda.program import compiled
 
-MANY = 20  # replays in a graph: to launch one costs the host as much as a small map's iteration takes
+MANY = 20  # replays in a graph: a launch costs the host as much as a small map's iteration
 
 
 def _check(result: tuple[Any, ...]) -> Any:
-    """The values of a driver call, or its error by name."""
     status, *values = result
     if status == driver.CUresult.CUDA_SUCCESS:
         return values if len(values) > 1 else values[0] if values else None
@@ -30,7 +29,7 @@ def _fault(what: str) -> DeviceError:
 
 @contextmanager
 def _named_faults() -> Iterator[None]:
-    """Turns what cuda-core raises, which has no public class, into DeviceError."""
+    """Turn errors of cuda-core, without a public class, into DeviceError."""
     try:
         yield
     except DeviceError:
@@ -40,13 +39,10 @@ def _named_faults() -> Iterator[None]:
 
 
 class CudaDevice:
-    """A card, the first by default, as `Memory`; everything is queued on one stream.
-
-    Raises DeviceError where it cannot be used.
-    """
+    """A card as `Memory`, with one stream. Raises DeviceError if unusable."""
 
     def __init__(self, card: Card | None = None, *, source: str = FIT) -> None:
-        """source: the kernels that are launched, of which others are compiled when they are."""
+        """source: kernels to compile now; others compile at first launch."""
         card = card or usable_card()
         self.name, self.capability = card.name, card.capability
         with _named_faults():
@@ -57,18 +53,16 @@ class CudaDevice:
         self._handle = int(self._stream.handle)
 
     def available(self) -> int:
-        """Bytes that are free."""
         free, _ = _check(driver.cuMemGetInfo())
         return int(free)
 
     def allocate(self, num_bytes: int) -> int:
-        """Memory of zeros."""
         address = int(_check(driver.cuMemAlloc(max(num_bytes, 1))))
         _check(driver.cuMemsetD8Async(address, 0, max(num_bytes, 1), self._handle))
         return address
 
     def free(self, address: int) -> None:
-        """Give it back, after what is queued."""
+        """Free, after what is queued."""
         self.wait()
         _check(driver.cuMemFree(address))
 
@@ -76,10 +70,10 @@ class CudaDevice:
         """Copy an array there, after what is queued."""
         values = np.ascontiguousarray(values)
         _check(driver.cuMemcpyHtoDAsync(address, values.ctypes.data, values.nbytes, self._handle))
-        self.wait()  # the array may go
+        self.wait()  # the array may be freed
 
     def read(self, address: int, out: Array) -> None:
-        """Wait for what is queued, and copy from there."""
+        """Copy from there, after what is queued."""
         _check(driver.cuMemcpyDtoHAsync(out.ctypes.data, address, out.nbytes, self._handle))
         self.wait()
 
@@ -88,11 +82,11 @@ class CudaDevice:
         _check(driver.cuMemcpyDtoDAsync(target, source, num_bytes, self._handle))
 
     def wait(self) -> None:
-        """Until what is queued is done."""
+        """Wait for what is queued."""
         _check(driver.cuStreamSynchronize(self._handle))
 
     def record(self, launches: Sequence[Launch]) -> "CudaGraph":
-        """The launches as graphs: of one replay, and of MANY."""
+        """Record graphs of one replay and of MANY."""
         graphs = {}
         with _named_faults():
             for count in (1, MANY):
@@ -103,7 +97,7 @@ class CudaDevice:
         return CudaGraph(graphs, self._stream)
 
     def queue(self, launches: Sequence[Launch]) -> None:
-        """The launches one by one, for tools that look at each."""
+        """Queue launches singly, for tools that inspect each."""
         self._queue(self._stream, launches)
 
     def _queue(self, target: Any, launches: Sequence[Launch]) -> None:
@@ -114,7 +108,7 @@ class CudaDevice:
             launch(target, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
 
     def seconds(self, graph: Graph, num_times: int) -> float:
-        """Mean time of a replay, measured on the device."""
+        """Mean time of a replay on the device."""
         before, after = (self._device.create_event({"timing_enabled": True}) for _ in range(2))
         self._stream.record(before)
         graph.run(num_times)
@@ -124,13 +118,10 @@ class CudaDevice:
 
 
 class CudaGraph:
-    """Launches on the device's stream."""
-
     def __init__(self, graphs: dict[int, Any], stream: Any) -> None:
         self._graphs, self._stream = graphs, stream
 
     def run(self, num_times: int = 1) -> None:
-        """Queue them, so many times."""
         with _named_faults():
             for _ in range(num_times // MANY):
                 self._graphs[MANY].launch(self._stream)

@@ -1,4 +1,4 @@
-"""What NVIDIA's driver says of its cards, through ctypes: nothing of CUDA is imported to learn that there is none."""
+"""NVIDIA's cards by ctypes, without importing CUDA."""
 
 import ctypes
 import re
@@ -12,14 +12,14 @@ from splatctrl_cli.kernels.cuda.memory import DeviceError
 LIBRARY = "libcuda.so.1"
 VERSION_FILE, CARDS = Path("/proc/driver/nvidia/version"), Path("/proc/driver/nvidia/gpus")
 OLDEST = (7, 5)  # compute capability
-OLDEST_CUDA = (13, 0)  # of the driver: an older one does not load what NVRTC 13 compiles
+OLDEST_CUDA = (13, 0)  # of the driver: older ones do not load code of NVRTC 13
 OLDEST_DRIVER = 580  # the first for it
 CAPABILITY = (75, 76)  # attributes of a device: major, minor
 
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """A card by its number, with its driver's version."""
+    """A card by number, with its driver's version."""
 
     index: int
     name: str
@@ -28,14 +28,14 @@ class Card:
 
 
 def num_cards() -> int:
-    """Cards that the driver has on file; none is woken, so that a process may still fork."""
+    """Number of cards; none is woken, so that the process may still fork."""
     with suppress(OSError):
         return len([*CARDS.iterdir()])
     return 0
 
 
 def usable_card(index: int = 0) -> Card:
-    """The card of that number. Raises DeviceError with a remedy where the driver or the card cannot be used."""
+    """Card of that number. Raises DeviceError with a remedy."""
     try:
         cuda: Any = ctypes.CDLL(LIBRARY)
     except OSError as error:
@@ -74,7 +74,7 @@ def usable_card(index: int = 0) -> Card:
 
 
 def _driver_version() -> str:
-    """As the driver's file says it, such as 580.159.04; empty where it does not."""
+    """Version, such as 580.159.04, or an empty string."""
     with suppress(OSError):
         if found := re.search(r"\b\d{3,}\.\d+(\.\d+)?\b", VERSION_FILE.read_text()):
             return found[0]

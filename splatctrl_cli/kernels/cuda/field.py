@@ -1,6 +1,6 @@
-"""Distance fields on a device: the exact one and those of kernels, at the cells of grids and at points.
+"""Distance fields on a device, in grid cells and at points.
 
-Shapes: N spheres laid out as C clusters (kernels/field.py), Q points, (X, Y, Z) cells.
+Shapes: N spheres as C clusters (kernels/field.py), Q points, (X, Y, Z) cells.
 """
 
 from collections.abc import Collection, Mapping
@@ -36,8 +36,9 @@ HARD = "hard"
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Which distance is taken: the exact one, or where a kernel is named the smaller of both, or (is_single) the
-    kernel's where it has one. resolution [m]: a kernel that exceeds the exact distance by more is counted.
+    """Choice of distance: exact; with a kernel, the smaller, or if is_single, the kernel's where defined.
+
+    resolution [m]: a larger excess of a kernel is counted.
     """
 
     kernel: str | None
@@ -47,11 +48,10 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Of (X, Y, Z) cells or (Q,) points, what was wanted: the exact distance `hard`, the chosen one and its gradient,
-    `bound` (the exact one less the margin), the entry of the nearest sphere, and the kernels' distances (the exact
-    one where they have none), each [m].
+    """Wanted results in (X, Y, Z) cells or (Q,) points [m].
 
-    counts: of a kernel the cells without a distance, and those where it exceeds the exact one.
+    bound: exact distance minus margin; entry: nearest sphere's; kernels: exact where undefined; counts: by kernel,
+    cells undefined, and above the exact distance.
     """
 
     distance: Float32
@@ -64,12 +64,12 @@ class Answers:
 
 
 class DeviceField:
-    """The fields of N spheres on a device, where what they are made of stays."""
+    """Fields of N spheres, kept on a device."""
 
     def __init__(
         self, device: Memory, spheres: Clusters, radii: Offsets, kernels: Mapping[str, LogSumExp], choice: Choice
     ) -> None:
-        """kernels: by name, those that are wanted. Raises OutOfMemory."""
+        """kernels: by name. Raises OutOfMemory."""
         self.device, self.choice, self._kernels = device, choice, kernels
         self._rooms: dict[str, tuple[int, int]] = {}  # address and bytes
         self.launches: list[Launch] = []  # of the last answer
@@ -91,13 +91,13 @@ class DeviceField:
             self._tasks[name] = task
 
     def close(self) -> None:
-        """Give back the memory."""
+        """Free the memory."""
         for address, _ in self._rooms.values():
             self.device.free(address)
         self._rooms = {}
 
     def bake(self, span: GridSpan, wanted: Collection[str], *, margin: float = 0.0) -> Answers:
-        """At the cells of a span, whose mask does not count. wanted: fields of `Answers`, and kernels; margin [m]."""
+        """Return `wanted` (fields of `Answers`, kernels) in a span, without its mask; margin [m]."""
         grid = np.zeros((), GRID)
         grid["place"], grid["size"], grid["planes"] = (*span.origin, span.voxel), span.shape, (span.first, span.last)
         shape = span.shape_of_channel
@@ -105,7 +105,7 @@ class DeviceField:
         return self._answered("bake", {"grid": grid}, shape, num_warps, wanted, margin)
 
     def query(self, points: Float64, anchor: Float64, wanted: Collection[str] = ("gradient",)) -> Answers:
-        """At points (Q, 3), Q > 0, in the frame that the spheres' anchor (3,) is in."""
+        """Return `wanted` at points (Q, 3), Q > 0, in anchor's (3,) frame."""
         address = self._put("points", points)
         asked: dict[str, Array | int] = {"points": address, "num_points": len(points), "anchor": anchor}
         return self._answered("query", asked, (len(points),), len(points), wanted, 0.0)
@@ -149,7 +149,6 @@ class DeviceField:
         )
 
     def _choices(self, num: int, places: Mapping[str, tuple[int, int]], margin: float | None) -> list[Launch]:
-        """The choice between the exact distance and the kernel's, then what is counted of each kernel."""
         task = np.zeros((), CHOICE)
         task["hard"], task["num"], task["margin"] = places[HARD], num, margin or 0.0
         task["resolution"], task["takes_least"] = self.choice.resolution, not self.choice.is_single
@@ -168,7 +167,6 @@ class DeviceField:
         return [self._launch("choose", "choice", task, num, CHOOSE, CHOOSE), *launches]
 
     def _launch(self, kernel: str, name: str, task: Array, num: int, per_block: int, threads: int) -> Launch:
-        """Of a kernel whose task is given to it by address, for `num` warps or cells."""
         grid = (-(-num // per_block), 1, 1)
         return Launch(kernel=kernel, grid=grid, block=threads, arguments=(self._put(name, task),), source=FIELD)
 
@@ -178,7 +176,6 @@ class DeviceField:
         return task
 
     def _room(self, name: str, num_bytes: int) -> int:
-        """The address of memory of that name that holds so many bytes."""
         address, size = self._rooms.get(name, (0, 0))
         if size < num_bytes:
             if address:

@@ -1,7 +1,6 @@
-"""The fit's iterations on a device: the splats, Adam's state and the views stay there between calls.
+"""Iterations of the fit on a device, which keeps splats, Adam's state and views.
 
-Shapes: N splats, (H, W) pixels, K tiles of 16 x 16 pixels. All sizes follow from the budget and the images; lists
-grow where they turn out too short, and the run is then repeated from where it began.
+Shapes: N splats, (H, W) pixels, K tiles of 16 x 16 pixels. If a list is too short, it grows, and the run repeats.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +25,7 @@ TILE, NUM_SUMS, PATCH, NUM_TERMS = 16, 10, 32, 5
 PROJECT_LANES = 4  # threads of a splat
 PROJECT, BLEND, LOSS, BACKWARD, STEP = 128, 128, 128, 64, 128  # threads in a block
 MOST_SPLATS = 1 << 24
-LIST_CAPACITY, SPLAT_TILES = 512, 16  # entries of a tile's list and tiles of a splat that there is room for at first
+LIST_CAPACITY, SPLAT_TILES = 512, 16  # entries per tile's list and tiles per splat, at first
 LEAST_TABLE = 1 << 16  # bytes, so that graphs outlive a longer schedule
 NUM_TABLES = 5  # of the run, the views, the schedule, the counters and the terms
 STATE = {"parameters": 32, "first": 32, "second": 32, "num_steps": 4}  # bytes of a splat
@@ -47,7 +46,7 @@ class _DeviceView:
 
 
 def camera_row(camera: Float64) -> Array:
-    """A `pack_camera` camera as the kernels read it."""
+    """`pack_camera` camera as the kernels read it."""
     row = np.zeros((), CAMERA)
     row["floats"], row["size"], row["T_camera_world"] = camera[:4], camera[4:6], camera[6:18]
     return row
@@ -59,7 +58,7 @@ def bytes_needed(
     list_capacity: int = LIST_CAPACITY,
     splat_tiles: float = SPLAT_TILES,
 ) -> int:
-    """Memory of a fit of N splats to views of `sizes` (H, W)."""
+    """Bytes of a fit of N splats to views of `sizes` (H, W)."""
     splats = (sum(STATE.values()) * 2 + sum(WORK.values()) + 4 * NUM_SUMS * splat_tiles) * num_splats
     tiles = [-(-height // TILE) * -(-width // TILE) for height, width in set(sizes)]
     pixels = sum(sum(PIXEL.values()) * height * width for height, width in set(sizes))
@@ -74,9 +73,9 @@ def bytes_needed(
 
 
 class DeviceFit:
-    """The optimiser of N splats on a device, of views of `sizes` (H, W) to begin with.
+    """Optimiser of N splats on a device, for views of `sizes` (H, W) at first.
 
-    Raises OutOfMemory where there is no room, with what would fit.
+    Raises OutOfMemory, with what would fit.
     """
 
     def __init__(
@@ -105,30 +104,30 @@ class DeviceFit:
         self._room("parts", 4 * NUM_SUMS * self.part_capacity)
 
     def close(self) -> None:
-        """Give back the memory."""
+        """Free the memory."""
         for address in [*self._addresses.values(), *self._images]:
             self.device.free(address)
         self._addresses, self._images, self._sizes = {}, {}, {}
 
     def expect(self, sizes: Sequence[tuple[int, int]]) -> None:
-        """Views of these sizes (H, W) will be added. Raises OutOfMemory where they do not fit."""
+        """Expect views of sizes (H, W). Raises OutOfMemory."""
         self._asked = list(sizes)
         if self._needed(self.num_splats) > self._usable():
             raise self._too_large()
 
     def put(self, parameters: Float32, moments: Moments | None = None) -> None:
-        """Splats (N, 8), and Adam's state if given, from the host."""
+        """Write splats (N, 8), and Adam's state if given."""
         state = {"parameters": parameters} if moments is None else self._state(parameters, moments)
         for name, values in state.items():
             self.device.write(self._addresses[name], values)
 
     def take(self, parameters: Float32, moments: Moments) -> None:
-        """Splats (N, 8) and Adam's state, into the host's arrays."""
+        """Read splats (N, 8) and Adam's state."""
         for name, values in self._state(parameters, moments).items():
             self.device.read(self._addresses[name], values)
 
     def add_view(self, camera: Float64, target: TargetView) -> int:
-        """A view that `run` may name by the number returned; its images stay on the device."""
+        """Copy a view to the device; return its number for `run`."""
         height, width = target.depth.shape
         num_values = 3.0 * max(int(np.count_nonzero(target.counted)), 1)
         num_depths = int(np.count_nonzero((target.depth > 0) & (target.counted != 0)))
@@ -149,13 +148,13 @@ class DeviceFit:
         return len(self.views) - 1
 
     def number_of(self, camera: Float64, target: TargetView) -> int:
-        """The number of a view, which is added if its target is not there."""
+        """Number of a view, added if its target is new."""
         known = (k for k, view in enumerate(self.views) if view.target is target)
         number = next(known, None)
         return self.add_view(camera, target) if number is None else number
 
     def keep(self, targets: Sequence[TargetView]) -> None:
-        """Give back the images of other views; the numbers of those that stay change."""
+        """Free other views' images; view numbers change."""
         kept = {id(target) for target in targets}
         gone = [view for view in self.views if id(view.target) not in kept]
         self.views = [view for view in self.views if id(view.target) in kept]
@@ -166,9 +165,9 @@ class DeviceFit:
     def run(
         self, schedule: Sequence[int], weights: LossWeights, settings: OptimiserSettings, seed: int
     ) -> dict[int, LossTerms]:
-        """An iteration on each view of the schedule; the loss of each at the last iteration that looked at it.
+        """Run an iteration on each scheduled view; return losses at their last iteration.
 
-        The noise of iteration k has seed `seed` + k.
+        Iteration k draws noise with `seed` + k.
         """
         if not schedule:
             return {}
@@ -184,7 +183,7 @@ class DeviceFit:
                 self.device.copy(self._addresses[name], self._addresses[f"{name}_before"], self._sizes[name])
 
     def planes(self, view: int) -> Float32:
-        """Red, green, blue, depth and opacity (5, H, W) of a view."""
+        """Planes (5, H, W) of a view, as in `kernels.raster`."""
         height, width = self.views[view].height, self.views[view].width
         while True:
             self.rewind([view], None, None, 0)
@@ -193,7 +192,7 @@ class DeviceFit:
                 return self.read_image("planes", view, 5)
 
     def gradients(self, view: int, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
-        """The derivatives (N, 8) of the loss of a view by the parameters, which stay as they are; and the loss."""
+        """Loss and its derivatives (N, 8); parameters stay."""
         height, width = self.views[view].height, self.views[view].width
         while True:
             self.rewind([view], weights, settings, 0)
@@ -204,14 +203,14 @@ class DeviceFit:
                 return out, self._terms([view])[view]
 
     def list_lengths(self, view: int) -> NDArray[np.int32]:
-        """(K,) splats on the list of each tile, of the last launches on the view's size."""
+        """Splats (K,) on tile lists, at the size's last launch."""
         height, width = self.views[view].height, self.views[view].width
         out = np.empty(-(-height // TILE) * -(-width // TILE), np.int32)
         self.device.read(self._addresses[f"num_entries {height} {width}"], out)
         return out
 
     def read_image(self, name: str, view: int, channels: int) -> Float32:
-        """What the last launch left in `planes`, `plane_gradients` or `maps` of the view's size (channels, H, W)."""
+        """Read `planes`, `plane_gradients` or `maps` (channels, H, W) of the size's last launch."""
         height, width = self.views[view].height, self.views[view].width
         out = np.empty((channels, height, width), np.float32)
         self.device.read(self._addresses[f"{name} {height} {width}"], out)
@@ -224,7 +223,7 @@ class DeviceFit:
         }  # fmt: skip
 
     def _room(self, name: str, num_bytes: int) -> int:
-        """The address of a named piece of memory of at least that size; what it held is lost where it grows."""
+        """Address of named memory; growing loses its content."""
         if self._sizes.get(name, -1) < num_bytes:
             if name in self._addresses:
                 self.device.free(self._addresses.pop(name))
@@ -254,7 +253,6 @@ class DeviceFit:
         return self.device.available() + sum(self._sizes.values()) + sum(self._images.values())
 
     def _too_large(self) -> OutOfMemory:
-        """The error that says what was needed and what would fit, in budgets of one significant digit."""
         usable, fixed = self._usable(), self._needed(0)
         each = (self._needed(self.num_splats) - fixed) / max(self.num_splats, 1)
         most = min(int((usable - fixed) / each), self.num_splats // 2)
@@ -268,7 +266,7 @@ class DeviceFit:
     def rewind(
         self, schedule: Sequence[int], weights: LossWeights | None, settings: OptimiserSettings | None, seed: int = 0
     ) -> None:
-        """Put a schedule before the next launches; without weights and settings to render only."""
+        """Set a schedule before the next launches; by default, for rendering."""
         run = np.zeros((), RUN)
         if settings is not None and weights is not None:
             w = weights
@@ -285,7 +283,7 @@ class DeviceFit:
         self._room("terms", max(8 * NUM_TERMS * len(self.views), LEAST_TABLE))
 
     def _fits(self) -> bool:
-        """Whether every list had room; else they have more now."""
+        """Return True if all lists had room; else grow them."""
         counters = np.zeros((), COUNTERS)
         self.device.read(self._addresses["counters"], counters)
         longest, most = int(counters["longest_list"]), int(counters["most_parts"])
@@ -323,7 +321,7 @@ class DeviceFit:
         return known
 
     def launches(self, height: int, width: int, gradients: int = 0) -> list[Launch]:
-        """One iteration on a view of that size; `gradients`, if not 0, is where they go instead of a step."""
+        """Launches of one iteration; gradients: their address, or 0 to step."""
         at: Callable[[str], int] = self._addresses.__getitem__
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         patches_x, patches_y = -(-width // PATCH), -(-height // PATCH)

@@ -1,4 +1,4 @@
-"""What the engine needs of a device: memory, and lists of kernel launches that are replayed as one graph."""
+"""Interface of a device: memory, and launches replayed as one graph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ FIT, FIELD = "fit.cu", "field.cu"  # the sources of kernels
 
 
 class DeviceError(RuntimeError):
-    """The device is not there, cannot be used, or has failed; `remedy` says what to do about it."""
+    """The device is missing, unusable, or failed."""
 
     def __init__(self, message: str, *, remedy: str = "") -> None:
         super().__init__(message)
@@ -19,14 +19,12 @@ class DeviceError(RuntimeError):
 
 
 class OutOfMemory(DeviceError):  # noqa: N818  (as the driver names it)
-    """The device has no room for what was asked."""
+    """Too little memory on the device."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Launch:
-    """One kernel of a source: blocks in the grid (x, y, z), threads in a block; addresses are int, other arguments
-    np.int32.
-    """
+    """One kernel launch: grid (x, y, z), threads per block; addresses are int, other arguments np.int32."""
 
     kernel: str
     grid: tuple[int, int, int]
@@ -36,23 +34,23 @@ class Launch:
 
 
 class Graph(Protocol):
-    """Launches that run one after the other."""
+    """Launches in order."""
 
     def run(self, num_times: int = 1) -> None:
-        """Queue them, so many times."""
+        """Queue the launches `num_times`."""
 
 
 class Memory(Protocol):
-    """What the engine needs of a device; addresses are int."""
+    """A device's memory; addresses are int."""
 
     def allocate(self, num_bytes: int) -> int:
-        """Memory of zeros. Raises OutOfMemory."""
+        """Address of zeroed memory. Raises OutOfMemory."""
 
     def available(self) -> int:
-        """Bytes that are free."""
+        """Number of free bytes."""
 
     def free(self, address: int) -> None:
-        """Give it back."""
+        """Free memory."""
 
     def write(self, address: int, values: Array) -> None:
         """Copy an array there."""
@@ -61,7 +59,7 @@ class Memory(Protocol):
         """Wait for what is queued, and copy from there."""
 
     def copy(self, target: int, source: int, num_bytes: int) -> None:
-        """Copy within the device, after what is queued."""
+        """Copy within the device."""
 
     def record(self, launches: Sequence[Launch]) -> Graph:
-        """Launches to be replayed."""
+        """Record launches for replay."""

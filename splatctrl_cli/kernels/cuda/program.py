@@ -1,4 +1,4 @@
-"""Compiles the kernels at run time with NVRTC; the result is kept on disk between runs."""
+"""Kernels compiled at run time with NVRTC, cached on disk."""
 
 import hashlib
 from contextlib import suppress
@@ -17,7 +17,7 @@ FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include l
 
 @cache
 def source_digest() -> bytes:
-    """Of every file that the kernels may include."""
+    """Digest of all files that kernels may include."""
     digest = hashlib.sha256()
     for folder in FOLDERS:
         for path in sorted(p for p in folder.iterdir() if p.suffix in {"", ".h", ".cu", ".cuh"} and p.is_file()):
@@ -26,10 +26,7 @@ def source_digest() -> bytes:
 
 
 def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, source: str = FIT) -> Any:
-    """The kernels of a source for a compute capability, as machine code, kept in cuda-core's folder or the given one.
-
-    A cache that cannot be written costs the compilation only.
-    """
+    """Machine code of a source, cached in cuda-core's or the given folder, if writable."""
     options = ProgramOptions(
         name=source, arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
     )
