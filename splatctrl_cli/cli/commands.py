@@ -302,7 +302,7 @@ COMMANDS = {
                 options=_ROBOT_PAIRS,
             ),
             "learn": Command(
-                summary="learn from a recording what is fixed to the links beside the URDF's geometry",
+                summary="learn from a recording the parts that the URDF lacks",
                 run="robot:run_learn",
                 options=_ROBOT_LEARN,
             ),

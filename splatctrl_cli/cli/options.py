@@ -268,7 +268,7 @@ PACKAGES = option(
 )
 SELF_MODEL = option(
     "--self-model FILE.npz",
-    "what robot learn found of its surface beside the URDF's (none: learn and take nothing)",
+    "self-model of 'robot learn' (none: learn and apply nothing)",
     Path,
 )
 LOCK = option("--lock JOINT=VALUE ...", "hold a joint, and what mimics it, at a value [rad or m]")

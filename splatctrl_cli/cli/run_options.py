@@ -40,7 +40,7 @@ VIEW = (
 BATCH = (
     option("SUITE", "TOML file of recordings and jobs (splatctrl help batch); with --list also an output", Path),
     option(
-        "-o/--out DIR", "folder of the batch, where it goes on (default: what the suite says, or SUITE.out)", Path
+        "-o/--out DIR", "folder of the batch, which a second run continues (default: the suite's, or SUITE.out)", Path
     ),
     option("--workers N", "nodes that run at once (default: one per core)", whole(1, 256)),
     option("--shard I/N", "only every N-th recording, from the I-th on", _shard),
@@ -62,7 +62,7 @@ SWEEP = (
         "what is varied, from A to B: splats, cameras-out, depth-noise, pose-error, pose-turn, latency, margin, ..."
         " (splatctrl help sweep), or a setting",
     ),
-    option("-o/--out DIR", "folder of the sweep, where it goes on (default: sweep)", Path),
+    option("-o/--out DIR", "folder of the sweep, which a second run continues (default: sweep)", Path),
     option(
         "--tolerance SHARE",
         "how near the two sides of a flip are to lie, as a share of the range",
@@ -162,7 +162,7 @@ CALIBRATE = (
         "--board COLUMNSxROWS:M",
         "begin where a board of so many inner corners (chessboard or ChArUco), squares of M metres, has the cameras",
     ),
-    option("--allow-unobserved", "write what the recording says, although not all can be told from it"),
+    option("--allow-unobserved", "write the result although the recording does not determine all of it"),
     group(
         "robot",
         option("--spheres FILE", "its spheres (default: those of the URDF), for links without geometry", Path),

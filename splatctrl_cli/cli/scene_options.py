@@ -100,7 +100,9 @@ SDF_BAKE = (
     GATES,
     group(
         "field",
-        option("--include NAME,...", "labels in the field beside object: robot, human, or none", str, "human"),
+        option(
+            "--include NAME,...", "labels in the field in addition to object: robot, human, or none", str, "human"
+        ),
         option("--spheres FILE.yaml", "spheres of --urdf (default: the URDF's own)", Path),
         option(
             "--channels NAME,...",
@@ -142,7 +144,12 @@ QUERY = (
     *output("CSV file of the answers, in the order of the points", default="stdout, with --json none"),
     option("--scene SCENE", "what SOURCE, a field, was baked from: adds what a grid does not know", Path),
     option("--at SECONDS", "of a scene: as known that long after its start", real(-MAX_SECONDS, MAX_SECONDS, "s")),
-    option("--include NAME,...", "of a scene: labels that count beside object: robot, human, or none", str, "human"),
+    option(
+        "--include NAME,...",
+        "of a scene: labels that count in addition to object: robot, human, or none",
+        str,
+        "human",
+    ),
     CONFIG_FILE,
     *settings(", such as field.distance=hard"),
     THREADS,
@@ -294,7 +301,7 @@ REPLAY = (  # what people use, and in groups the rest
         "evidence",
         HOLDOUT,
         option("--max-unknown SHARE", "never-seen share allowed", real(0, 1), 0.05),
-        option("--max-map-age S", "a scene older than this is no evidence", real(1e-3, MAX_SECONDS, "s"), 1.0),
+        option("--max-map-age S", "largest age of a map that counts as evidence", real(1e-3, MAX_SECONDS, "s"), 1.0),
         option(
             "--latency S",
             "a map is known this long after its frames' stamp (--scene, --lockstep)",
@@ -304,11 +311,11 @@ REPLAY = (  # what people use, and in groups the rest
         option("--require-evidence", "not evaluable (exit 5) without a bound on the map's error"),
         option(
             "--unseen",
-            "space beside the arm that no camera saw free: judge by a table (splatctrl help verdict), or obstacle",
+            "space near the arm not seen free: judge it (splatctrl help verdict), or take it for an obstacle",
             UNSEEN_IS,
             "judge",
         ),
-        option("--require-proof", "not evaluable (exit 5) where space beside the arm was assumed to be free"),
+        option("--require-proof", "not evaluable (exit 5) if space near the arm was assumed to be free"),
         *DISAGREEMENT,
     ),
     group(

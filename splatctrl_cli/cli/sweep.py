@@ -29,7 +29,7 @@ def _lines(result: SweepResult, *, is_long: bool) -> Iterator[str]:
         if flip.first is not None:
             yield f"  at {flip.first.values[flip.key.name]:.6g}: {flip.first.sentence}"
         if not flip.is_monotone:
-            yield "  the verdict turns back: the flip nearest to the start is told"
+            yield "  the verdict turns back: the flip nearest to the start is reported"
         if flip.spacing:
             which = "values tried" if flip.first is None else "values tried before it"
             yield f"  {which} are up to {flip.spacing:.4g} apart: a narrower flip is not excluded"

@@ -193,7 +193,7 @@ def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
     with monkeypatch.context() as patched:
         patched.setattr("splatctrl_cli.cli.common.Console.log", interrupted)
         assert main(["batch", str(suite), "--workers", "1"]) == 130
-    assert "interrupted; run the same again to go on" in capsys.readouterr().err
+    assert "interrupted; run the same command again to continue" in capsys.readouterr().err
     nodes = json.loads((out / "batch.json").read_text())["nodes"]
     assert [node["state"] for node in nodes] == ["done", "done", "to do"]
     assert main(["report", str(out), "-o", str(tmp_path / "page.html")]) == 0

@@ -96,10 +96,10 @@ def test_unknown_space_is_said_after_the_outputs_are_written(desk: Desk, capsys:
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), is_seen=False)
     assert desk.replay("--scene", str(scene), "-q", is_judged=True) == 5
     said = capsys.readouterr().out
-    assert "100 % of the space within the margin of the arm was never seen by a camera" in said
+    assert "100 % of the space within the margin of the arm was never seen" in said
     verdict = json.loads((desk.folder / "out" / "summary.json").read_text())["verdict"]
     reasons = [reason["sentence"] for reason in verdict["reasons"]]
-    unknown = "100.0 % of the sphere centres lie in space no camera ever saw, allowed 5 %, first"
+    unknown = "100.0 % of the sphere centres lie in unseen space, allowed 5 %, first"
     assert any(unknown in sentence for sentence in reasons)
     assert desk.metrics()["unknown_share"] == 1.0
     assert desk.replay("--scene", str(scene), "-q", "--max-unknown", "1", out="again") == 0

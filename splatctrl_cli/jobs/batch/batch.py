@@ -80,7 +80,7 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
         try:
             runs = list(scheduler.run(nodes).values())
         except KeyboardInterrupt:
-            raise KeyboardInterrupt("interrupted; run the same again to go on") from None
+            raise KeyboardInterrupt("interrupted; run the same command again to continue") from None
         finally:
             if scheduler.keys:  # it knows what each node is to be
                 write_batch(out, suite, every, ledger.latest(), scheduler.keys)

@@ -409,7 +409,7 @@ class _Figures:
             notes.append(f"{num['outside']} of {num['points']} points lie {place} and {what}")
         blank = num["points"] - num["answered"] - (num["outside"] if asked.is_grid else 0)
         if blank:
-            notes.append(f"{blank} points lie beside never-seen cells, which were baked as nan, and have no distance")
+            notes.append(f"{blank} points lie next to unseen cells, baked as nan, and have no distance")
         if self._knows_seen and num["never_seen"]:
             notes.append(
                 f"{num['never_seen']} of {num['points']} points are where no camera looked: nothing is known of"

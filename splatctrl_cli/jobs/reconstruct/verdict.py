@@ -99,7 +99,7 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
     yield Reason(
         criterion="map",
         outcome=Outcome.NOT_EVALUABLE if is_empty else Outcome.PASSED,
-        sentence="it is empty: no splat of an object is left" if is_empty else f"{num_splats} splats of objects",
+        sentence="it is empty: it has no splat of an object" if is_empty else f"{num_splats} splats of objects",
         value=float(num_splats),
         threshold=1.0,
         remedy="give a --box that holds what the cameras saw, and check the depth with 'splatctrl check'"
@@ -111,7 +111,7 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
         yield note(
             criterion="represented space",
             sentence=f"{num} voxels ({1e3 * metrics['unrepresented_volume']:.2f} l) are occupied and have no splat; "
-            "they are obstacles as they are",
+            "they count as obstacles",
             value=float(num),
             remedy=f"raise --max-splats above {made.config.scene.max_splats}",
             count=metrics["splats"] + num,
@@ -137,7 +137,7 @@ def _blind(made: Reconstructed) -> Iterator[Reason]:
             unit="s",
             time_s=start,
             who=camera,
-            remedy="nothing it looked at is known then: check it with 'splatctrl check'",
+            remedy="its view is unknown during that time: run 'splatctrl check'",
             count=without,
         )
     if not long:
@@ -206,7 +206,7 @@ def _inside(made: Reconstructed) -> Iterator[Reason]:
     if num:
         yield note(
             criterion="points inside the robot",
-            sentence=f"{num} measured points lie inside it where its surface does not explain them, first in {link}",
+            sentence=f"{num} measured points lie inside it and are not explained by its surface, first in {link}",
             value=float(num),
             time_s=made.seconds(made.metrics["inside_robot_first_ns"]),
             who=link,

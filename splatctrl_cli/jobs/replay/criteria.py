@@ -83,20 +83,20 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     for found in judged.replay.unwatched:
         since, until, when = ((ns - first_ns) * 1e-9 for ns in (found.since_ns, found.depth_ns, found.stamp_ns))
         yield lacking(
-            sentence=f"no camera gave depth from about the arm from {since:.2f} to {until:.2f} s, and then a thing "
-            f"is {mm(found.clearance)} from where the arm was, margin {mm(margin)},",
+            sentence=f"no camera gave depth near the arm from {since:.2f} to {until:.2f} s, and then an obstacle "
+            f"is {mm(found.clearance)} from the arm's place, margin {mm(margin)},",
             value=found.clearance,
             threshold=margin,
             unit="m",
             time_s=when,
-            remedy="nobody can say when it came: cameras must give depth all the time",
+            remedy="its time of arrival is unknown: cameras must give depth all the time",
             count=judged.num_states,
         )
     ahead = nearby(judged, judged.replay.near["ahead"])
     allowed = SAME_MOMENT_NS / 1e9  # frames of one time step differ in time
     if ahead is not None and ahead[0] > allowed:
         yield lacking(
-            sentence=f"the newest depth near the arm is {ahead[0]:.2f} s later than the state that it judges",
+            sentence=f"the newest depth near the arm is {ahead[0]:.2f} s newer than the state that it judges",
             value=-ahead[0],
             threshold=-allowed,
             unit="s",
@@ -171,8 +171,8 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
     found = sorted(judged.replay.overtaken, key=lambda each: each.clearance)
     for worst in [each for each in found if each.depth_ns <= each.stamp_ns][:1]:
         yield failed(
-            sentence=f"depth of {(worst.depth_ns - first_ns) * 1e-9:.2f} s, which the map of then did not have yet, "
-            f"shows a thing {mm(worst.clearance)} from the arm, margin {mm(margin)},",
+            sentence=f"depth of {(worst.depth_ns - first_ns) * 1e-9:.2f} s, not yet in the map of that time, "
+            f"shows an obstacle {mm(worst.clearance)} from the arm, margin {mm(margin)},",
             value=worst.clearance,
             threshold=margin,
             unit="m",
@@ -183,13 +183,13 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
         )
     for last in [each for each in found if each.depth_ns > each.stamp_ns][:1]:
         yield lacking(
-            sentence=f"the next depth, {(last.depth_ns - last.stamp_ns) * 1e-9:.2f} s after the last state, shows a "
-            f"thing {mm(last.clearance)} from where the arm is, margin {mm(margin)},",
+            sentence=f"the next depth, {(last.depth_ns - last.stamp_ns) * 1e-9:.2f} s after the last state, shows an "
+            f"obstacle {mm(last.clearance)} from the arm, margin {mm(margin)},",
             value=last.clearance,
             threshold=margin,
             unit="m",
             time_s=(last.stamp_ns - first_ns) * 1e-9,
-            remedy="nobody can say whether it came before: judge a longer time",
+            remedy="it may have come earlier: judge a longer time",
             count=judged.num_states,
         )
 
@@ -326,7 +326,7 @@ def scene_hits(judged: Judged) -> Iterator[Reason]:
     if hits:
         change = next(change for change in trace.scene_changes if change.is_hit)
         yield failed(
-            sentence=f"the scene came into the arm {int(hits)} times, first",
+            sentence=f"obstacles appeared inside the arm {int(hits)} times, first",
             value=float(hits),
             threshold=0.0,
             time_s=float(change.stamp_ns - judged.replay.audit.stamp_ns[0]) * 1e-9,

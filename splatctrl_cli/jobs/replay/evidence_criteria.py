@@ -77,57 +77,57 @@ class Limit:
 LIMITS = (
     Limit(
         asked="never seen, of all points within the margin",
-        why="faultless recordings of three cameras leave up to 49 %; what this alone finds is met from 50 % on",
+        why="correct recordings of three cameras leave up to 49 %; what this limit alone rejects leaves 50 % or more",
         column="unseen",
         most=UNSEEN,
-        words="of the space within the margin of the arm was never seen by a camera",
+        words="of the space within the margin of the arm was never seen",
         remedy="add a camera that sees where the arm goes",
     ),
     Limit(
         asked="never seen, from a surface of the map",
-        why="one side of a thing says little of where the other ends",
+        why="an object may extend into space on its unseen side",
         column="unseen_to_surface",
         least=HIDDEN,
-        words="space within the margin of the arm that no camera saw is {} from a surface of the map, allowed "
-        "{allowed}: it may go on there",
+        words="unseen space within the margin of the arm is {} from a surface of the map, allowed {allowed}: the "
+        "surface may extend there",
         remedy="add a camera that sees that side",
     ),
     Limit(
         asked="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
-        why="where the arm comes to nothing but the unseen, a whole thing may stand",
+        why="space that is almost entirely unseen may hold a whole object",
         column="blind_to_surface",
         least=BEYOND,
-        words="a part of the arm comes to space of which cameras saw less than a tenth, {} from a surface of the "
-        "map: it may go on there, allowed {allowed}",
+        words="a part of the arm enters space that is over 90 % unseen, {} from a surface of the map, allowed "
+        "{allowed}: the surface may extend there",
         remedy="add a camera that sees where the arm goes",
     ),
     Limit(
         asked="unanswered, from the arm",
-        why="a dark, shiny or clear thing stands where depth was due and none came",
+        why="a dark, shiny or transparent object returns no depth where depth is expected",
         column="nearest",
         parts=(EvidenceClass.UNANSWERED,),
-        words="cameras looked at a place {} from the arm and got no depth from it, margin {allowed}",
-        remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth there",
+        words="cameras got no depth from a place {} from the arm, margin {allowed}",
+        remedy="a dark, shiny or transparent object may be there: add a camera that gets depth there",
     ),
     Limit(
         asked="contradicted, from the arm",
-        why="a shiny thing is measured far behind its place",
+        why="depth of a shiny object may lie far behind it",
         column="nearest",
         parts=(EvidenceClass.CONTRADICTED,),
-        words="{} from the arm, margin {allowed}, a camera measures through what another one sees",
-        remedy="a shiny thing may stand there: add a camera that sees it, or check depth scale and poses",
+        words="{} from the arm, margin {allowed}, one camera measures depth behind a surface that another one sees",
+        remedy="a shiny object may be there: add a camera that sees it, or check depth scale and poses",
     ),
     Limit(
         asked="depth edge, from the arm",
-        why="a surface may go on for a pixel where its edge was lost",
+        why="a surface may extend one pixel past an edge without depth",
         column="nearest",
         parts=(EvidenceClass.DEPTH_EDGE,),
-        words="the edge of a surface was lost {} from the arm, margin {allowed}: it may go on for a pixel",
+        words="a depth edge was lost {} from the arm, margin {allowed}: the surface may extend one pixel further",
         remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
     ),
     Limit(
         asked="outside of the workspace, from the arm",
-        why="what stands there is in no map",
+        why="the map ends there",
         column="nearest",
         parts=(EvidenceClass.OUTSIDE,),
         words="the workspace of the map ends {} from the arm, margin {allowed}",
@@ -136,11 +136,11 @@ LIMITS = (
 )
 PROOF = Limit(
     asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
-    why="such a run would be safe by an assumption",
+    why="such a run would be safe by assumption",
     column="nearest",
     parts=tuple(kind for kind in EvidenceClass if kind is not EvidenceClass.FREE),
-    words="space that no camera saw free in time is {} from the arm, margin {allowed}",
-    remedy="add cameras until every side of the arm is seen",
+    words="space not seen free within the allowed age is {} from the arm, margin {allowed}",
+    remedy="add cameras until they see every side of the arm",
 )
 
 
@@ -163,7 +163,7 @@ def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lackin
     near = judged.replay.near
     values = limit.values(near)
     if limit is PROOF and np.isnan(near["assumed"]).all():
-        yield lacking(sentence="what cameras saw of the space about the arm, and when, is not recorded")
+        yield lacking(sentence="evidence of the space near the arm is not recorded")
     if limit.most is not None:
         worst = nearby(judged, values)
         if worst is None:
@@ -205,15 +205,14 @@ def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lackin
 def _unknown_share(judged: Judged) -> Iterator[Reason]:
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
-        yield lacking(sentence="what cameras saw is not recorded")
+        yield lacking(sentence="the space that cameras saw is not recorded")
         return
     if share <= allowed:
         yield held(f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.num_states)
         return
     first = int(np.argmax(judged.replay.audit.figures["unknown_share"] > allowed))
     yield lacking(
-        sentence=f"{100 * share:.1f} % of the sphere centres lie in space no camera ever saw, allowed "
-        f"{100 * allowed:g} %, first",
+        sentence=f"{100 * share:.1f} % of the sphere centres lie in unseen space, allowed {100 * allowed:g} %, first",
         value=share,
         threshold=allowed,
         time_s=seconds_at(judged, first),
@@ -295,7 +294,7 @@ def calibration(judged: Judged) -> Iterator[Reason]:
     if (camera := displaced(judged)) is not None:
         yield lacking(
             sentence=f"{camera[0]} sees the robot {mm(camera[1])} from where its joints put it, allowed "
-            f"{mm(MISPLACED)}: what is near it in the map may be the robot itself",
+            f"{mm(MISPLACED)}: obstacles near it in the map may be the robot itself",
             value=camera[1],
             threshold=MISPLACED,
             unit="m",
@@ -345,7 +344,7 @@ def map_resolution(judged: Judged) -> Iterator[Reason]:
     blind = max(reaches, key=reaches.__getitem__, default=None)
     if blind is not None and reaches[blind] > margin:
         yield lacking(
-            sentence=f"what is within {mm(reaches[blind])} of {blind} was taken for the robot, margin {mm(margin)}",
+            sentence=f"surfaces within {mm(reaches[blind])} of {blind} count as the robot, margin {mm(margin)}",
             value=reaches[blind],
             threshold=margin,
             unit="m",

@@ -86,8 +86,8 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     yield _at_worst(
         worst,
         failed(
-            sentence=f"{worst.worst_name} is {mm(abs(least))} {'deep in' if least < 0 else 'from'} the scene, "
-            f"margin {mm(replay.margin)}, {states} states in {counted(len(events), 'interval')}, worst",
+            sentence=f"{worst.worst_name} {_apart(least)}, margin {mm(replay.margin)}, {states} states in "
+            f"{counted(len(events), 'interval')}, worst",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -95,6 +95,10 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
             label=CONTACT if least < 0 else MARGIN,
         ),
     )
+
+
+def _apart(least: float) -> str:
+    return f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
 
 
 def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
@@ -147,7 +151,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     yield _at_worst(
         worst,
         failed(
-            sentence=f"{worst.worst_name} are {mm(-worst.worst)} deep in each other",
+            sentence=f"{worst.worst_name} overlap by {mm(-worst.worst)}",
             value=worst.worst,
             threshold=0.0,
             unit="m",
@@ -190,8 +194,8 @@ def _brought_together(judged: Judged) -> Reason | None:
         if gap < before - SLIGHTLY_UNDER:
             bound = f"at least {mm(before)}" if before < pair.apart else f"{mm(pair.apart)} or more"
             return failed(
-                sentence=f"{' and '.join(pair.links)} came together to {mm(gap)}, in the recording {bound}: their "
-                f"spheres keep {mm(pair.margin or 0.0)} of {mm(replay.config.control.self_margin)} asked for",
+                sentence=f"{' and '.join(pair.links)} were driven to {mm(gap)} apart, recorded {bound}: "
+                f"spheres keep {mm(pair.margin or 0.0)} of the required {mm(replay.config.control.self_margin)}",
                 value=gap,
                 threshold=min(pair.apart, before),
                 unit="m",
@@ -217,7 +221,7 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
     if broken:
         name, (first, least) = min(broken.items(), key=lambda item: item[1][1])
         yield failed(
-            sentence=f"the scene comes within {mm(least)} of {name}, which no joint moves (at first {mm(first)})",
+            sentence=f"the scene is within {mm(least)} of {name}, which no joint moves ({mm(first)} at first)",
             value=least,
             threshold=judged.replay.margin,
             unit="m",
@@ -290,14 +294,14 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
     deficit = model.sphere_deficit[np.asarray(model.moving_spheres)]
     if np.isnan(deficit).any():
         yield lacking(
-            sentence=f"how much of the robot its spheres cover is not known: {model.coverage_unknown}",
+            sentence=f"the share of the robot that its spheres cover is unknown: {model.coverage_unknown}",
             remedy="give a URDF with collision geometry (--packages finds its meshes)",
         )
         return
     bare = bare_moving_links(judged.replay.model)
     if bare:
         yield lacking(
-            sentence=f"no sphere on {', '.join(bare)}: nothing is known of their clearance",
+            sentence=f"no sphere on {', '.join(bare)}: their clearance is unknown",
             who=bare[0],
             remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {judged.inputs.model.urdf.path}",
         )
@@ -327,7 +331,7 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
         return
     if between < judged.threshold <= surface:
         yield lacking(
-            sentence=f"on the straight way between two states the arm comes to at most {mm(between)}"
+            sentence=f"on a straight path between two states the arm is at most {mm(between)} from the scene"
             if bool(columns["met"][int(np.nanargmin(columns["lower"]))])
             else f"the arm may have come within {mm(between)} between two states",
             value=between,

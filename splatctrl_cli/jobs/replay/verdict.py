@@ -94,7 +94,7 @@ def _notes(judged: Judged) -> Iterator[str]:
     if inside:
         yield f"{inside} measured points lie inside the robot: contact, a carried object, or calibration"
     if judged.request.re_anchor is not None:
-        yield "the arm is put back into the log's posture on the way: nothing is said between states"
+        yield "the arm is reset to the log's configuration on the way: motion between states is not judged"
 
 
 def waivers(request: ReplayRequest) -> Iterator[str]:

@@ -155,7 +155,7 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
         try:
             result = _found(request, run, ranges, runs)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt("interrupted; run the same again to go on") from None
+            raise KeyboardInterrupt("interrupted; run the same command again to continue") from None
         _write(out, asked, result)
         write_batch(out, runs.suite(starts), [*runs.nodes.values()], ledger.latest(), runs.keys)
     return result

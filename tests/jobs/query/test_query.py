@@ -157,4 +157,4 @@ def test_cells_without_a_distance_are_told(scene: Path) -> None:
     field = baked(scene, scene.parent / "field", voxel=0.1, box=outside, field={"unknown": "nan"}).out
     result, rows = asked(field, np.array([[-2.2, 0.0, 0.0], [0.0, 0.0, 0.25]]))
     assert rows[0]["distance"] == "" and rows[1]["distance"] != ""
-    assert any("1 points lie beside never-seen cells" in note for note in result.notes)
+    assert any("1 points lie next to unseen cells" in note for note in result.notes)

@@ -82,7 +82,7 @@ def test_frames_that_repeat_their_depth_are_noted_by_camera() -> None:
 def test_an_empty_map_is_not_evaluable_and_balls_alone_are_no_empty_map() -> None:
     verdict = reconstruct_verdict(made(*STEPS, splats=40), [])
     assert (verdict.exit_code, verdict.label) == (5, "not evaluable")
-    assert "map: it is empty: no splat of an object is left; give a --box" in verdict.sentence
+    assert "map: it is empty: it has no splat of an object; give a --box" in verdict.sentence
     assert notes(made(*STEPS, splats=40, unrepresented_voxels=1))
 
 

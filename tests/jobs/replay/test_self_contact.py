@@ -79,7 +79,7 @@ def test_an_arm_that_folds_into_itself_is_in_contact_whatever_its_spheres_are(
     desk = desk_of(tmp_path, monkeypatch, spheres, OPEN, FOLDED, CROSSED, OPEN)
     found = judged(desk)
     assert (found["outcome"], found["label"], found["who"]) == ("failed", "contact", "block and drum")
-    assert "block and drum are 5.1 mm deep in each other" in found["sentence"]
+    assert "block and drum overlap by 5.1 mm" in found["sentence"]
     assert desk.metrics()["min_self_clearance"] == pytest.approx(-0.0051, abs=1e-4)
     (event,) = [
         one
@@ -157,7 +157,7 @@ def test_links_apart_in_the_recording_that_a_lowered_margin_lets_come_together_a
     assert apart.metrics()["goal_reached"] == 1 and apart.metrics()["num_relaxed"] == 0
     assert (found["outcome"], found["label"], found["who"]) == ("failed", "margin broken", "block and drum")
     assert 0 < found["value"] < found["threshold"] == pytest.approx(1e-3 * least, abs=1e-6)
-    said = f"came together to {1e3 * found['value']:.1f} mm, in the recording {least} mm or more: their spheres keep"
+    said = f"were driven to {1e3 * found['value']:.1f} mm apart, recorded {least} mm or more: spheres keep"
     assert said in found["sentence"] and found["time_s"] > 0.5
     assert judged(apart)["outcome"] == judged(apart, *DRIVE)["outcome"] == "passed"
     as_near = desk_of(tmp_path / "as_near", monkeypatch, spheres, OPEN, there, urdf=urdf)
