@@ -84,7 +84,7 @@ def arm_seen(model: RobotModel, source: RecordSource, progress: Progress) -> tup
     try:
         return arm, frames_of(arm, source, progress)
     except InputError as error:
-        progress.log(f"no self-model is learned: {error.message}")
+        progress.log(f"the robot is not measured: {error.message}")
         return None
 
 
@@ -112,5 +112,5 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
         for item in source.stored()
         if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen and arm.is_posed(item.stamp_ns)
     ]
-    progress.log(f"self-model: learned from {counted(len(frames), 'frame')} of {counted(len(order), 'moment')}")
+    progress.log(f"the robot is measured in {counted(len(frames), 'frame')} of {counted(len(order), 'moment')}")
     return frames

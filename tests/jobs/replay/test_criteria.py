@@ -140,7 +140,7 @@ def test_what_the_spheres_leave_uncovered_must_keep_the_margin_too(surface: floa
 def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
     (reason,) = surface_clearance(bodied((0.0, np.nan), 0.025))
     assert reason.outcome is Outcome.NOT_EVALUABLE
-    assert "is not known: no meshes" in reason.sentence
+    assert "is unknown: no meshes" in reason.sentence
 
 
 def test_one_state_judged_by_an_old_map_is_enough() -> None:
