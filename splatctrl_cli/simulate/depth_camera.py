@@ -22,7 +22,7 @@ class StereoDepth:
 
     - Disparity d = f b / z errs by `spread` [px], so depth errs by z^2 spread / (f b): with 0.07 px, 3.6 mm at 1 m
       and 14.5 mm at 2 m. Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Steps are of 1/32 px.
-    - Beside an edge of 0.5 px or more, the background takes the foreground's depth over `fattening` depth pixels.
+    - Next to an edge of 0.5 px or more, the background takes the foreground's depth over `fattening` depth pixels.
       That width is uniform between the two numbers, and constant within a window.
     - Background that the second imager does not see is lost: f b (1 / z_foreground - 1 / z_background) depth pixels
       left of the foreground, less those that took its depth.

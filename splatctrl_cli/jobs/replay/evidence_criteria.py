@@ -40,7 +40,8 @@ from splatctrl_cli.voxels import EvidenceClass
 class Limit:
     """A row of the evidence table; column: of `NEAR_COLUMNS`, for `parts` the least of their classes.
 
-    most: largest share allowed; least [m]: smallest distance (0: the margin); asked, why: for the documentation.
+    most: largest share allowed; least [m]: smallest distance (0: the margin). For the documentation, asked: the
+    quantity; why: the reason.
     """
 
     asked: str
