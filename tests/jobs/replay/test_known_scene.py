@@ -171,5 +171,7 @@ def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_
         write_npz(field / "field.npz", replace(grid, channels=kept))
         code, verdict = stage.replayed("--field", str(field))
         assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
-        words = "the space that cameras saw is not recorded" if state is None else "100 % of the space within the margin"
+        words = (
+            "the space that cameras saw is not recorded" if state is None else "100 % of the space within the margin"
+        )
         assert words in verdict["sentence"]
