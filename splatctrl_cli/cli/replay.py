@@ -1,13 +1,12 @@
 """``splatctrl replay``: clearance of motion, and what a controller would do."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, long_table, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config import load_config
-from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.jobs.replay.files import chunks_of, when_and_why
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replay.request import Replay, ReplayRequest
@@ -47,24 +46,11 @@ def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator
     lines += ["", *table(("replay", "value"), [(name, _shown(value)) for name, value in shown.items()])]
     yield from lines
     yield from result.notes
-    yield from _mount_lines(replay.static_violations)
     if not is_long:
         yield f"wrote {result.out}; -v prints every figure"
     if with_steps:
         yield ""
         yield from _step_lines(replay)
-
-
-def _mount_lines(violations: Sequence[StaticViolation]) -> list[str]:
-    if not violations:
-        return []
-    nearest = min(violations, key=lambda violation: violation.clearance)
-    links = ", ".join(dict.fromkeys(violation.sphere.partition("[")[0] for violation in violations))
-    num = f"{len(violations)} sphere{'s' if len(violations) > 1 else ''}"
-    return [
-        f"mount: {num} of {links} that no joint moves within the margin of the scene, down to "
-        f"{1e3 * nearest.clearance:.1f} mm ({nearest.sphere}); events.json has each"
-    ]
 
 
 def _step_lines(replay: Replay) -> Iterator[str]:

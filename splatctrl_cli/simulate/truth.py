@@ -57,7 +57,7 @@ def distance_along(primitives: Sequence[Primitive], points_world: Float64, stamp
     distance = np.full(points_world.shape[:2], np.inf)
     for primitive in primitives:
         present = np.flatnonzero([primitive.is_present(int(stamp)) for stamp in stamps])
-        for at in np.split(present, len(present)) if primitive.track is not None and len(present) else [present]:
+        for at in present[None] if primitive.track is None else present[:, None]:
             if len(at):
                 near, _ = closest_point(primitive.at(int(stamps[at[0]])), points_world[at].reshape(-1, 3))
                 distance[at] = np.minimum(distance[at], near.reshape(len(at), -1))
