@@ -34,7 +34,7 @@ DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a 
 
 @dataclass(frozen=True, kw_only=True)
 class Pieces:
-    """An array made while written; its values in C order, by piece."""
+    """An array that is made while it is written: `make` yields its values in C order, piece by piece."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -42,7 +42,7 @@ class Pieces:
 
 
 def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, level: int = 6) -> None:
-    """Write as `np.savez_compressed`, at zlib's `level` (0: stored), by array."""
+    """Write as `np.savez_compressed`, at zlib's `level` (0: stored), one array at a time."""
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
         for name, array in arrays.items():
@@ -60,7 +60,8 @@ def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, lev
 def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, NDArray[np.generic]]:
     """Read the arrays `names` (default: all) of a ``.npz``, at most `most` bytes together.
 
-    Raises OSError, KeyError for a missing array, ValueError for objects or another size than announced, and `DAMAGE`.
+    Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or another size than
+    announced, and `DAMAGE`.
     """
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
         chosen = (
@@ -86,7 +87,7 @@ def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
 
 
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read a ``.npy`` header: shape, is_by_columns and dtype. Raises ValueError for none.
+    """Read a ``.npy`` header: shape, is_by_columns and dtype. Raises ValueError if there is none.
 
     The stream is left after it.
     """
@@ -124,7 +125,7 @@ def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> ND
 
 
 def npy_of(data: bytes) -> NDArray[np.generic]:
-    """The array of ``.npy`` bytes. Raises ValueError for objects or too few bytes.
+    """The array of ``.npy`` bytes. Raises ValueError for objects, or another number of bytes than announced.
 
     `np.load` would allocate what the header announces.
     """

@@ -29,16 +29,16 @@ class TriangleMesh:
 
     @property
     def corners(self) -> Float64:
-        """(F, 3, 3) by face."""
+        """The three corners of each face, (F, 3, 3) [m]."""
         return self.vertices[self.faces]
 
 
 def load_mesh(path: Path) -> TriangleMesh:
     """Load a mesh with trimesh (OBJ, STL, PLY, OFF, GLB, COLLADA), all parts as one.
 
-    Vertices at one place are merged: a texture seam is not a hole. COLLADA is scaled by its unit, without its up
-    axis, as in RViz. Bytes after a binary STL's faces are noted. Raises InputError if unreadable, without triangles,
-    or not finite.
+    Vertices at one place are merged: a texture seam is not a hole. COLLADA is scaled by its unit; its up axis
+    is ignored, as in RViz. Bytes after a binary STL's faces are ignored, with a note. Raises InputError if
+    unreadable, without triangles, or not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a mesh, got no such file")
@@ -67,7 +67,7 @@ def load_mesh(path: Path) -> TriangleMesh:
 
 
 def _opened(path: Path) -> tuple[BytesIO | Path, str]:
-    """A binary STL without trailing bytes, and a note; or text as UTF-8."""
+    """A binary STL without trailing bytes, and a note on them; or a text, its invalid UTF-8 replaced."""
     content = path.read_bytes()
     num = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
     end = STL_HEADER + STL_FACE * num  # of a text: gigabytes
@@ -89,5 +89,6 @@ def _opened(path: Path) -> tuple[BytesIO | Path, str]:
 
 
 def _collada_unit(path: Path) -> float:
+    """Metres per unit."""
     unit = ElementTree.parse(path).find("{*}asset/{*}unit")
     return 1.0 if unit is None else float(unit.get("meter", "1"))

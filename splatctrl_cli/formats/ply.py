@@ -1,4 +1,4 @@
-"""PLY elements as tables of exactly the promised bytes; points in PLY or CSV."""
+"""PLY elements as tables, read only if the file has exactly the bytes it promises; points in PLY or CSV."""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -62,7 +62,7 @@ class PlyFile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Element:
-    """properties: names and scalar types; a list's are length and value, with a space."""
+    """properties: names and scalar types; a list has the types of its length and values, with a space between."""
 
     name: str
     count: int
@@ -263,10 +263,11 @@ _Line = tuple[int, list[str]]
 
 
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
-    """Yield a CSV's points x, y, z as (Q, 3) float64 [m], `POINTS_PER_BLOCK` at once.
+    """Yield a CSV's points x, y, z as (Q, 3) float64 [m], at most `POINTS_PER_BLOCK` at once.
 
     Without a header (a first line not all numbers) it has three columns; other columns are ignored. Raises InputError
-    naming `name`, line and column for a missing column, another length, or no finite number within `MAX_PLACE`.
+    naming `name`, line and column for a missing column, a line of another length, or no finite number within
+    `MAX_PLACE`.
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)

@@ -46,9 +46,9 @@ class Budget:
 
 
 def unpacked(data: bytes, compression: str, size: int, largest: int = MAX_BLOCK) -> bytes:
-    """Unpack the `size` bytes in `data`, never making more.
+    """Unpack the announced `size` bytes of `data`, never more.
 
-    Raises BadBlockError for unknown or broken compression, over `largest`, or another size.
+    Raises BadBlockError for unknown or broken compression, a size over `largest`, or another than announced.
     """
     if size > largest:
         raise BadBlockError(f"announces {size} bytes unpacked, at most {largest} are read")

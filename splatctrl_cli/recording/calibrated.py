@@ -33,7 +33,7 @@ class Correction:
 
     @property
     def clock_ns(self) -> int:
-        """[ns] to add to joint states' stamps."""
+        """[ns] to add to joint states' stamps; 0 if the clock was not calibrated."""
         return round((self.calibration.clock or 0.0) * SECOND_NS)
 
     def camera(self, name: str) -> CalibratedCamera:
@@ -71,7 +71,7 @@ class Correction:
         return self.clock_ns if self.clock_ns and self.camera(name).moves else 0
 
     def depth(self, name: str, depth: Float32) -> Float32:
-        """Correct depth [m]."""
+        """Correct depth [m] by the camera's scale and bias; 0 (no return) stays 0."""
         camera = self.camera(name)
         if (camera.scale, camera.bias) == (1.0, 0.0):
             return depth
@@ -82,7 +82,7 @@ class Correction:
         return replace(states, stamp_ns=states.stamp_ns + self.clock_ns) if self.clock_ns else states
 
     def frame(self, frame: RgbdFrame) -> RgbdFrame:
-        """Correct a frame posed on the robot's clock."""
+        """Correct a frame whose pose is already that of its time on the robot's clock."""
         return replace(
             frame,
             T_world_camera=self.pose(frame.camera, frame.T_world_camera),
@@ -119,8 +119,8 @@ class CalibratedSource(Recording):
     """Another source's records, corrected by a calibration.
 
     Joint states move to the frames' clock. A moving camera takes its pose at the frame's time on the robot's clock:
-    from a log's transforms, else between frames. Frames without a pose within `tolerance_ns` are left out and
-    counted.
+    from a log's transforms, else interpolated between the poses of frames. Frames without a pose within
+    `tolerance_ns` are left out and counted.
     """
 
     def __init__(self, source: FrameSource, correction: Correction, tolerance_ns: int = 0) -> None:
@@ -220,7 +220,7 @@ class CalibratedSource(Recording):
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-    """Interpolate (4, 4) on a path; its end within the tolerance, else None."""
+    """Interpolate the pose (4, 4) on a path; outside it, the end if within the tolerance, else None."""
     after = int(np.searchsorted(stamps, stamp_ns))
     if after in (0, len(stamps)):
         end = min(after, len(stamps) - 1)
@@ -242,7 +242,7 @@ class Perturbation:
     """Errors drawn from `seed`: twice the size is twice the same error.
 
     depth_noise: standard deviation at 1 m [m]; it grows with depth squared, as for stereo. pose_error [m], pose_turn
-    [degrees]: per camera, the same in all frames.
+    [degrees]: a shift and a turn of each camera, in a drawn direction and about a drawn axis, the same in all frames.
     """
 
     depth_noise: float = 0.0
@@ -252,7 +252,7 @@ class Perturbation:
 
     @classmethod
     def of(cls, given: Mapping[str, float]) -> "Perturbation | None":
-        """Build by name; None without effect. Raises UsageError for an unknown name or value."""
+        """Build from values by name; None if they do nothing. Raises UsageError for an unknown name or value."""
         for name, value in given.items():
             if name not in LIMITS:
                 raise UsageError(f"--perturb {name}: expected one of {', '.join(LIMITS)}", remedy="leave it out")

@@ -78,7 +78,7 @@ def lacks_depth(source: FrameSource) -> InputError | None:
 
 
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
-    """Open one input, or several logs recorded at once.
+    """Open one input, or several logs recorded at the same time.
 
     Raises as `open_source`, and InputError if one of several is no log.
     """

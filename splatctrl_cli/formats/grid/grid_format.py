@@ -126,7 +126,7 @@ def check_grid(grid: DistanceGrid) -> Shape:
 
 
 def check_finite(name: str, grid: DistanceGrid) -> None:
-    """Raise InputError for a non-finite value; the policy `nan` allows NaN in unknown cells."""
+    """Raise InputError for a non-finite value; the policy `nan` allows NaN in channels that `may_be_unknown`."""
     for channel, values in grid.channels.items():
         if not np.issubdtype(values.dtype, np.floating):
             continue
@@ -168,10 +168,10 @@ class GridFormat:
     """A file format, listed in its module's ``ENTRIES``, for the program and its docs.
 
     `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
-    `describe`: from a path and its first bytes; None for another kind. `needs`: one of these channels.
-    `holds_unknown`: cells can lack a distance. `bytes_per_cell`: on disk, None for all channels'. `check` raises
-    UsageError without a library. `docs`: row in docs/artefacts.md, cells between bars: name, file, who opens it,
-    checked, cost.
+    `describe`: from a path and its first bytes; None for another kind. `needs`: the grid must have one
+    of these channels. `holds_unknown`: cells can be without a distance. `bytes_per_cell`: on disk, None for all
+    channels'. `check` raises UsageError if its library is missing. `docs`: row in docs/artefacts.md, cells between
+    bars: name, file, who opens it, checked, cost.
     """
 
     name: str
@@ -259,7 +259,7 @@ class GridSlabs:
     def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
         """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress.
 
-        counts: recorded with it. Raises InputError if channels or shapes differ from the plan.
+        counts: the baker's so far, kept with it. Raises InputError if channels or shapes differ from the plan.
         """
         if slab.keys() != set(self.plan.channels):
             raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")

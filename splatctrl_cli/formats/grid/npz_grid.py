@@ -63,7 +63,7 @@ def read_npz(path: Path) -> DistanceGrid:
 
 
 def read_npz_head(path: Path) -> GridHead:
-    """Read without values, unchecked. Raises as `read_npz`."""
+    """Read all but the channels' values, which are not checked. Raises as `read_npz`."""
     with _opened(path) as archive:
         return _head(path, archive, _members(archive))
 

@@ -105,8 +105,8 @@ ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
 def write_moveit(path: Path, grid: DistanceGrid) -> None:
     """Write occupied cells: a splat may reach the cube, or sdf is not above 0.
 
-    A splat may if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes unknown space
-    as obstacle, and NaN. Raises InputError without bound and hard.
+    A splat may if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes NaN,
+    and unknown space that the policy makes an obstacle. Raises InputError with neither bound nor hard.
     """
     shape = check_grid(grid)
     if not {"bound", "hard"} & grid.channels.keys():
@@ -135,7 +135,7 @@ def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
 
 
 def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
-    """Read the numbers, and the bits' offset. Raises InputError if damaged."""
+    """Read the header's numbers, and the offset [bytes] of the bits. Raises InputError if damaged."""
     with path.open("rb") as stream:
         lines = [stream.readline(128) for _ in FIELDS]
         start = stream.tell()

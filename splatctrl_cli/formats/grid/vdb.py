@@ -97,7 +97,7 @@ def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
     """Read name, type and metadata of a ``.vdb``'s grids, without OpenVDB.
 
     The layout is OpenVDB's io/Archive.cc, io/GridDescriptor.cc and MetaMap.cc, since file version 222. Raises
-    InputError.
+    InputError for another or a damaged file.
     """
     with path.open("rb") as stream:
         if stream.read(8) != MAGIC:

@@ -92,7 +92,7 @@ def read_vti(path: Path) -> DistanceGrid:
 
 
 def read_vti_head(path: Path) -> GridHead:
-    """Read without values. Raises as `read_vti`."""
+    """Read all but the channels' values. Raises as `read_vti`."""
     with _opened(path) as stream:
         return _head(path, stream)[0]
 
@@ -107,7 +107,7 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, dict[str, int]]:
-    """The head, and offsets [bytes] of each channel's length."""
+    """The head, and by channel the offset [bytes] of its length, which its values follow."""
     text = stream.read(1 << 22)  # bytes in which the XML must end
     mark = text.find(_APPENDED)
     begin = text.find(b"_", mark) + 1

@@ -173,7 +173,7 @@ class SceneFolder:
 
     @property
     def has_digests(self) -> bool:
-        """False for an older scene."""
+        """False for an older scene, whose files cannot be checked."""
         return self.parts.digests is not None
 
     @property
@@ -313,7 +313,7 @@ class SceneFolder:
 
 
 def open_scene(path: Path) -> SceneFolder:
-    """Open a scene folder. Raises InputError for another."""
+    """Open a scene folder. Raises InputError if it is none."""
     if not path.exists():
         raise InputError(f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
     if path.name.endswith(PARTIAL):
@@ -328,7 +328,7 @@ def open_scene(path: Path) -> SceneFolder:
 
 @dataclass(frozen=True)
 class SplatFile(SceneFolder):
-    """A splat file rendered as it is, on black."""
+    """A splat file rendered as it is: any shape, its own harmonics, on black."""
 
     names_its_views: ClassVar[bool] = False
 

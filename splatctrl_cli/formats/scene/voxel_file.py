@@ -98,7 +98,7 @@ def read_states(path: Path) -> OccupancyGrid:
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
-    """Read only when voxels were last seen, which a replay does five times a second.
+    """Read the times at which voxels were last seen, and lost edges, alone: a replay does so five times a second.
 
     None for an older file. Raises InputError for another one.
     """

@@ -49,8 +49,8 @@ HEADER_COMMENTS = {
 def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write `gaussians`, with frame, units and `comments` in the header. Same input, same bytes.
 
-    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises InputError naming an invalid
-    index, UsageError for a comment of several lines.
+    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises InputError naming the index
+    of an invalid value, UsageError for a comment of several lines.
     """
     check_gaussians("Gaussians to write", gaussians)
     has_labels = bool((gaussians.labels != Label.OBJECT).any())
@@ -59,7 +59,7 @@ def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str
 
 
 def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
-    """Rows (N,) of `dtype`, 0 in other properties."""
+    """Rows (N,) of `dtype`; properties that Gaussians do not have are 0."""
     g = gaussians
     rest = np.zeros((len(g), 3, 15), dtype=np.float32)
     rest[:, :, : g.harmonics.shape[1] - 1] = g.harmonics[:, 1:].transpose(0, 2, 1)
@@ -76,7 +76,7 @@ def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
     Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45), less all-zero degrees. Quaternions are normalised; a
-    missing label is 0 (object). Raises InputError if truncated, invalid or without a property.
+    missing label is 0 (object). Raises InputError if truncated, invalid or without a `REQUIRED` property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return gaussians_of(ply), ply.pairs()
@@ -140,7 +140,7 @@ def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
 def log_sigmas(ply: PlyFile) -> Float64:
     """(N, 3) log(sigma [m]). Raises InputError for two scales, or scales that are no logarithms.
 
-    Those are all above 0, with splats SPARSEST times as large as their spacing.
+    They are none if no scale is below 0 and 95 % of splats are over SPARSEST times as large as their spacing.
     """
     found = [name for name in SCALES if name in ply]
     if len(found) == 2:
@@ -167,7 +167,7 @@ def log_sigmas(ply: PlyFile) -> Float64:
 
 
 def labels_of(ply: PlyFile) -> UInt8:
-    """Labels (N,), 0 (object) by default. Raises InputError for other values."""
+    """Labels (N,), 0 (object) by default. Raises InputError unless whole numbers 0 to 255."""
     if "label" not in ply:
         return np.zeros(len(ply), dtype=np.uint8)
     values = ply.column("label")

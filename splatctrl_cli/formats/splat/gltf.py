@@ -37,7 +37,7 @@ PROPERTIES = {
 
 
 def _write(path: Path, document: Mapping[str, Any], tables: Sequence[NDArray[Any]]) -> None:
-    """Write tables (N, 1 | 3 | 4) of float32, or of uint8 for 0 to 1."""
+    """Write a document and its tables (N, 1 | 3 | 4) of float32, or of uint8 for 0 to 1."""
     views, accessors, binary = list[dict[str, Any]](), list[dict[str, Any]](), bytearray()
     for table in tables:
         is_float, content = table.dtype == np.float32, np.ascontiguousarray(table).tobytes()
@@ -111,7 +111,8 @@ def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, w
 def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write `gaussians`; `comments` become the asset's extras. Same input, same bytes.
 
-    ``_LABEL`` is written if some Gaussian is not an object. Raises InputError naming an invalid index.
+    ``_LABEL`` is written if some Gaussian is not an object. Raises InputError naming the index
+    of an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
     tables: dict[str, NDArray[Any]] = {  # the first has its range beside it

@@ -43,8 +43,8 @@ ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("
 def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write what `.splat` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    A quaternion's largest component is made negative: -1 has a byte, +1 has none. Raises InputError naming an invalid
-    index.
+    A quaternion's largest component is made negative: -1 has a byte, +1 has none. Raises InputError naming the
+    index of an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
@@ -115,7 +115,7 @@ SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
 def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write what `.spz` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    Raises InputError naming an invalid index.
+    Raises InputError naming the index of an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
     held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)

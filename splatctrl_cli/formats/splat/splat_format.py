@@ -32,7 +32,7 @@ def sigmoid(logits: Float64) -> Float32:
 
 
 def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
-    """exp(x) as float32 [m]. Raises InputError naming an infinite or zero one."""
+    """exp(x) as float32 [m]. Raises InputError naming the first splat outside the range of normal float32."""
     values = np.exp(np.clip(logs, -700.0, 700.0))
     limits = np.finfo(np.float32)
     refuse(where, name, values, (values > limits.max) | (values < limits.tiny), "a radius that float32 holds [m]")
@@ -48,7 +48,7 @@ def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
 
 
 def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: str) -> None:
-    """Raise InputError naming the first bad splat (N,)."""
+    """Raise InputError naming the first splat where `is_bad` (N,)."""
     bad = np.flatnonzero(is_bad)
     if len(bad):
         value = values[bad[0]]
@@ -57,7 +57,7 @@ def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: 
 
 
 def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> None:
-    """Raise InputError at the first non-finite value, or for not `num` rows."""
+    """Raise InputError at the first non-finite value, or for an array without `num` rows."""
     for name, values in groups.items():
         if len(values) != num:
             raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")
@@ -95,7 +95,7 @@ def float32_bound(gaussians: GaussianSet) -> Differences:
 
 
 def differences(a: GaussianSet, b: GaussianSet, centers: Float64 | None = None) -> Differences:
-    """Largest differences in equal order; centers: exact ones of `a` (N, 3) [m]."""
+    """Largest differences between Gaussians in the same order; centers: of `a`, more exact (N, 3) [m]."""
     return Differences(
         center=_largest((a.centers.astype(np.float64) if centers is None else centers) - b.centers),
         sigma=_largest(b.scales / a.scales.astype(np.float64) - 1.0),

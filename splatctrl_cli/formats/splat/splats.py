@@ -110,8 +110,8 @@ def _is_stretched(gaussians: GaussianSet) -> Bool:
 def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None:
     """Write `splats`, with frame, units and `comments` in the header. Same input, same bytes.
 
-    Opacities 0 and 1 read back exactly. Raises InputError naming an invalid index, UsageError for a comment of
-    several lines.
+    Opacities 0 and 1 read back exactly. Raises InputError naming the index of an invalid value, UsageError for a
+    comment of several lines.
     """
     check_splats("splats to write", splats)
     rows = rows_of(as_gaussians(splats), DTYPE)
@@ -123,7 +123,7 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
     Ignores other properties (normals, higher harmonics, rotation); a missing label is 0 (object), a missing density 0
-    (not computed). Raises InputError if truncated, anisotropic, invalid or without a property.
+    (not computed). Raises InputError if truncated, anisotropic, invalid or without a `REQUIRED` property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return splats_of(ply), ply.pairs()
@@ -198,7 +198,7 @@ def num_stretched(ply: PlyFile) -> int:
 
 
 def check_splats(where: str, splats: SplatSet) -> None:
-    """Raise InputError at the first splat not finite, without radius, or opacity outside [0, 1]."""
+    """Raise InputError at the first splat that is not finite, has no radius, or an opacity outside [0, 1]."""
     groups = {
         "center": splats.centers,
         "radius": splats.radii,
@@ -239,7 +239,7 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
     """Read as `read_splats`, with the centres (N, 3) float64 [m] in the file's precision.
 
-    If float32 would move them, an origin is subtracted, named by the comment `ORIGIN`.
+    If float32 would move them, an origin is subtracted, which the comment `ORIGIN` names. Raises as `read_splats`.
     """
     if _known_format(path) is not FORMATS[".ply"]:
         splats, comments = read_splats(path)

@@ -29,8 +29,8 @@ NAME = "field"  # of the file while the library has it: it goes by the suffix
 def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *, suffix: str) -> None:
     """Write `gaussians` as ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
 
-    Primvar ``label`` is written if some Gaussian is not an object. Raises InputError naming an invalid index;
-    UsageError without the library.
+    Primvar ``label`` is written if some Gaussian is not an object. Raises InputError naming the index
+    of an invalid value; UsageError without the library.
     """
     check_gaussians("Gaussians to write", gaussians)
     usd, geometry, volume, arrays, kinds = _library()

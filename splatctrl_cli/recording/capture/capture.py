@@ -41,7 +41,8 @@ _NOT_FOR_CAPTURES = (
 class CaptureSource(Recording):
     """Records of a capture folder; files with a wrong checksum are skipped and counted as damage.
 
-    joints: a robot's, merged from the kept topics as from the log; without either, the states are joints.npz's.
+    joints: a robot's, merged from the kept topics as from the log; if None, or no topic was kept, the states are
+    joints.npz's.
     """
 
     def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
@@ -95,7 +96,7 @@ class CaptureSource(Recording):
         yield from filter(None, map(self._stored_frame, self._rows))
 
     def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
-        """A row's frame; None, and counted, if an image was changed."""
+        """A row's frame; None, and counted, if colour, depth or its mask of valid pixels is missing or damaged."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
         camera = self._cameras[row["camera"]]

@@ -1,4 +1,4 @@
-"""A capture's index: capture.json; frames.csv and SHA256SUMS at fifty bytes a file."""
+"""A capture's index: capture.json, frames.csv and SHA256SUMS, in some fifty bytes of memory a file."""
 
 import csv
 import hashlib
@@ -197,5 +197,5 @@ class FileSums:
 
 
 def _key(name: bytes) -> int:
-    """64 bits; a collision would make a good file look damaged."""
+    """64 bits of a name; a collision would make a good file look damaged."""
     return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")

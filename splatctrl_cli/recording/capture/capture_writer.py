@@ -254,6 +254,7 @@ def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str,
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """Make the frame's row of frames.csv without file names, and count the frame in `cameras`."""
     if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
         raise InputError(
             f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
@@ -314,7 +315,7 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
-    """Suffix and bytes, of the recorded PNG if in the unit."""
+    """Suffix and bytes of the depth image: the recorded PNG if it counts in the camera's unit."""
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)

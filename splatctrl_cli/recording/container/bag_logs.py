@@ -1,7 +1,7 @@
 """The messages of ROS bags: ROS 1, and ROS 2 sqlite3; damage is skipped and counted.
 
 A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body, read in order in bounded
-memory. Its index is not used: a cut or growing bag has none.
+memory. Its index is not needed: a cut or growing bag has none.
 
 rosbags (rosbags/rosbag2/storage_sqlite3.py) counts messages first, so one bad page makes it refuse. Tables of
 rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions.
@@ -36,7 +36,7 @@ Fields = dict[str, bytes]
 
 
 class BagRecord(NamedTuple):
-    """A record; a cut one has the rest of its body."""
+    """A record; the body of a cut one is what the file still has of it."""
 
     offset: int
     kind: int
@@ -53,7 +53,7 @@ class BagFile:
         self.size = path.stat().st_size
 
     def records(self, damage: Damage) -> Iterator[BagRecord]:
-        """Yield all but index data in order; losses go to `damage`."""
+        """Yield all records in order; only chunks, connections and messages have bodies. Losses go to `damage`."""
         with self.path.open("rb") as stream:
             if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
                 damage.add(f"{self.path.name}: is not a bag of format 2.0")
@@ -111,7 +111,7 @@ class BagFile:
         return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
 
     def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
-        """Find the next whole chunk by its header."""
+        """Find the next whole chunk after `offset` by its header."""
         stream.seek(offset + 1)
         kept = b""
         while block := stream.read(PIECE):
@@ -184,7 +184,7 @@ def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
 
 
 class Bag1Log:
-    """One ROS 1 bag, read without its index. Raises InputError without any record.
+    """One ROS 1 bag; its index is not needed. Raises InputError without any record.
 
     rosbags (rosbags/rosbag1/reader.py) refuses a bag without index, and ends at the first damaged chunk.
     """
@@ -272,7 +272,8 @@ _FILE_FORMAT = slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
 class Db3Log:
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal, so both are copied first. Raises InputError for other tables.
+    SQLite writes while it reads a journal, so both are copied first. Raises InputError for other tables, or
+    an unreadable file.
     """
 
     container = "ROS 2 bag (sqlite3)"

@@ -39,7 +39,7 @@ class MessageTypes:
         self._pool = DescriptorPool(files)
 
     def read(self, type_name: str, data: bytes) -> Any:
-        """Decode a message; unwritten fields have defaults. Raises ValueError."""
+        """Decode a message; unwritten fields have defaults. Raises ValueError if it does not decode."""
         try:
             return GetMessageClass(self._pool.FindMessageTypeByName(type_name)).FromString(data)
         except KeyError:
@@ -96,9 +96,9 @@ def standing_in(topic: Topic) -> Topic:
 
 
 def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> Any:
-    """Decode to a ROS message; definition: protobuf's FileDescriptorSet, a byte a character.
+    """Decode `data` to a ROS message; definition: protobuf's FileDescriptorSet, a byte a character.
 
-    Raises ValueError, KeyError, TypeError or AttributeError.
+    Raises ValueError, KeyError, TypeError or AttributeError if they do not decode.
     """
     if encoding == "json":
         return as_ros(schema, _object(json.loads(data)))

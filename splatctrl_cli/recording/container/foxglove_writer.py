@@ -55,7 +55,7 @@ class FoxgloveLog:
         return self._counts
 
     def add_cloud(self, topic: str, stamp_ns: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Add a PointCloud: float32 or uint8 (N,), among them x, y, z [m]."""
+        """Add a PointCloud of columns (N,) by name, float32 or uint8, among them x, y, z [m]."""
         kind = np.dtype([(name, column.dtype) for name, column in columns.items()])
         packed = np.zeros(len(columns["x"]), kind)
         for name, column in columns.items():
@@ -103,7 +103,7 @@ class FoxgloveLog:
     def add_mesh(
         self, topic: str, stamp_ns: int, frame: str, vertices: NDArray[np.floating], faces: NDArray[np.integer]
     ) -> None:
-        """Add a SceneUpdate: (V, 3) [m] and (F, 3) that move with a frame."""
+        """Add a SceneUpdate: vertices (V, 3) [m] and faces (F, 3) that move with a frame."""
         message = _new("SceneUpdate")
         entity = message.entities.add(id=frame, frame_id=frame, frame_locked=True)
         entity.timestamp.FromNanoseconds(stamp_ns)

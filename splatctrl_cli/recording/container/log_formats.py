@@ -102,7 +102,7 @@ SUFFIXES = tuple(kind.suffix for kind in CONTAINERS)
 
 
 class SessionLog(JoinedLog):
-    """Logs recorded at once, such as cameras and joints, by log time."""
+    """Logs recorded at the same time, such as cameras and joints, merged by log time."""
 
     def __init__(self, parts: tuple[RawLog, ...]) -> None:
         path = parts[0].path.with_name("+".join(part.path.name for part in parts))
@@ -132,7 +132,7 @@ class SessionLog(JoinedLog):
 def open_raw_log(path: Path) -> RawLog:
     """Open .mcap, .bag, .db3 or a ROS 2 bag folder, with zstd messages unpacked.
 
-    Raises InputError for others.
+    Raises InputError for others, and unreadable ones.
     """
     if path.is_dir():
         return _open_folder(path)

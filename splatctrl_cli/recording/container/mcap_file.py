@@ -90,7 +90,7 @@ class McapFile:
         return sorted(found, key=lambda index: index.chunk_start_offset)
 
     def chunk_at(self, index: ChunkIndex) -> bytes:
-        """A chunk record's content, or the rest of it."""
+        """A chunk record's content, or what a shorter file has of it."""
         with self.path.open("rb") as stream:
             stream.seek(min(index.chunk_start_offset, self.size))
             opcode, length = HEAD.unpack((stream.read(HEAD.size) + bytes(HEAD.size))[: HEAD.size])
@@ -106,7 +106,7 @@ class _Walk:
         self._crc: int | None = 0 if has_crc else None  # of the data section so far; None once a part was skipped
 
     def parts(self) -> Iterator[Part]:
-        """Yield records up to the footer, or the last one's rest."""
+        """Yield records up to the footer, or to what is left of a cut chunk."""
         if self._take(len(MAGIC)) != MAGIC:
             self._add("does not begin like an MCAP")
             return
@@ -152,7 +152,7 @@ class _Walk:
         return Part(offset, opcode, b"", opcode <= DATA_END)
 
     def _beyond(self, offset: int, opcode: int) -> Part | None:
-        """Go to the next readable place, or return the last record's rest."""
+        """Go to the next readable place, or return what is left of a cut chunk."""
         start = self._next_place(offset)
         if start is not None:
             self._add(f"bytes {offset} to {start} are damaged and were left out")
@@ -183,7 +183,7 @@ class _Walk:
         return None
 
     def _chunks_in(self, block: bytes, base: int) -> Iterator[int]:
-        """Chunks in `block` (at `base`) with consistent lengths."""
+        """Yield places in `block` (the file from `base`) of chunks with consistent lengths."""
         for name in _COMPRESSIONS:
             at = block.find(name)
             while at >= 0:

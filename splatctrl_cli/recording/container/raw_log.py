@@ -85,7 +85,7 @@ class RawLog(Protocol):
 
     @property
     def container(self) -> str:
-        """``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``."""
+        """The kind of file in words, such as ``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``."""
         ...
 
     def topics(self) -> tuple[Topic, ...]:

@@ -61,8 +61,8 @@ def read_dtu(
     """Read scan `scan` (default: the only one) of a DTU folder; `masks` contains NNN.png by view number.
 
     `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or a
-    quarter). Depth of another size is sampled, not blended: larger maps at the image's pixels, smaller ones only at
-    their own. Drops views without depth. Raises InputError naming the file.
+    quarter). Depth of another size is sampled, not blended: a larger map at the image's pixels; a smaller one sets
+    only the pixels it was made for. Drops views without depth. Raises InputError naming the file.
     """
     scan, folder = chosen_scan(root, scan_folders(root), scan)
 
@@ -111,8 +111,8 @@ def read_views(
 ) -> DtuScan:
     """Read views by number, one at a time in memory before `shrink`.
 
-    A view without a depth file has depth 0, or is left out. camera: intrinsics and T_world_camera by number and
-    (width, height).
+    A view without a depth file has depth 0 if `keeps_without_depth`, else it is left out. camera: intrinsics and
+    T_world_camera by number and (width, height).
     """
     views: list[DtuView] = []
     numbers: list[int] = []

@@ -18,7 +18,7 @@ HOLDOUT_CAMERA = "holdout"
 
 
 def view_numbers(words: Sequence[str]) -> list[int]:
-    """Parse ``2`` and ``5``. Raises UsageError for others."""
+    """Parse view numbers such as ``2`` and ``5``. Raises UsageError for other words."""
     bad = [word for word in words if not word.isdigit()]
     if bad:
         raise UsageError(f"--holdout: expected view numbers such as 2,5, got {bad[0]!r}")
@@ -29,8 +29,9 @@ class DtuSource:
     """A scan's views by number (view 0 is ``rect_001``), which is also the stamp.
 
     The scene is static, so there is no clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``,
-    unless a `protocol` assigns or drops them. masks, depths: folders the layout misses. downscale: shrink factor;
-    None: to the protocol's size, if whole. layout: ``MVSNet`` or ``IDR``; split: training and held-out views.
+    unless a `protocol` assigns or drops them. masks, depths: folders of what the layout does not have. downscale:
+    shrink factor; None: to the protocol's size, if that is a whole factor. layout: ``MVSNet`` or ``IDR``; split:
+    training and held-out views.
     """
 
     joint_names: tuple[str, ...] = ()
@@ -86,7 +87,7 @@ class DtuSource:
         return any(bool((view.depth > 0).any()) for view in self._views.values())
 
     def mask(self, number: int) -> Bool | None:
-        """(H, W) True on the object, or None."""
+        """(H, W) True on the object; None if unknown."""
         return self._views[number].mask
 
     def records(self) -> Iterator[Record]:

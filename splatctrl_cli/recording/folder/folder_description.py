@@ -18,7 +18,7 @@ DEPTH_ENCODINGS = ("uint16", "uint16-rotated3", "float32")
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTable:
-    """``[camera]`` or ``[depth_camera]``; pixel_center: the first pixel's coordinate (0 or 0.5)."""
+    """``[camera]`` or ``[depth_camera]``; pixel_center: coordinate of the first pixel's centre (0 or 0.5)."""
 
     width: int
     height: int
@@ -59,7 +59,7 @@ class FramesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthTable:
-    """``[depth]``: encoding, metres per count, an invalid count next to 0 (-1: none)."""
+    """``[depth]``: encoding, metres per count, and the count that is invalid in addition to 0 (-1: no other)."""
 
     encoding: str = "uint16"
     scale: float = 1e-3
@@ -151,9 +151,9 @@ class ListedView:
 class Description:
     """A whole description; transforms.json may give camera and frames, --camera-pose the poses.
 
-    listed: a layout's views, instead of frames. is_depth_resized: depth of another size takes nearest pixels.
+    listed: a layout's views, instead of frames. is_depth_resized: depth is resized to colour by nearest pixels.
     unpaired: colour and depth files without partner. num_damaged: views lost to damage. supply: how to add depth if
-    none has it. notes: assumptions that the layout leaves open.
+    no view has it. notes: assumptions on what the layout leaves open.
     """
 
     path: Path
@@ -204,7 +204,7 @@ def read_table(
     beside: Collection[str] = (),
     fill: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> T:
-    """Read table [name] of a TOML file with no others but `beside`; `fill` adds keys.
+    """Read table [name] of a TOML file with no others but `beside`; `fill` adds keys left out.
 
     Raises as `read_description`.
     """
@@ -218,7 +218,7 @@ def read_table(
 
 
 def has_table(path: Path, name: str) -> bool:
-    """True with table [name]. Raises InputError if not TOML."""
+    """True if the file has a table [name]. Raises InputError if not TOML."""
     return name in _content(path)
 
 

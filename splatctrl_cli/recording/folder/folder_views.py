@@ -52,7 +52,7 @@ class View:
     valid: Path | None = None
 
     def in_unit(self, metres: float) -> "View":
-        """Scale pose and depth to metres."""
+        """Scale pose and depth to metres; metres: per length of the recording."""
         T = self.T_world_camera.copy()
         T[:3, 3] *= metres
         return replace(self, T_world_camera=T, depth_scale=self.depth_scale * metres)
@@ -61,8 +61,8 @@ class View:
 def length_unit(median: float, apart: float) -> float:
     """Metres per length of a recording with this median depth and camera distance.
 
-    1 unless depth is too large for metres and the cameras agree. If depth alone is, its scale is wrong: the cameras
-    are relatively close. `reconstruct` then compares the views.
+    1 unless depth is too large for metres and the cameras have the same unit. If depth alone is too large, its scale
+    is wrong, and the cameras are close together in comparison. `reconstruct` then compares the views.
     """
     if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
         return 1.0
@@ -72,7 +72,10 @@ def length_unit(median: float, apart: float) -> float:
 
 
 def views_of(description: Description, options: SourceOptions, loss: LossReport) -> list[View]:
-    """Views by stamp; losses are counted in `loss`. Raises InputError without any."""
+    """Views sorted by stamp; losses are counted in `loss`.
+
+    Raises InputError if none is left, or all are held out (UsageError if by --holdout).
+    """
     listed = _present(description, loss) if description.listed else _listed(description, options, loss)
     names = [view.name for view in listed]
     held = _holdout(description, names, options)
@@ -265,7 +268,7 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """Stamp by layout, file name, frame rate, or one second a frame."""
+    """Stamp by the layout, the file name, frame number and rate, or (no clock) one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

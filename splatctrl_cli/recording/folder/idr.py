@@ -3,8 +3,8 @@
 SCAN/cameras_sphere.npz (or cameras.npz) has world_mat_I, the projection (4, 4) of world points to pixels of image I,
 and scale_mat_I, the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png.
 Image I is the I-th by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing. World lengths are
-millimetres there, metres here. SCAN/depth may have our depth as MVSNet's depth_map_0000.pfm (and
-depth_visual_0000.png).
+millimetres there, metres here. The layout has no depth; SCAN/depth may have depth_map_0000.pfm (and
+depth_visual_0000.png) as MVSNet names them.
 """
 
 import re
@@ -112,6 +112,7 @@ def projection(view: DtuView) -> Float64:
 
 
 def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
+    """Centre (3,) and radius [mm]."""
     centers = MILLIMETRES * np.array([view.T_world_camera[:3, 3] for view in views])
     axes = np.array([view.T_world_camera[:3, 2] for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # what of a vector is no way along the axis

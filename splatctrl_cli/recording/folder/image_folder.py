@@ -69,7 +69,7 @@ class ImageFolderSource(Recording):
 
     @property
     def has_depth(self) -> bool:
-        """False if every depth is 0."""
+        """True if any view has a depth file; without, every depth is 0."""
         return any(view.depth is not None for view in self._views)
 
     def no_depth(self) -> InputError:
@@ -81,13 +81,13 @@ class ImageFolderSource(Recording):
 
     @property
     def has_clock(self) -> bool:
-        """True if the description has stamps."""
+        """True if [stamps] has a rate or names."""
         stamps = self._description.stamps
         return stamps.rate is not None or stamps.names
 
     @property
     def loss(self) -> LossReport:
-        """Unpaired, unposed and undecodable images."""
+        """Unpaired and unposed images, and those that the last pass could not decode."""
         loss = self._loss
         return replace(
             loss,
@@ -97,7 +97,7 @@ class ImageFolderSource(Recording):
         )
 
     def _in_metres(self) -> str:
-        """Convert millimetres or centimetres; return a note."""
+        """Convert lengths that look like millimetres or centimetres; return a note, or ""."""
         places = [view.T_world_camera[:3, 3] for view in self._views]
         apart = float(np.linalg.norm(np.ptp(places, axis=0)))  # the diagonal of their box, in the unit of the poses
         for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():
@@ -225,7 +225,7 @@ class ImageFolderSource(Recording):
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
-        """Pixels seen and kept by the mask; none if it is unreadable."""
+        """Pixels that the lens saw and the mask keeps (None: all); none if the mask is unreadable."""
         seen = None if lens.undistortion is None else lens.undistortion.valid
         if view.valid is None:
             return seen

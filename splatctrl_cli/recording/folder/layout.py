@@ -50,7 +50,7 @@ class Layout:
 
 
 def marked(*alternatives: str) -> Callable[[Path], bool]:
-    """A folder test: every name of one alternative; a trailing / means a folder."""
+    """Make a test of folders: one must have every name of one alternative; a trailing / means a folder."""
 
     def has(folder: Path, mark: str) -> bool:
         return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))
@@ -59,7 +59,7 @@ def marked(*alternatives: str) -> Callable[[Path], bool]:
 
 
 def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions], Description]:
-    """A reader that asks for a description, like one of the examples."""
+    """Make a reader that refuses a folder and asks for a description like one of the examples."""
 
     def refuse(folder: Path, _: SourceOptions) -> Description:
         raise InputError(
@@ -119,7 +119,7 @@ def paired_by_name(
     pose: Callable[[Key], Float64 | None],
     name: Callable[[Key], str] = str,
 ) -> Pairs:
-    """Pair equal keys, named and posed by key."""
+    """Pair files of equal key, which gives name and pose."""
     views = [
         ListedView(name=name(key), color=color, depth=depths[key], matrix=pose(key))
         for key, color in colors.items()
@@ -135,7 +135,7 @@ def paired_by_stamp(
     pose_at: Callable[[int], Float64 | None],
     options: SourceOptions,
 ) -> Pairs:
-    """Pair stamps [ns] within the tolerance, posed at the colour's."""
+    """Pair files by stamp [ns] within the tolerance; the pose is that at the colour's stamp."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
     pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
     views = [
@@ -168,7 +168,7 @@ def described(
 ) -> Description:
     """Describe paired views with the lens of --intrinsics, else `lens` of the first image.
 
-    Without `lens` each view has one. Raises InputError if impossible.
+    Without `lens` each view has one. Raises InputError if a camera is impossible.
     """
     first = pairs.views[0]
     camera = first.camera if lens is None else given_lens(options, first.color) or lens(first.color)
@@ -193,13 +193,13 @@ def described(
 
 
 def given_lens(options: SourceOptions, image: ImageFile) -> CameraTable | None:
-    """--intrinsics for ``camera``, in the size of `image`, or None."""
+    """The lens of --intrinsics for ``camera``, in the size of `image`; None if not given."""
     values = options.intrinsics.get(CAMERA)
     return None if values is None else pinhole(values[:4], image, values[4:])
 
 
 def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[float] = ()) -> CameraTable:
-    """fx, fy, cx, cy [px] and an image's size."""
+    """A lens of fx, fy, cx, cy [px] and an image's size."""
     width, height = image_size(image)
     fx, fy, cx, cy = values
     return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=list(distortion))
@@ -217,7 +217,7 @@ def read_K(path: Path) -> tuple[float, float, float, float]:
 
 
 def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Float64) -> CameraTable | None:
-    """The depth camera posed in the colour camera; None if one."""
+    """The depth camera posed in the colour camera; None if they are the same."""
     if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= 1e-6:
         return None
     return replace(depth, depth_to_color=T_color_depth.tolist())
@@ -256,7 +256,7 @@ def pose_or_none(matrix: Float64) -> Float64 | None:
 
 
 def read_pose(path: Path) -> Float64 | None:
-    """A pose (4, 4); None without a file or tracking."""
+    """A pose (4, 4); None if the file is missing or tracking was lost."""
     return pose_or_none(read_matrix_file(path)) if path.is_file() else None
 
 

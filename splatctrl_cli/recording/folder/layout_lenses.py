@@ -97,6 +97,7 @@ def _stamp_ns(path: Path) -> int | None:
 
 
 def _poses(path: Path) -> dict[str, Float64]:
+    """T_world_camera by stamp [s] as written."""
     poses = {}
     for where, words, values in read_rows(path):
         if len(values) != 7 or not np.isfinite(values).all():
@@ -164,7 +165,7 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
 
 
 def _sensors(folder: Path) -> list[str]:
-    """File suffixes, such as ``_cam1``; one sensor's is empty."""
+    """Suffixes of the sensors' file names, such as ``_cam1``; empty for ``scene_camera.json``."""
     stem = Path(FILE).stem
     found = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
     return [sensor for sensor in found if (folder / f"depth{sensor}").is_dir()]

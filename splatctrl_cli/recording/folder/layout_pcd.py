@@ -77,7 +77,7 @@ def read_cloud(path: Path) -> Cloud:
 def pinhole_of(points: Float64) -> Intrinsics | None:
     """Fit a pinhole whose pixel (u, v) sees the point (H, W, 3) of row v, column u.
 
-    Least squares over u and v; None with too few points in front, or a bad fit.
+    Least squares over u and v; None with too few points in front, or a focal length that is not positive.
     """
     valid = _is_seen(points)
     v, u = np.nonzero(valid)

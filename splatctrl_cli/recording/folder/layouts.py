@@ -25,7 +25,7 @@ def layout_of(path: Path) -> Layout | None:
 
 
 def has_views(path: Path) -> bool:
-    """True for a folder but a ROS 2 bag, or a file with a layout."""
+    """True for a folder that is no ROS 2 bag, or a file with a layout."""
     return layout_of(path) is not None if path.is_file() else path.is_dir() and not is_bag_folder(path)
 
 

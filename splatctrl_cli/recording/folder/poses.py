@@ -107,7 +107,7 @@ def read_matrix_lines(path: Path) -> dict[str, Float64]:
 
 
 def read_rows(path: Path) -> Iterator[tuple[str, list[str], list[float]]]:
-    """Yield place, words and numbers of lines but empty ones and comments."""
+    """Yield place, words and numbers of lines that are neither empty nor comments."""
     for index, line in enumerate(_lines(path)):
         if line and not line.startswith("#"):
             words, where = line.split(), f"{path}:{index + 1}"
@@ -133,12 +133,12 @@ def read_matrix_file(path: Path) -> Float64:
 
 
 def read_numbers(path: Path) -> list[float]:
-    """All numbers in order."""
+    """All numbers of a text file, in order."""
     return [value for line in _lines(path) if not line.startswith("#") for value in _numbers(line.split(), str(path))]
 
 
 class Trajectory:
-    """A camera's poses by stamp [s, as text], interpolated like tf, never across None."""
+    """A camera's poses by stamp [s, as text], interpolated like tf, never across a stamp with None."""
 
     def __init__(self, poses: Mapping[str, Float64 | None]) -> None:
         self._tree = TfTree()
@@ -153,7 +153,7 @@ class Trajectory:
         self._known, self._lost = np.array(sorted(known), dtype=np.int64), np.array(sorted(lost), dtype=np.int64)
 
     def at(self, stamp_ns: int) -> Float64 | None:
-        """T_world_camera (4, 4); None out of reach."""
+        """T_world_camera (4, 4); None where the trajectory does not reach."""
         after = np.searchsorted(self._known, stamp_ns)
         is_known = after < len(self._known) and self._known[after] == stamp_ns
         before = self._known[after : after + 1] if is_known else self._known[max(after - 1, 0) : after]
@@ -165,7 +165,7 @@ class Trajectory:
 
 
 def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
-    """Nanoseconds of a text in `unit_ns`, without float rounding; None if no time."""
+    """Nanoseconds of a time written in units of `unit_ns`, without float rounding; None if it is no time."""
     try:
         stamp_ns = Decimal(text) * unit_ns
         return round(stamp_ns) if abs(stamp_ns) < _MOST_NS else None  # rounding 1e999 writes out its digits

@@ -169,7 +169,7 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
-    """Colour's frame; a video file has its aligned depth's."""
+    """The colour images' frame; a video file names none and takes that of its depth, which is aligned to it."""
     return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 

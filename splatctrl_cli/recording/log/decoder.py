@@ -253,7 +253,7 @@ class RealSense:
             units.append(unit)
 
     def T_between(self, to_topic: str, from_topic: str) -> Float64 | None:
-        """(4, 4) between image topics' streams; None without a common group."""
+        """T_to_from (4, 4) of two image topics' streams; None without a common group."""
         to_all, from_all = (self.extrinsics.get(_stream(topic), {}) for topic in (to_topic, from_topic))
         group = next((group for group in to_all if group in from_all), None)
         return None if group is None else to_all[group] @ invert_transform(from_all[group])

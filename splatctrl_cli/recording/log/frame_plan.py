@@ -148,7 +148,7 @@ class HeldMessages:
 def planned_images(
     log: RawLog, plan: FramePlan, damage: Damage, held: HeldMessages
 ) -> Iterator[tuple[Planned, list[RawMessage]]]:
-    """Yield each planned frame with its colour, depth and mask messages, in any log order.
+    """Yield frames in plan order with their colour, depth and mask messages, whatever the log's order.
 
     `held` keeps waiting ones; missing frames go to `damage`.
     """

@@ -293,7 +293,7 @@ def depth_of(image: ImageMessage, scale: float | None) -> Float32:
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
-    """Count depths (H, W) negative, NaN, infinite or a no-return code."""
+    """Count recorded depths (H, W) that are negative, NaN, a no-return code, or floats from `FARTHEST` on."""
     is_invalid = depth == NO_RETURN
     if depth.dtype.kind != "u":
         is_invalid |= ~(depth >= 0) | (np.abs(depth - NO_RETURN_M) < 1e-4) | (depth >= FARTHEST)

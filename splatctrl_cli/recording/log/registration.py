@@ -155,7 +155,7 @@ class TfTree:
         return self._ancestors(frame)[-1]
 
     def span_ns(self, frame: str) -> tuple[int, int] | None:
-        """Stamps between which all moving edges above are known; None without any."""
+        """First and last stamp with all moving edges above `frame` known; None if none moves."""
         edges = [self._edges[f] for f in self._ancestors(frame)[:-1]]
         moving = [edge.stamps for edge in edges if not edge.static]
         return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None

@@ -77,7 +77,7 @@ class RosLogSource(Recording):
 
     @property
     def loss(self) -> LossReport:
-        """The loss; undecodable images are the fullest pass's."""
+        """The loss, with the undecodable images of the pass that met most."""
         loss, most = self._loss, max(self._passes, key=lambda one: (one.damage.count, one.num_invalid))
         return replace(
             loss,
@@ -93,7 +93,7 @@ class RosLogSource(Recording):
         return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
 
     def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
-        """T_world_camera (4, 4) at [ns]; None if tf does not know it."""
+        """T_world_camera (4, 4) at a time [ns]; None if tf does not know it."""
         found = next(c for c in self._rig if c.name == camera)
         return found.pose_at(self._tf, stamp_ns, round(self._options.pose_tolerance_s * SECOND_NS))
 

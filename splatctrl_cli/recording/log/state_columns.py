@@ -51,7 +51,7 @@ class StateColumns(Sequence[JointState]):
             yield from self.states(first, last)
 
     def postures(self, within_ns: int) -> Posture:
-        """Positions at any time, linear between states at most `within_ns` away."""
+        """Positions at any time, linear between states at most `within_ns` away; None without any."""
 
         def posture(stamp_ns: int) -> Float64 | None:
             after = int(np.searchsorted(self.stamp_ns, stamp_ns))
@@ -71,7 +71,7 @@ class StateColumns(Sequence[JointState]):
         return posture
 
     def states(self, first: int, last: int) -> list[JointState]:
-        """States first to last, excluded."""
+        """States from `first` up to, but not with, `last`."""
         optional = (self.commanded_velocity, self.T_base_ee, self.T_world_ee)
         commanded, base, world = (_optional(values, first, last) for values in optional)
         position, velocity = self.position[first:last], self.velocity[first:last]
@@ -95,7 +95,7 @@ class StateColumns(Sequence[JointState]):
         return self._changed(lambda table, _: of_columns(table, order), OF_JOINTS)
 
     def of_log(self, order: Index, factor: Float64, offset: Float64) -> Self:
-        """Joints (J,): ``position[order] * factor + offset``."""
+        """Joints (J,): ``position[order] * factor + offset``; velocities without offset."""
         plain = self.of_joints(order)
         if (factor == 1.0).all() and (offset == 0.0).all():
             return plain
@@ -142,7 +142,7 @@ class ColumnWriter:
             self._flush()
 
     def tables(self) -> dict[str, Rows]:
-        """Non-empty tables so far."""
+        """Columns so far, but those without any value."""
         self._flush()
         return {name: Rows(self._files[name]) for name in self._shapes if name in self._files}
 

@@ -45,8 +45,8 @@ def joint_records(
 ) -> tuple[tuple[str, ...], StateColumns]:
     """Joint names and states by stamp; both empty if the log has none.
 
-    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states without all its joints
-    (a gripper that publishes alone) are left out with a note.
+    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states that do not name
+    the same joints as its fullest (a gripper that publishes alone) are left out with a note.
     """
     topics = state_topics(survey, options, loss)
     if not topics:
@@ -85,7 +85,7 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
-    """/joint_states, else the largest JointState topic, else another; commands last."""
+    """/joint_states, else the JointState topic with most messages, else another type's; commands last."""
     by_name = {topic.topic.name: topic for topic in topics}
     chosen = by_name[
         max(
@@ -246,7 +246,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
 
 
 def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
-    """A log's joint names to the robot's by either side's prefix; empty unless one fits best."""
+    """Map a log's joint names to the robot's by a prefix on either side; empty unless one prefix fits best."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(found):
         for meant in wanted:

@@ -72,7 +72,7 @@ class _Sums:
         self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
 
     def means(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> Float64:
-        """Means (4, T) from first to last, excluded."""
+        """Means (4, T) over the states from each first up to, but not with, its last."""
         return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
 
     def forget(self, before: int) -> None:
@@ -137,7 +137,7 @@ def _slopes(seconds: Float64, position: Float64) -> Float64:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawTrack(StateColumns):
-    """States as recorded, in file order; absent velocity is NaN. where: for messages."""
+    """States as recorded, in file order; absent velocity is NaN. where: its name in messages."""
 
     where: str
     names: tuple[str, ...]
@@ -151,8 +151,8 @@ class RawTrack(StateColumns):
 def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     """Sort states by stamp, each stamp once, each with velocities; changes are noted in `loss`.
 
-    Positions that are not finite are damage; of equal stamps the first is kept. Velocities that are absent, NaN, or
-    always zero for a moving joint become position differences.
+    States with a position that is not finite are damage, and left out; of equal stamps the first is kept. Velocities
+    that are absent, NaN, or always zero for a moving joint become position differences.
     """
     ordered = unwrapped(_in_order(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)

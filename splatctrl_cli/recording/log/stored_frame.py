@@ -48,7 +48,7 @@ AGAIN = "run `splatctrl ingest` again"
 class JointTopics:
     """Topics with joint states, their `loss` and the user's chosen topic.
 
-    first_note: the loss's first note in the whole report.
+    first_note: index of the loss's first note in the whole report.
     """
 
     topics: Sequence[TopicSurvey]
@@ -276,7 +276,7 @@ def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
 
 
 def check_depth(depth: Float32, where: str, scale: float) -> bool:
-    """True with any depth [m]. Raises InputError for an implausible median.
+    """True if a depth image [m] has any depth. Raises InputError for an implausible median.
 
     scale: metres per count it was read with.
     """

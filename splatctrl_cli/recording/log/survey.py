@@ -100,7 +100,7 @@ def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
 
 
 def dropped(stamps_ns: Stamps) -> tuple[int, int, float]:
-    """Number of gaps, missing images, and the period [ns]; 0 if unsteady or few.
+    """Number of gaps, images missing in them, and the period [ns]; no gaps if unsteady, all 0 with few stamps.
 
     The period is the median interval; three of four must be within a quarter of it.
     """
@@ -147,7 +147,7 @@ class Calibration:
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """A topic; stamps_ns and clock (images only) are headers' in file order."""
+    """A topic; stamps_ns and clock (images only) are of the headers, or log times, in file order."""
 
     topic: Topic
     count: int = 0
@@ -161,7 +161,7 @@ class TopicSurvey:
 
     @property
     def image(self) -> ImageMessage:
-        """The first image, required."""
+        """The first image, of a topic that is known to have one."""
         assert self.first_image is not None
         return self.first_image
 
@@ -182,7 +182,7 @@ class Survey:
         return sum(topic.count for topic in self.topics.values())
 
     def of_type(self, *types: str) -> list[TopicSurvey]:
-        """Non-empty topics, by name."""
+        """Non-empty topics of these types, sorted by name."""
         found = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
         return sorted(found, key=lambda t: t.topic.name)
 

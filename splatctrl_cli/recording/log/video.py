@@ -1,4 +1,4 @@
-"""Compressed video, decoded as a log with its images; in messages, or a file with stamps.
+"""Logs with compressed video decoded to images, and video files with stamps as logs.
 
 Reads H.264 and H.265 of foxglove.CompressedVideo (Annex B, an image per message; docs.foxglove.dev, CompressedVideo)
 and ffmpeg_image_transport's FFMPEGPacket. Images without a prior key frame, or after a missing image, are dropped and
@@ -45,7 +45,7 @@ class _Stream:
     """A topic's decoder.
 
     num: packets. waiting: (message without data, header) by packet. key: last key frame. broken: packets since then
-    with losses. num_early, num_late: images lost before and after it.
+    with losses. num_early, num_late: images lost before the first key frame, and after.
     """
 
     context: Any
@@ -175,7 +175,7 @@ _TIME = re.compile("time|stamp", re.IGNORECASE)
 
 
 def open_log(path: Path) -> RawLog:
-    """Open a log, or a video file with stamps. Raises InputError.
+    """Open a log, or a video file with stamps. Raises InputError for others.
 
     Video is decoded if the library is installed.
     """

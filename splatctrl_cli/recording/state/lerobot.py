@@ -2,7 +2,8 @@
 
 Versions 2 and 3 (huggingface/lerobot, lerobot_dataset.py, utils.py) list features in ``meta/info.json``. v2 has
 ``data/chunk-000/episode_000000.parquet`` per episode; v3 shares ``data/chunk-000/file-000.parquet`` by column
-``episode_index``. ``observation.state`` is position, ``timestamp`` seconds of the episode.
+``episode_index``. ``observation.state`` is position, ``timestamp`` seconds from the
+episode's begin.
 """
 
 from collections.abc import Mapping
