@@ -1,6 +1,6 @@
 """Rigid transforms T (4, 4), rotations (3, 3), pinhole camera; float64.
 
-Quaternions are (x, y, z, w), positions (3,) [m].
+T_world_camera maps camera to world. Quaternions are (x, y, z, w), positions (3,) [m].
 """
 
 import numpy as np

@@ -128,7 +128,7 @@ class Plane:
 
 
 def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
-    """The largest plane in a view, with a quarter of the pixels, or None."""
+    """The largest plane in a view; None if no plane has a quarter of the normals."""
     normals = view.normals.reshape(-1, 3)
     normals = normals[np.any(normals != 0, axis=1)] @ T_world_camera[:3, :3].T
     if len(normals) < 100:

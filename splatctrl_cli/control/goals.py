@@ -140,7 +140,7 @@ PlanDetour = Callable[[int, Float64, Float64], Detour | None]
 class TwistTrack:
     """N twists (N, 6) [m/s, rad/s] of the controlled frame, linear first.
 
-    stamp_ns (N,) rise; axes: frame of the axes, turning with the arm; None: world.
+    stamp_ns (N,) increases; axes: the frame whose axes the twists use, which turns with the arm (None: world).
     """
 
     stamp_ns: Stamps

@@ -69,7 +69,7 @@ class ReplayTask:
 
     @property
     def last_ns(self) -> int | None:
-        """Last stamp; None with a goal."""
+        """Last stamp; None where the task ends at a goal."""
         if self.twists is not None:
             return self.end_ns
         return None if self.follow is None else self.follow.last_ns

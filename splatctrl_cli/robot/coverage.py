@@ -44,8 +44,8 @@ class LinkCoverage:
     """Coverage of one link's collision surface by its spheres and those fixed to it.
 
     area [m2]; uncovered_area [m2], proven bounds; deficit: None without spheres; protrusion [m]: bound on how far
-    spheres leave the body, exact for a convex one; worst_sphere: its index in the sphere set; is_closed: else the
-    hull replaced the surface.
+    spheres leave the body, exact for a convex one; worst_sphere: its index in the sphere set, -1 without
+    spheres; is_closed: False if a hull replaced an open surface.
     """
 
     link: str

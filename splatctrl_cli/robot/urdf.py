@@ -113,8 +113,8 @@ class UrdfFile:
     def grippers(self) -> tuple[str, ...]:
         """Joints typical of fingers.
 
-        They are several prismatic joints on one rigid body, or mimics and their leaders, without another kind of joint
-        beyond them.
+        They are several prismatic joints on one rigid body, or mimics and their leaders, without another kind of
+        joint beyond them.
         """
         movable = [joint for joint in self.joints if joint.kind != "fixed"]
         leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
