@@ -1,6 +1,6 @@
 """Rigid transforms T (4, 4), rotations (3, 3), pinhole camera; float64.
 
-Quaternions are (x, y, z, w), positions (3,) [m].
+T_world_camera maps camera to world. Quaternions are (x, y, z, w), positions (3,) [m].
 """
 
 import numpy as np
@@ -84,9 +84,9 @@ def frame_along(axis: Float64) -> Float64:
 
 
 def face_normals(corners: Float64) -> Float64:
-    """Return triangles' normals (F, 3) times twice the area.
+    """Return the normals (F, 3) of triangles (F, 3, 3), times twice their area.
 
-    Outward if corners run counter-clockwise seen from outside.
+    They point outward if corners run counter-clockwise seen from outside.
     """
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 

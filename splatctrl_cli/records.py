@@ -128,9 +128,11 @@ def by_stamp(*streams: Iterable[_Item]) -> Iterator[_Item]:
 class LossReport:
     """Losses of an input: `damaged` sets exit code 3, the rest is only counted.
 
-    dropped_images: gaps in a topic of steady rate; invalid_depth: pixels with NaN, infinite, negative or 65535
-    counts, read as no return; differentiated_velocities: from positions; unsorted_states: with earlier stamps;
-    conflicting_states: duplicates with other positions than the kept one; state_gaps: times without states.
+    duplicate_images: images of a stamp that their topic had before; dropped_images: images missing from a topic of
+    steady rate; invalid_depth: pixels with NaN, infinite, negative or 65535 counts, read as no return;
+    differentiated_velocities: states with a velocity from positions; unsorted_states, duplicate_states: stamps that
+    go back or repeat; conflicting_states: duplicates with other positions than the kept one; state_gaps: times
+    without states.
     """
 
     unpaired_color: int = 0
@@ -287,7 +289,7 @@ class DistanceField(Protocol):
     """Signed distance to the scene, positive outside."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return distance (Q,) [m] at points (Q, 3), and its own gradient (Q, 3).
+        """Return distance (Q,) [m] at points (Q, 3) [m], world, and its own gradient (Q, 3).
 
         The gradient is not normalised.
         """

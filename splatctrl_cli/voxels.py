@@ -113,11 +113,11 @@ class Balls:
 
     @classmethod
     def of_voxels(cls, centers: Float32, voxel: float, labels: UInt8) -> "Balls":
-        """Return the balls around voxels at centers (K, 3)."""
+        """Return the balls around voxels of edge `voxel` [m] at centers (K, 3)."""
         return cls(centers=centers, radius=0.5 * 3**0.5 * voxel, labels=labels)
 
     def select(self, which: Bool) -> "Balls":
-        """Return some of them (K,)."""
+        """Return the balls of a mask (K,)."""
         return Balls(centers=self.centers[which], radius=self.radius, labels=self.labels[which])
 
     @property
@@ -138,14 +138,14 @@ class LostEdges:
 
     @classmethod
     def joined(cls, parts: Sequence["LostEdges"]) -> "LostEdges":
-        """Return all of them, or none."""
+        """Return all balls of the parts; no parts give no balls."""
         return cls(
             centers=np.concatenate([np.zeros((0, 3), np.float32), *(part.centers for part in parts)]),
             radii=np.concatenate([np.zeros(0, np.float32), *(part.radii for part in parts)]),
         )
 
     def select(self, which: Bool) -> "LostEdges":
-        """Return some of them (K,)."""
+        """Return the balls of a mask (K,)."""
         return LostEdges(centers=self.centers[which], radii=self.radii[which])
 
 
@@ -168,9 +168,9 @@ class SeenVoxels:
     edges: LostEdges = NO_EDGES
 
     def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
-        """Return last stamps (Q,) [ns], -1 never, and `EvidenceClass` (Q,), `FREE` if ever seen.
+        """Return the stamps (Q,) [ns] of the last views, -1 for never, and `EvidenceClass` (Q,).
 
-        points (Q, 3) [m], world.
+        points (Q, 3) [m], world. The class is `FREE` for every voxel that was ever seen, however long ago.
         """
         cell = np.floor((points - self.origin) / self.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)

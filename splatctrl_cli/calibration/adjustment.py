@@ -19,7 +19,7 @@ ROBOT = "the robot"
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Residuals (M,) [m] and their sigma of two views, or of a frame and the robot.
+    """Residuals (M,) [m] and their sigma (M,) [m], of two views, or of a frame and the robot.
 
     jacobian (M, 17): by the two cameras' unknowns and the clock, in `columns` (17,). clusters (M,): equal numbers of
     the same `alike` have correlated errors. num_laid: points that should lie on the other's surface, even beyond the
@@ -39,7 +39,7 @@ class Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class Widths:
-    """Residuals that count: within reach [m] and cut [sigma]; None for the reach alone."""
+    """Limits of the residuals that count: reach [m], and cut [sigma] (None: the reach alone decides)."""
 
     reach: float
     cut: float | None = None
@@ -71,7 +71,7 @@ class Adjustment:
     def solved(
         self, estimate: Estimate, schedule: Sequence[Widths], rounds: int = fixed.CALIBRATION_ROUNDS
     ) -> Estimate:
-        """The estimate after a round per width, and `rounds` more at most until convergence."""
+        """The estimate after a round per width, and at most `rounds` more of the last one until convergence."""
         start, step = estimate, np.zeros(self.unknowns.size)
         for number, widths in enumerate((*schedule, *(schedule[-1],) * rounds)):
             normal = self.normal(estimate, widths)
@@ -84,7 +84,8 @@ class Adjustment:
     def _step(self, normal: Normal, estimate: Estimate, start: Estimate, hold: float) -> Float64:
         """The Gauss-Newton step; unobserved directions stay near the start.
 
-        So do all others by a share `hold` of the residuals' weight: at large reach, wrong surfaces pull.
+        All others stay near it, too, by a share `hold` of the residuals' weight, because wrong surfaces pull while
+        the reach is large.
         """
         weight, offset = self._prior(estimate, start)
         weight = weight + hold * float(np.trace(normal.H)) / len(weight)
@@ -144,7 +145,7 @@ class Adjustment:
         return Normal(H=H, g=g, scores=np.array(scores).reshape(-1, P), counts=counts, spread=spread)
 
     def cost(self, estimate: Estimate, reach: float) -> tuple[float, int]:
-        """Misfit, and the number of points compared.
+        """Misfit, and the number of points that can be compared.
 
         The misfit averages, over pairs, the mean squared residual [sigma], each cut at `CALIBRATION_CUT`.
         """
@@ -282,7 +283,7 @@ def _cells(points_world: Float64, depth: float) -> Index:
 
 
 def _carried(twist: Float64, T: Float64) -> Float64:
-    """A frame's small motion (6,), in axes at T (4, 4) on it."""
+    """The motion (6,) of a frame fixed at T (4, 4) to one with a small motion `twist` (6,), each in its own axes."""
     if not twist.any():
         return twist
     turn, move = twist[:3], twist[3:]

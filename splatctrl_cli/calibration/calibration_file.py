@@ -25,8 +25,9 @@ class CalibratedCamera:
 
     T (4, 4): T_world_camera if stationary, T_recorded_camera if moving. recorded (4, 4): the recording's
     T_world_camera, None if moving. scale, bias [m]: the true depth is ``scale depth + bias``. sigma_position (3,)
-    [m], sigma_rotation (3,) [rad]: in the world's axes, a moving camera's own. depth_noticed: the least |scale - 1|
-    and |bias| [m] to be solved for, inf if none. held: parts not solved for. unobserved: directions kept as recorded.
+    [m], sigma_rotation (3,) [rad]: in the world's axes, or a moving camera's own. sigma_depth: of scale and bias.
+    depth_noticed: the least |scale - 1| and |bias| [m] that would be noticed, inf if not looked for. held: parts not
+    solved for. unobserved: directions kept as recorded.
     """
 
     T: Float64
@@ -107,7 +108,7 @@ def calibration_text(calibration: Calibration) -> str:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read a calibration. Raises InputError for another or a damaged file."""
+    """Read a calibration. Raises InputError for a missing, another or a damaged file."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

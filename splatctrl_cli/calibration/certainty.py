@@ -16,7 +16,7 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class Certainty:
-    """Covariance (P, P) of the unknowns; reach (P, P): their displacements [m] of visible points."""
+    """Covariance (P, P) of the unknowns; reach (P, P) maps them to displacements [m] of what the cameras see."""
 
     unknowns: Unknowns
     covariance: Float64
@@ -28,7 +28,7 @@ class Certainty:
         return np.zeros((POSE, POSE)) if columns[0] < 0 else self.covariance[np.ix_(columns, columns)]
 
     def displacement(self, camera: str) -> Float64:
-        """Covariance (6, 6) [m] of the view's middle: rotation at the rim, then translation."""
+        """Covariance (6, 6) [m^2] of displacements: of the view's rim by rotation, then of its middle."""
         columns = self.unknowns.columns(camera)[:POSE]
         if columns[0] < 0:
             return np.zeros((POSE, POSE))
@@ -43,7 +43,7 @@ class Certainty:
 
     @property
     def is_full(self) -> bool:
-        """True if all directions of all cameras are within `CALIBRATION_SIGMA`."""
+        """True if all directions of all cameras are known within `CALIBRATION_SIGMA`."""
         spreads = [np.linalg.eigvalsh(self.displacement(camera))[-1] for camera in self.unknowns.poses]
         return max(spreads, default=0.0) <= fixed.CALIBRATION_SIGMA**2
 
@@ -128,7 +128,7 @@ class Plane:
 
 
 def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
-    """The largest plane in a view, with a quarter of the pixels, or None."""
+    """The largest plane in a view; None if no plane has a quarter of the normals."""
     normals = view.normals.reshape(-1, 3)
     normals = normals[np.any(normals != 0, axis=1)] @ T_world_camera[:3, :3].T
     if len(normals) < 100:

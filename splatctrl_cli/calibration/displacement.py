@@ -101,7 +101,8 @@ def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
 def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, Any], Float64] | None:
     """One camera's pose error and correction T_recorded_camera (4, 4); None if little robot shows.
 
-    `distance_mm`, `sigma_mm`: root mean square motion of the robot's `num_pixels` visible points by the correction.
+    `distance_mm`, with its `sigma_mm`: root mean square motion of the robot's `num_pixels` visible points by the
+    correction.
 
     Two Gauss-Newton steps on point-to-plane distances, with Huber's weight from two sigma. Neighbouring pixels err
     alike: `DISPLACED_ALIKE` count as one. The distance is `DISPLACED_WIDTH` if fewer than `DISPLACED_SHARE` of the

@@ -86,7 +86,8 @@ def bends_alone() -> Float64:
 class BentViews:
     """Views, and the bends (C, G) of their cameras to solve for.
 
-    `cameras` (N,): `HELD` where depth is exact. now: the views without current bends.
+    cameras (N,): number of each view's camera, `HELD` where its depth stays as it is. now: the views without current
+    bends.
     """
 
     recorded: Sequence[GrayView]
@@ -104,7 +105,7 @@ class BentViews:
 
     @property
     def grids(self) -> Float64:
-        """Offsets of disparity (C, rows, columns)."""
+        """Offsets of disparity (C, rows, columns), in the views' scaled lengths."""
         return (self._free @ self._basis.T).reshape(self._num, *fixed.BEND_GRID)
 
     def equations(self, size: int, num_pairs: int) -> "BendEquations":

@@ -1,4 +1,4 @@
-"""From evidence to a calibration: starts, unknowns, and uniqueness."""
+"""Solves a calibration from several starts, chooses its unknowns, and rejects it if two solutions fit alike."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +20,7 @@ FREED = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_FREED)
 class Solution:
     """The estimate, its certainty, and its residuals within `widths`.
 
-    noticed: by camera, the least |scale - 1| and |bias| [m] to be solved for.
+    noticed: by camera, the least |scale - 1| and |bias| [m] that would be noticed.
     """
 
     estimate: Estimate
@@ -220,7 +220,7 @@ def _positive(covariance: Float64) -> Float64:
 
 
 def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """Least |scale - 1| and |bias| [m] to be noticed, by camera; inf if none."""
+    """Least |scale - 1| and |bias| [m] that would be noticed, by camera; inf if not looked for."""
     unknowns = tried.adjustment.unknowns
     held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
     found = {}

@@ -19,7 +19,7 @@ class DepthView:
     """One depth image, in its camera's optical frame [m].
 
     surface, normals (h, w, 3): per pixel, normals towards the camera, 0 if unknown. points, point_normals (K, 3): a
-    subset with normals, in image parts tiles (K,). T_world_camera (4, 4): as recorded.
+    subset with normals; tiles (K,): the part of the image of each. T_world_camera (4, 4): as recorded.
     """
 
     camera: str
@@ -102,7 +102,7 @@ def surface_normals(surface: Float64, step: int = 1) -> Float64:
 
 
 def bend(depth: Float32, step: int = 1) -> Float64:
-    """Largest deviation (h, w) [m] of depth from the mean `step` pixels aside."""
+    """Largest deviation (h, w) [m] of depth from the mean of those `step` pixels to either side."""
     bent = np.zeros(depth.shape)
     middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
     z = depth.astype(np.float64)
@@ -125,7 +125,7 @@ class Surface(Protocol):
 
 
 def landed(points: Float64, view: Surface) -> tuple[Bool, Float64, Float64]:
-    """Hits (K,) of points (K, 3), camera frame, on depth; surface and normals there."""
+    """Return which points (K, 3), camera frame, land on depth (K,), and the surface and normals (K, 3) there."""
     is_ahead = points[:, 2] > fixed.PLAUSIBLE_DEPTH[0]
     pixels = np.round(project(view.lens, np.where(is_ahead[:, None], points, 1.0)))
     lands = is_ahead & np.all((pixels >= 0) & (pixels < view.surface.shape[1::-1]), axis=1)
@@ -160,7 +160,8 @@ def overlap_rows(
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
     """A stationary camera's frame: the mean of inverse depths near their median.
 
-    Sensors err in disparity, proportional to inverse depth. Half of the frames must agree within three `depth_sigma`.
+    Sensors err in disparity, proportional to inverse depth. Half of the frames must agree within three `depth_sigma`,
+    else depth is 0.
     """
     if len(frames) == 1:
         return frames[0]

@@ -39,9 +39,9 @@ CHUNK = 256  # states per query
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
-    """distance (T,) [m] of the nearest moving part, NaN if none, with its sphere (T,).
+    """distance (T,) [m] of the nearest moving part, NaN if unknown; sphere (T,): the index of its sphere.
 
-    For self-collision: nearest pair, by index, -1 without pairs.
+    For self-collision, distance is that of the nearest pair, and sphere is the pair's index, -1 without pairs.
     """
 
     distance: Float64
@@ -72,10 +72,10 @@ class AuditTrace:
 def part_clearances(
     model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Float64, Bool]:
-    """Return the moving parts' clearances (T, M) [m], and which (M,) are of link surfaces.
+    """Return the moving parts' clearances (T, M) [m] at postures (T, J), and which (M,) are of link surfaces.
 
-    A link's triangles decide if the scene is of balls: its nearest sphere has their clearance. Its others have at
-    least that, or their own less `sphere_deficit`. centers (T, S, 3): if known.
+    A link's triangles decide if the scene is of balls: the link's nearest sphere has their clearance. Each other
+    sphere has the larger of that and its own less `sphere_deficit`. centers (T, S, 3) [m]: of all spheres, if known.
     """
     moving = np.flatnonzero(model.moving_spheres)
     there = model.sphere_centers_batch(positions) if centers is None else centers
@@ -117,8 +117,8 @@ def audit(
 ) -> AuditTrace:
     """Return clearances of states, by the distances known at their stamps.
 
-    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Any part of one scene's states gives the same
-    bits.
+    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. The audit of some states of one scene equals that
+    part of the audit of all, to the bit.
     """
     parts: dict[str, list[Clearance]] = {}
     spheres: dict[str, list[Float64]] = {}
@@ -146,7 +146,7 @@ def audit(
 
 
 def observed_at(seen: Channel, origin: Float64, voxel: float, points: Float64) -> Channel:
-    """Return the nearest voxel's value; 0 (never seen) outside. seen (X, Y, Z)."""
+    """Return the value (Q,) of the voxel of `seen` (X, Y, Z) nearest to each point; 0 (never seen) outside."""
     cell = np.floor((points - origin) / voxel + 0.5).astype(np.int64)
     is_inside = np.all((cell >= 0) & (cell < seen.shape), axis=1)
     found = np.zeros(len(points), dtype=np.uint8)
@@ -155,7 +155,7 @@ def observed_at(seen: Channel, origin: Float64, voxel: float, points: Float64) -
 
 
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
-    """Yield ranges of states in one scene; keep at most two scenes."""
+    """Yield ranges of at most CHUNK consecutive states in one scene; hold at most two scenes."""
     first, before = 0, distances_at(int(stamps[0]))
     for index, stamp in enumerate(stamps[1:], start=1):
         known = distances_at(int(stamp))

@@ -78,10 +78,10 @@ class SceneRows(BarrierTerm):
         return self._barrier(self._moving, G, h, distance)
 
     def cut(self, state: State, velocity: Float64, chosen: NDArray[np.integer], distance: Float64) -> Barrier:
-        """Return rows of `chosen` spheres against their nearest surfaces after a period of `velocity`.
+        """Return rows of `chosen` spheres against their nearest surfaces after a period of `velocity` (J,).
 
-        distance (M,): now. The later distance is linearised, which is conservative for surfaces convex from there,
-        such as balls; now it is at least the present one.
+        The distance to such a surface is linearised at that later place. This is conservative for a surface that is
+        convex seen from there, such as a ball. At the state it counts as at least `distance` (M,), the present one.
         """
         period = self._config.period
         q = state.q + period * velocity
@@ -95,7 +95,7 @@ class SceneRows(BarrierTerm):
         return self._barrier(chosen, G, h, now)
 
     def distances(self, centers: Float64) -> Float64:
-        """Return distances (M,) [m]; NaN, where unknown, keeps no promise."""
+        """Return distances (M,) [m]; NaN where unknown, which breaks a row's promise."""
         return self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii
 
     def _barrier(self, index: NDArray[np.integer], G: Float64, h: Float64, distance: Float64) -> Barrier:
@@ -191,8 +191,8 @@ def distance_bound(
 ) -> Float64:
     """Return h (M,), with the braking distance where joints cannot stop at once.
 
-    Only then G (M, J) counts. A row's approach G v can brake by at most ``|G| a``; BRAKING_SHARE of it counts,
-    because it changes on the way and other rows share it.
+    Only then G (M, J) counts. A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it counts,
+    because it changes on the way and other rows share it. rate [m/s]: dd/dt of a field that changes with time.
     """
     if acceleration is None or G is None:
         return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)
@@ -212,22 +212,22 @@ def pair_gradient(direction: Float64, jacobians: Float64, pairs: NDArray[np.inte
 
 
 def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, rate: float | Float64 = 0.0) -> Float64:
-    """Return h (M,): ``alpha (d - epsilon) + dd/dt`` [m/s]."""
+    """Return h (M,): ``alpha (d - epsilon) + dd/dt`` [m/s]; rate: dd/dt of a field that changes with time."""
     return np.asarray(gain * (distance - margin) + rate)
 
 
 def fastest_approach(G: Float64, lowest: Float64, highest: Float64) -> Float64:
-    """Return the largest G v (M,) [m/s] over the box."""
+    """Return the largest G v (M,) [m/s] over the box of joint velocities."""
     return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1))
 
 
 def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> NDArray[np.bool_]:
-    """True for rows (M,) that some velocity of the box violates; others drop exactly."""
+    """True for rows (M,) that some velocity of the box violates; to drop the others changes no solution."""
     return np.asarray(fastest_approach(G, lowest, highest) > h)
 
 
 def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Float64:
-    """Return top speeds (S,) [m/s] over the box; jacobians (S, 3, J)."""
+    """Return upper bounds (S,) [m/s] on the spheres' speeds over the box; jacobians (S, 3, J)."""
     speed = np.abs(jacobians) @ np.maximum(np.abs(lowest), np.abs(highest))
     return np.asarray(np.sqrt(np.einsum("si,si->s", speed, speed)))
 

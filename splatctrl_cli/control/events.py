@@ -82,8 +82,8 @@ class Obstacle:
 class Event:
     """An interval of consecutive states with its worst value.
 
-    names: in order of appearance, at most MAX_NAMES of num_names; source: field, or empty; state: index of the worst;
-    worst_name, obstacle: there.
+    names: in order of appearance, at most MAX_NAMES of num_names; source: the field, or empty; state: index of the
+    worst state; worst_name, obstacle: at that state.
     """
 
     kind: EventKind
@@ -158,7 +158,7 @@ Near = Callable[[EventKind, str, int], Obstacle | None]
 
 @dataclass(kw_only=True)
 class _Run:
-    """An unfinished interval; state: worst index over all blocks."""
+    """An unfinished interval; state: index of the worst state, counted over all blocks."""
 
     order: int
     kind: EventKind

@@ -14,11 +14,12 @@ WasSeen = Callable[[Float64], Bool]
 
 
 class FixedParts:
-    """`found`: each fixed sphere's clearance [m] in the first scene, and least to later arrivals.
+    """`found`: each fixed sphere's clearance [m] in the first scene, and its least, later arrivals included.
 
     A ball has arrived if none of the first scene stood within STATIC_CHANGE of it; near a sphere at its mount, where
     the map grows, within MOUNTED_CHANGE. It is nearer than the first clearance by as much, and a camera had seen its
-    place before. The last scene had it too: noise is in one scene alone. A link's triangles replace its spheres.
+    place before. The last scene had it too: noise is in one scene alone. A link's triangles count where they are
+    farther away.
     """
 
     def __init__(self, model: ArmModel, near: float) -> None:
@@ -53,7 +54,7 @@ class FixedParts:
     def _came(
         self, balls: BallDistance, centers: Float64, q: Float64, was_seen: WasSeen | None, change: Float64
     ) -> Float64:
-        """Clearance (M,) [m] of each sphere from new balls; infinite without any."""
+        """Clearance (M,) [m] of each sphere from balls that moved by over `change` (M,) [m]; infinite without any."""
         model, least = self._model, np.full(len(centers), np.inf)
         radii = model.sphere_set.radii[self._still]
         away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii

@@ -69,7 +69,7 @@ class LoggedMotion:
     def at(self, stamp_ns: int) -> tuple[Float64, Float64]:
         """Return position and velocity (J,) at a stamp, linear between states.
 
-        The first before all; the last, at rest, after all.
+        Before all states it is the first; after all, the last, at rest.
         """
         if stamp_ns > self.last_ns:
             return np.asarray(self.position[-1]), np.zeros(self.position.shape[1])
@@ -122,7 +122,7 @@ class Detour:
         return self.clock >= self.path.duration
 
     def goal(self, model: ArmModel, frame: str) -> tuple[Float64, Guide]:
-        """Return a frame's pose (4, 4) and motion at the clock."""
+        """Return a frame's pose (4, 4) and motion at the clock's time."""
         position, velocity = self.path.at(self.clock)
         return guided_goal(model, frame, position[0], velocity[0])
 
@@ -140,7 +140,7 @@ PlanDetour = Callable[[int, Float64, Float64], Detour | None]
 class TwistTrack:
     """N twists (N, 6) [m/s, rad/s] of the controlled frame, linear first.
 
-    stamp_ns (N,) rise; axes: frame of the axes, turning with the arm; None: world.
+    stamp_ns (N,) increases; axes: the frame whose axes the twists use, which turns with the arm (None: world).
     """
 
     stamp_ns: Stamps
@@ -148,7 +148,7 @@ class TwistTrack:
     axes: str | None = None
 
     def at(self, stamp_ns: int, timeout: float) -> Float64:
-        """Return the newest twist (6,); zero if none or older than `timeout` [s]."""
+        """Return the newest twist (6,) up to a stamp [ns]; zero if none or older than `timeout` [s]."""
         index = int(np.searchsorted(self.stamp_ns, stamp_ns, side="right")) - 1
         if index < 0 or (stamp_ns - self.stamp_ns[index]) * 1e-9 > timeout:
             return np.zeros(6)

@@ -41,7 +41,7 @@ class Reach:
 
 @dataclass(frozen=True, kw_only=True)
 class Between:
-    """Clearance bounds lower (T - 1,) [m] of intervals, ends included.
+    """Lower bounds (T - 1,) [m] of the clearance within intervals, ends included.
 
     Where is_met (T - 1,), lower is a witness: the clearance of a posture in between, below the margin. is_bounded (T
     - 1,): False if the states do not determine a bound.
@@ -66,9 +66,9 @@ def between_states(
 ) -> Between:
     """Return bounds between states (T, J) at stamps (T,) [ns] in one scene.
 
-    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm
-    moved straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may have gone
-    anywhere within its velocity limits: bounded only where that stays above the margin [m].
+    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm is
+    assumed to move straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may
+    have gone anywhere within its velocity limits: bounded only where that stays above the margin [m].
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))
@@ -107,7 +107,11 @@ def _refined(
     distance_to: DistanceFunction,
     margin: float,
 ) -> tuple[Float64, Bool]:
-    """Halve straight motions until each bound reaches the margin, or the piece is short."""
+    """Halve K straight motions until each piece's bound reaches the margin, or the piece is short.
+
+    Return the least bound (K,), and is_met (K,): a posture on the way is below the margin, and the least clearance of
+    such postures replaces the bound.
+    """
     least, is_met = np.full(len(q_first), np.inf), np.zeros(len(q_first), dtype=np.bool_)
     owner = np.arange(len(q_first))
     for level in range(MAX_HALVINGS + 1):

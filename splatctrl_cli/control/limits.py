@@ -115,7 +115,7 @@ class JointLimits:
     def of(cls, model: ArmModel, config: ControlConfig) -> "JointLimits":
         """Return an arm's configured limits.
 
-        Raises UsageError for a wrong number of accelerations.
+        Raises UsageError for a wrong number of accelerations, or for other joints than an FR3's with its limits.
         """
         return cls(
             lower=model.lower,

@@ -1,4 +1,4 @@
-"""An external process of lines, with named faults and bounded time and memory."""
+"""An external process that answers line by line, with named faults and bounded time and memory."""
 
 import os
 import selectors
@@ -59,7 +59,7 @@ class LineProcess:
             self._selector.register(number, selectors.EVENT_READ)
 
     def exchange(self, line: bytes, limit: float) -> bytes:
-        """Send a line and return the next one. Raises Misbehaved after `limit` [s]."""
+        """Send a line and return the next one. Raises Misbehaved without a line within `limit` [s], or at the end."""
         deadline = time.monotonic() + limit
         if not self._unsent:
             self._selector.register(self._stdin, selectors.EVENT_WRITE)

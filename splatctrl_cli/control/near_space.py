@@ -29,8 +29,8 @@ class Seen:
     """Camera evidence at one moment.
 
     look: points (Q, 3) [m], world -> stamps (Q,) [ns] of the last depth through or on them, -1 never, and
-    `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: balls that a surface past its lost edge may
-    reach. origin (3,), voxel [m].
+    `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: centre and radius of balls into which a
+    surface may extend past its lost edge. origin (3,), voxel [m]: of the underlying voxels.
     """
 
     look: Callable[[Float64], tuple[NDArray[np.int64], UInt8]]

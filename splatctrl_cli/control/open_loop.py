@@ -21,7 +21,7 @@ FieldAt = Callable[[int], DistanceField]
 class OpenLoopTask:
     """Goal at each state: logged motion, a frame's pose (4, 4), or logged twists.
 
-    home (J,) [rad]: attracts free motion with a pose (None: `middle`).
+    home (J,) [rad]: the posture to lean to with a goal pose (None: the model's `middle`).
     """
 
     frame: str
@@ -34,8 +34,8 @@ class OpenLoopTask:
 class OpenLoopTrace:
     """T states: the controller's step, and the room that the logged velocity left.
 
-    Both are None where the field has no distance, the step also after the commander's end. commanded (T, J) [rad/s]
-    is NaN there.
+    Both are None where the field has no distance; the step is None also after the commander's end. logged, commanded
+    (T, J) [rad/s]; commanded is NaN without a step.
     """
 
     logged: Float64

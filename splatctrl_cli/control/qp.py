@@ -184,7 +184,7 @@ class Choice:
     """The ladder's answer.
 
     velocity (J,); slack (M,) of barrier rows; multipliers of the box (2 J,) and barrier rows (M,); solution: the
-    last; num_refused: unused solutions.
+    last one computed; num_refused: how many solutions with slacks were not usable.
     """
 
     velocity: Float64
@@ -208,10 +208,10 @@ def descend(
     barriers: Sequence[Barrier],
     config: ControlConfig,
 ) -> Choice:
-    """Return the solved or relaxed program, else least violation, else standstill.
+    """Return the program's solution, relaxed where a slack remains, else the least violation, else standstill.
 
-    First without slacks, far smaller: its solution stands if no multiplier exceeds its row's slack cost. Programs
-    with slacks are feasible by construction, so lower rungs are for failing solvers.
+    The far smaller program without slacks is solved first. Its solution stands if no multiplier exceeds its row's
+    slack cost. Programs with slacks are feasible by construction, so the lower rungs are for failing solvers.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver.solve(assemble_hard(costs, *box, barriers))

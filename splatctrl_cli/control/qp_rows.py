@@ -27,8 +27,8 @@ class Rows:
     """Rows at one configuration (M, one barrier per term), and those the QP needs.
 
     First come the moving spheres, then the pairs. margin (M,) [m]; is_fixed: no joint velocity changes it; in_qp: not
-    fixed, and some velocity of the box violates it; cuts: further QP rows (`RowBuilder.cut`), indexed by their own
-    row.
+    fixed, and some velocity of the box violates it; cuts: further QP rows (`RowBuilder.cut`), whose index is
+    the row that each belongs to.
     """
 
     barriers: tuple[Barrier, ...]
@@ -61,7 +61,7 @@ class Rows:
         return rows if self.cuts is None else (*rows, self.cuts)
 
     def spread(self, values: Float64) -> Float64:
-        """Return QP rows' values as (M,), zero elsewhere; a row has its cuts' largest."""
+        """Return the QP rows' values as (M,), zero elsewhere; a row has the largest of its own and its cuts'."""
         everywhere, num_rows = np.zeros(len(self.in_qp)), int(self.in_qp.sum())
         everywhere[self.in_qp] = values[:num_rows]
         if self.cuts is not None:
@@ -70,7 +70,7 @@ class Rows:
 
 
 class RowBuilder:
-    """Builds an arm's rows in a distance field; names and kinds (M,); scene: its rows."""
+    """Builds an arm's rows in a distance field; names, kinds (M,): of the rows; scene: the rows against the scene."""
 
     def __init__(
         self,

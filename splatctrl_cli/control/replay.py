@@ -50,9 +50,9 @@ class Waypoint:
 class ReplayTask:
     """Start (J,) [rad] at a stamp [ns] and goal pose (4, 4) of a frame.
 
-    home (J,) [rad]: attracts free motion (None: the model's `middle`). via: earlier goals. follow: the goal is each
-    time's logged pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: every
-    anchor_period [s] the arm returns to the logged posture.
+    home (J,) [rad]: posture to lean to where the task leaves the arm free (None: the model's `middle`). via: poses to
+    reach first, in order. follow: the goal is each time's logged pose, until the log ends. twists: velocity to
+    reach instead, until end_ns. anchors: every anchor_period [s] the arm is put back into the logged posture.
     """
 
     start: Float64
@@ -69,7 +69,7 @@ class ReplayTask:
 
     @property
     def last_ns(self) -> int | None:
-        """Last stamp; None with a goal."""
+        """Last stamp; None where the task ends at a goal."""
         if self.twists is not None:
             return self.end_ns
         return None if self.follow is None else self.follow.last_ns
@@ -88,7 +88,7 @@ class SceneChange:
 
     @property
     def is_hit(self) -> bool:
-        """True if only the newer scene penetrates."""
+        """True if the arm is in collision in the newer scene only, which no controller can prevent."""
         return self.after < 0 <= self.before
 
 
@@ -96,8 +96,8 @@ class SceneChange:
 class ReplayTrace:
     """T steps with stamp_ns (T,) and position (T, J) [rad] before each.
 
-    anchored: steps before which the arm returned to the log; num_reached: goals; detours: steps before a planned
-    detour; by_surface: spheres that finally counted by their link's surface.
+    anchored: steps before which the arm was put back into the logged posture; num_reached: goals; detours: steps
+    after which a planned detour began; by_surface: spheres that finally counted by their link's surface.
     """
 
     stamp_ns: Stamps
@@ -254,7 +254,7 @@ class _Course:
         self.num_reached = 0
         self.detours: list[int] = []
         self._since = 0  # the step from which a stall counts: the last anchor, waypoint or detour
-        self._positions: list[Float64] = []  # of the steps since then
+        self._positions: list[Float64] = []  # of every step that may stall
         self._detour: Detour | None = None
         last_ns = task.last_ns
         left = config.max_time if last_ns is None else (last_ns - task.stamp_ns) * 1e-9 + config.period

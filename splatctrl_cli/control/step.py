@@ -56,9 +56,10 @@ class ControlStep:
 
     velocity (J,) [rad/s], already scaled by `scale` (1 unless the next distance broke a row's promise); pose_error
     (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf
-    without pairs); violated_fixed: violated rows that no joint velocity changes, fixed_distance [m]: their least (inf
-    without any); num_rows: in the QP; residual: worst KKT residual of the last solution; num_refused: failed
-    solutions; by_surface: spheres that now count by their link's surface.
+    without pairs); violated_fixed: violated rows that no joint velocity changes; fixed_distance [m]: their least
+    distance (inf without any); interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT
+    residual of the last solution; status: the solver's word for it; num_refused: unusable solutions; by_surface:
+    spheres that count by their link's surface from this step on.
     """
 
     velocity: Float64
@@ -122,7 +123,7 @@ class QpIkController:
         solver: QpSolver | None = None,
         terms: Sequence[CostTerm | BarrierTerm] = (),
     ) -> None:
-        """home (J,) [rad] attracts free motion (default: `middle`); terms add to the paper's.
+        """home (J,) [rad]: posture to lean to with free motion (default: `middle`); terms: added to the paper's.
 
         Raises InputError for a robot that no controller can run with.
         """
@@ -370,7 +371,7 @@ class Commander(Protocol):
 
     @property
     def is_over(self) -> bool:
-        """True after the last step, to rest."""
+        """True once no step will follow; the last one was to rest."""
         ...
 
     def step(self, controller: QpIkController, moment: Moment) -> ControlStep:

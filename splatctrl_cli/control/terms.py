@@ -196,9 +196,9 @@ class Barrier:
 
 
 class BarrierTerm(ABC):
-    """A term of M rows that bound the velocity; `names` describes them.
+    """A term of M rows that bound the velocity; `names` describe them.
 
-    Without distances it has `rows` alone: the infinite distance exempts it from step checks.
+    A term that is not about a distance defines `rows` alone. Its infinite distance exempts it from step checks.
     """
 
     kind = RowKind.LIMIT

@@ -73,8 +73,9 @@ class ControllerInput:
     """A controller's input at a step, in world.
 
     q (J,) [rad]; dq (J,) [rad/s]; goal, pose (4, 4) of goal and frame; error (6,) [m, rad]: twist from frame to goal
-    in a second, linear first; jacobian (6, J) of the frame. A moving goal has goal_twist (6,) [m/s, rad/s],
-    goal_posture (J,) [rad] to lean to, and goal_velocity (J,) [rad/s] of that posture; else all None.
+    in a second, linear first; jacobian (6, J) of the frame. A goal that moves or has a posture has
+    goal_twist (6,) [m/s, rad/s], goal_posture (J,) [rad] to lean to, and goal_velocity (J,) [rad/s] of that posture;
+    all three are None for a pose alone.
     """
 
     stamp_ns: int
@@ -103,7 +104,7 @@ class Controller(Protocol):
 
 
 def serve(target: str) -> None:
-    """Answer lines on stdin with the class ``module:Class``; its prints go to stderr."""
+    """Answer lines on stdin with the class ``module:Class`` until they end; its prints go to stderr."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     questions = os.fdopen(os.dup(0), encoding="utf-8")
     os.dup2(2, 1)

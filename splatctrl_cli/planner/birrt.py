@@ -123,7 +123,7 @@ class _Search:
         return tree.add(tree.q[near[is_free]] + way[is_free], near[is_free])
 
     def met(self, tree: _Tree, other: _Tree, new: Index) -> tuple[int, int] | None:
-        """Grow `other` towards new nodes as far as free; return the pair that meets."""
+        """Grow `other` towards the new nodes of `tree` as far as free; return the pair that meets, or None."""
         near = other.nearest(tree.q[new])
         way = tree.q[new] - other.q[near]
         share = self.free_shares(other.q[near], tree.q[new], only_whole=False)
@@ -220,9 +220,10 @@ def checked_postures(clearance: Clearance, start: Float64, goals: Float64, confi
 def shortened(
     clearance: Clearance, waypoints: Float64, config: PlannerConfig, random: np.random.Generator
 ) -> tuple[Float64, int, int]:
-    """Return a path (W', J) of proved edges, no longer; counts of edges, postures.
+    """Return a path (W', J) of proved edges, not longer than before, and the numbers of edges and postures checked.
 
-    First the shortest way over waypoints, then rounds of random shortcuts, each with the most saving one.
+    The shortest way over waypoints comes first. Each round then draws random shortcuts and takes the free one that
+    saves most.
     """
     path, num_edges, num_checks = _over_waypoints(clearance, waypoints, config)
     for _ in range(config.shortcut_rounds):

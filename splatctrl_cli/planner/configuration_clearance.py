@@ -147,7 +147,7 @@ def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
 
 
 def _between(levers: Float64, pairs: NDArray[np.integer]) -> Float64:
-    """A joint that moves both spheres moves neither against the other."""
+    """Bounds (P, J) on how fast two spheres approach; a joint that moves both moves neither against the other."""
     a, b = levers[pairs[:, 0]], levers[pairs[:, 1]]
     moves_both: Bool = (a > 0) & (b > 0)
     return np.where(moves_both, 0.0, np.maximum(a, b))
@@ -160,7 +160,7 @@ ROUNDING = 1e-9  # [m] subtracted from every clearance: far above rounding
 class EdgeCheck:
     """Proofs of E edges: each is free to `free_share` (E,) of its length.
 
-    0 if not even the start was proved. num_checks: postures checked.
+    The share is 0 if not even the start was proved. num_checks: postures checked.
     """
 
     free_share: Float64

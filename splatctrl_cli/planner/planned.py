@@ -115,7 +115,7 @@ NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedPath:
-    """A timed path; None with its reason in outcome.
+    """A timed path, or None with the reason in outcome.
 
     margin, self_margin [m]: reduced where start or goal is nearer. num_proved of num_edges edges are proved free.
     seconds [s]: of planning.
@@ -143,7 +143,8 @@ def planned_path(
     """Plan a path from start to goal pose, within the controller's frame speeds.
 
     scene: lower bound of a 1-Lipschitz distance, so every edge is proved. Goal postures start from home, start and
-    random guesses. approach [m]: straight end along the frame's z axis, as far as free.
+    random guesses. approach [m]: length of a straight last stretch along the frame's z axis, as
+    far as that is free.
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame
@@ -226,7 +227,7 @@ def approach_to(
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:
-    """Margins that start and goal keep, and goals that keep them, if any."""
+    """Margins that the start and a goal (G, J) keep, and the free goals that keep them, possibly none."""
     rows = room.rows(np.vstack([start, goals])) - fixed.START_ROOM
     num = len(room.moving)
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)

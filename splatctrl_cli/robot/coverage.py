@@ -44,8 +44,8 @@ class LinkCoverage:
     """Coverage of one link's collision surface by its spheres and those fixed to it.
 
     area [m2]; uncovered_area [m2], proven bounds; deficit: None without spheres; protrusion [m]: bound on how far
-    spheres leave the body, exact for a convex one; worst_sphere: its index in the sphere set; is_closed: else the
-    hull replaced the surface.
+    spheres leave the body, exact for a convex one; worst_sphere: its index in the sphere set, -1 without
+    spheres; is_closed: False if a hull replaced an open surface.
     """
 
     link: str
@@ -60,7 +60,7 @@ class LinkCoverage:
 
     @property
     def is_covered(self) -> bool:
-        """True if proven to lie in spheres."""
+        """True if the whole surface is proven to lie in spheres."""
         return self.deficit is not None and self.deficit.proven <= 0
 
     @property
@@ -79,7 +79,7 @@ class CoverageReport:
 
     @property
     def bare_links(self) -> tuple[str, ...]:
-        """Uncovered links: geometry but no sphere."""
+        """Links with collision geometry but no sphere."""
         return tuple(link.link for link in self.links if link.deficit is None)
 
     @property
@@ -89,12 +89,12 @@ class CoverageReport:
 
     @property
     def worst(self) -> LinkCoverage | None:
-        """Largest proven deficit; None: bare links."""
+        """The link with the largest proven deficit; None if a link is bare, because no distance bounds it."""
         return None if self.bare_links else max(self.links, key=_proven)
 
     @property
     def max_deficit(self) -> float | None:
-        """Proven deficit [m]; None: bare links."""
+        """Largest proven deficit [m], at least 0; None if a link is bare."""
         return None if self.worst is None else max(0.0, _proven(self.worst))
 
     @property
@@ -186,7 +186,7 @@ def largest_deficit(
 def uncovered_area(
     triangles: Float64, centers: Float64, radii: Float64, *, resolution: float = COVERED_EDGE
 ) -> tuple[float, float, float]:
-    """Return the area [m2] with phi > 0: best guess and proven bounds.
+    """Return the area [m2] with phi > 0: best guess, proven lower and upper bound.
 
     Triangles are halved until in one sphere, outside all, or no longer than `resolution` [m]; then their middle
     decides.

@@ -34,10 +34,11 @@ from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 class RobotModel:
     """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
-    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; left_out: links of the
-    sphere file missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None if not
-    measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a surface point of the sphere's rigid body may
-    lie outside all spheres, NaN if unknown; held: locked fingers and their values.
+    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: links
+    that `frame_pose` knows; left_out: links of the sphere file missing from the URDF; bare_links: URDF links with a
+    body but no sphere; coverage: None if not measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a
+    surface point of the sphere's rigid body may lie outside all spheres, NaN if unknown; held: locked fingers and
+    their values.
     """
 
     def __init__(
@@ -205,7 +206,7 @@ class RobotModel:
 
     @property
     def self_allowance(self) -> Float64:
-        """Each pair's margin shortfall (P,) [m]."""
+        """Shortfall (P,) [m] of each pair from the configured margin (`robot.self_margins`)."""
         return np.zeros(len(self.self_pairs())) if self._allowance is None else self._allowance
 
     def _changed(self, **attributes: object) -> "RobotModel":
@@ -256,7 +257,7 @@ class RobotModel:
 
     @property
     def middle(self) -> Float64:
-        """Mid-limit posture (J,); 0 if unlimited."""
+        """Posture (J,) in the middle of the limits; 0 for an unlimited joint."""
         limited = np.isfinite(self.lower) & np.isfinite(self.upper)
         return np.where(limited, (np.where(limited, self.lower, 0) + np.where(limited, self.upper, 0)) / 2, 0.0)
 
@@ -280,7 +281,7 @@ class RobotModel:
         return self.chain.jacobians(self._checked(q))
 
     def frame_pose(self, q: Float64, frame: str) -> Float64:
-        """Return T_world_frame (4, 4) of a link. Raises InputError if unknown."""
+        """Return T_world_frame (4, 4) of a link at q (J,). Raises InputError for an unknown link."""
         return np.vstack([self._framed(q, frame)[0], [0.0, 0.0, 0.0, 1.0]])
 
     def surface_gaps(
@@ -320,7 +321,7 @@ class RobotModel:
         return self.chain.frame(self._checked(q), there.parentJoint, in_body)
 
     def lever_arms(self) -> Float64:
-        """Return bounds (S, J) on a centre's travel per radian (or metre) in any posture."""
+        """Return upper bounds (S, J) [m] on a centre's travel per radian (or metre) of a joint, in any posture."""
         return lever_arms(self.chain, self.lower, self.upper)
 
     def reach(self) -> float:

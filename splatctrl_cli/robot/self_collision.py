@@ -26,7 +26,7 @@ class DisabledPair:
 def read_srdf(path: Path, urdf: UrdfFile) -> tuple[tuple[DisabledPair, ...], tuple[DisabledPair, ...]]:
     """Return the ``disable_collisions`` pairs within `urdf`, and those with an unknown link.
 
-    Raises InputError for no SRDF, a pair without links, or no pair within the URDF.
+    Raises InputError for a file that is no SRDF, a pair without links, or no pair within the URDF.
     """
     try:
         root = ElementTree.fromstring(path.read_text(encoding="utf-8"))

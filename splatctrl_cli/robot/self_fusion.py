@@ -114,9 +114,10 @@ def learn(
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """An image, thinned by `stride`.
+    """An image: depth (H, W) float32 [m], and its explanation.
 
-    links (h, w) int16: explaining link, `UNEXPLAINED`, or `EXPLAINED` by some; points_world (M, 3): unexplained.
+    links (h, w) int16: the link that explains each `stride`-th pixel, `UNEXPLAINED`, or `EXPLAINED` by some link;
+    points_world (M, 3) [m]: unexplained points.
     """
 
     stamp_ns: int

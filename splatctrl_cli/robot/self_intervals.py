@@ -43,7 +43,7 @@ class Fused:
     free: Bool
 
     def within(self, run: slice) -> tuple[Float64, Bool, Bool]:
-        """Return a run's mean distance (N,) [m] or NaN, seen but not free (R, N), free (R, N)."""
+        """Return a run's mean distance (N,) [m] or NaN, and where it is seen but not free, and free (R, N)."""
         total, weight = self.total[run].sum(axis=0), self.weight[run].sum(axis=0)
         mean = np.where(weight > 0.5, total / np.maximum(weight, 1e-9), np.nan).astype(np.float64)
         return mean, self.seen[run] & ~self.free[run], self.free[run]
@@ -136,7 +136,7 @@ def _interval(before: int, first: int, last: int, after: int, stamps: Stamps) ->
 
 
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
-    """Return the interval (N,) in which each cell is robot, -1 for none.
+    """Return the number (N,) of the interval in which each cell is robot, -1 for none.
 
     Votes of robot cells around it decide. In the whole recording, the first, cells next to robot need fewer
     configurations: some rays pass structures as thin as a pixel.

@@ -54,7 +54,7 @@ class LinkSurface:
         self._depths: list[Depth] = []
 
     def depth(self, points: Float64) -> float:
-        """Return the largest depth [m] of points (Q, 3); 0 outside or in open surfaces."""
+        """Return the largest depth [m] of points (Q, 3), link frame; 0 outside or in open surfaces."""
         is_near = np.zeros(len(points), dtype=np.bool_)
         for lower, upper in self._boxes:
             is_near |= np.all((points >= lower) & (points <= upper), axis=1)
@@ -81,7 +81,7 @@ def depth_in(solid: Solid) -> Depth:
 
 
 def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
-    """Return the gap [m] of two surfaces, b at T_a_b; negative where they overlap.
+    """Return the gap [m] of two surfaces, b at T_a_b (4, 4); negative where they overlap.
 
     Exact between triangles, a lower bound for round shapes. A link inside the other overlaps it, although the
     surfaces do not meet. The depth is the deepest vertex's, at least LEAST_OVERLAP.
@@ -200,10 +200,10 @@ class _SphereBodies:
 class KeptMargin:
     """Two links whose spheres keep `margin` [m] instead of the configured one.
 
-    margin: negative if the spheres may overlap; None: they cannot be separated, and it stays configured. apart: least
-    gap [m] of their surfaces (of their spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one
-    stands still and carries none, such as a table. surface_gap: least gap [m] of their surfaces in sampled postures
-    that keep the margin, negative where they overlap; None if unknown.
+    margin: negative if the spheres may overlap; None: they cannot be separated, and the configured margin stays.
+    apart: least gap [m] of their surfaces (of their spheres if unknown) that is not *near* (`kept_margins`).
+    is_fixture: one stands still and carries none, such as a table. surface_gap: least gap [m] of their surfaces in
+    sampled postures that keep the margin, negative where they overlap; None if unknown.
     """
 
     links: tuple[str, str]
@@ -216,7 +216,7 @@ class KeptMargin:
 def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) -> tuple[KeptMargin, ...]:
     """Return pairs of a moving link and one of `fixtures`, which no map contains.
 
-    They keep `margin` [m], or a share of their largest gap.
+    They keep `margin` [m], or a share of their largest gap if that is less.
     """
     standing = fixtures(model)
     postures, found = random_postures(model, SELF_TOUCHING, seed=0), []

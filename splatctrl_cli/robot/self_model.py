@@ -92,7 +92,7 @@ class SelfModel:
 
     @property
     def parts(self) -> list[LearnedLink]:
-        """Parts of any time."""
+        """Permanent and temporary parts."""
         return [part for part in self.learned if len(part.triangles)]
 
     def changes(self) -> list[int]:

@@ -2,7 +2,7 @@
 
 Files are URDFs, and YAML of this tool, robometrics and cuRobo. As in cuRobo (NVlabs/curobo, cuda_robot_generator.py),
 `collision_sphere_buffer`, a number or one per link, adds to every radius; `collision_spheres` may name a file; a
-radius not above 0 is switched off, as for objects not attached yet.
+sphere whose radius is then not above 0 is switched off, as for objects not attached yet.
 """
 
 from collections.abc import Sequence

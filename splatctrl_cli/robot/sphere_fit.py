@@ -30,7 +30,8 @@ DIGITS = 6  # decimals of a written sphere: micrometres
 class FitOptions:
     """Requirements on the spheres.
 
-    max_spheres: over all links; or max_protrusion [m], with few spheres. max_deficit [m]: of surface points outside.
+    max_spheres: over all links; or max_protrusion [m], met by as few spheres as are found. max_deficit [m]: how far
+    surface points may stay outside.
     restarts: greedy covers per link and protrusion; num_patches, num_candidates: approximate, per link.
     """
 

@@ -156,7 +156,7 @@ class RobotSurface:
 
     @property
     def vague(self) -> list[int]:
-        """Links of enclosing spheres or boxes."""
+        """Numbers of the links whose solids only enclose the body: spheres and carried boxes."""
         first = len(self.links) - self.num_carried
         return [k for k, name in enumerate(self.links) if k >= first or name in self.by_spheres]
 
@@ -173,7 +173,7 @@ class RobotSurface:
         return np.array([T_world_link[link] for link in self.links], np.float64).reshape(-1, 4, 4)
 
     def extents(self, T_world_link: Float64) -> dict[str, list[float]]:
-        """Return box corners (lower, upper) [m] and area [m^2] by link, at T_world_link."""
+        """Return box corners (lower, upper) [m] and area [m^2] by link, at T_world_link (L, 4, 4)."""
         T = T_world_link[self.solid_links] @ self.T_link_solid
         half, areas = _half_extents(self.kinds, self.sizes, T[:, :3, :3]), _areas(self.kinds, self.sizes)
         T_link = T_world_link[self.triangle_links]
@@ -229,7 +229,8 @@ class RobotSurface:
         """Return signed distances (Q,) [m] of points (Q, 3), negative inside.
 
         Infinite to triangles beyond `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0, any distance on the same
-        side of both bounds, which is faster. Points `outside` (Q,) of all triangles skip the slow inside test.
+        side of both bounds, which is faster. Points `outside` (Q,) of all triangles skip the slow inside test. Links
+        `without` do not count.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)

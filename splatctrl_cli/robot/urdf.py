@@ -20,7 +20,7 @@ LIMITED = ("revolute", "prismatic")
 class Shape:
     """A link's primitive: `box` (full x, y, z), `cylinder` (radius, length along z), `sphere` (radius).
 
-    size [m]; T_link_shape (4, 4) from the shape's frame, at its middle.
+    size [m]; T_link_shape (4, 4) maps the shape's frame, at its middle, to the link.
     """
 
     link: str
@@ -55,8 +55,8 @@ class Joint:
 class UrdfFile:
     """Checked text of a URDF, with links, joints and collision shapes.
 
-    A capsule becomes a cylinder and two spheres. other_shapes: (link, tag); solid_links: with a collision or visual
-    element.
+    A capsule becomes a cylinder and two spheres. other_shapes: (link, tag) of collision elements that are neither a
+    primitive nor a mesh; solid_links: links with a collision or visual element.
     """
 
     path: Path
@@ -113,7 +113,8 @@ class UrdfFile:
     def grippers(self) -> tuple[str, ...]:
         """Joints typical of fingers.
 
-        Several prismatic joints on a rigid body, or mimics and their leaders, without another kind of joint beyond.
+        They are several prismatic joints on one rigid body, or mimics and their leaders, without another kind of
+        joint beyond them.
         """
         movable = [joint for joint in self.joints if joint.kind != "fixed"]
         leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
@@ -160,7 +161,7 @@ class UrdfFile:
 
 
 def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
-    """Read and check the URDF at `path`, or its `text`.
+    """Read and check the URDF at `path`, or `text` under that name.
 
     Raises InputError for no URDF, several roots, missing limits, a zero axis, or no movable joint (such as an
     unexpanded xacro).

@@ -40,7 +40,7 @@ PEAK = 1.875  # a minimum-jerk segment's top speed by its mean
 
 @dataclass(frozen=True, kw_only=True)
 class Capsule:
-    """Points within `radius` [m] of a segment between (3,) [m], link frame."""
+    """Points within `radius` [m] of the segment from `start` to `end` (3,) [m], link frame."""
 
     start: tuple[float, float, float]
     end: tuple[float, float, float]
@@ -210,8 +210,8 @@ def arm_spheres_yaml() -> str:
 def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64, float]]:
     """Spheres (center (3,), radius) [m], link frame, whose union contains every shape.
 
-    At steps h along a segment, radius sqrt(R^2 + (h/2)^2) covers a tube of radius R, half a bar's diagonal. Spheres
-    inside others are dropped.
+    At steps h along a segment, radius sqrt(R^2 + (h/2)^2) covers a tube of radius R. For a bar of a box, R is half
+    its section's diagonal. Spheres inside others are dropped.
     """
     spheres: list[tuple[Float64, float]] = []
     for start, end, radius in (spine for shape in shapes for spine in _spines(shape)):
@@ -272,7 +272,7 @@ def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]
 
 
 def _turned(axis: int, angle: float, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float64:
-    """The pose (4, 4) at xyz [m], about x (0) or z (2)."""
+    """The pose (4, 4) at xyz [m], rotated about x (0) or z (2)."""
     T, c, s = np.eye(4), np.cos(angle), np.sin(angle)
     i, j = ((1, 2), (2, 0), (0, 1))[axis]
     T[i, i], T[i, j], T[j, i], T[j, j] = c, -s, s, c
@@ -292,13 +292,13 @@ class Motion:
     waypoints: Float64
 
     def within(self, velocity_limit: Float64) -> "Motion":
-        """The same path, slowed to the limits (J,) [rad/s]."""
+        """The same path, slowed as a whole where a joint would exceed its limit (J,) [rad/s]."""
         speeds = PEAK * np.abs(np.diff(self.waypoints, axis=0)) / np.diff(self.times)[:, None]
         slower = max(1.0, float(np.max(speeds / velocity_limit)))
         return replace(self, times=self.times + (slower - 1.0) * (self.times - self.times[0]))
 
     def at(self, time: float) -> tuple[Float64, Float64]:
-        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest outside."""
+        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest before the first and after the last waypoint."""
         time = float(np.clip(time, self.times[0], self.times[-1]))
         index = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2))
         span = self.times[index + 1] - self.times[index]

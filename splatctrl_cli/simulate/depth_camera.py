@@ -26,7 +26,8 @@ class StereoDepth:
       That width is uniform between the two numbers, and constant within a window.
     - Background that the second imager does not see is lost: f b (1 / z_foreground - 1 / z_background) depth pixels
       left of the foreground, less those that took its depth.
-    - A share `dropout` of all pixels is lost, in blobs of two windows, as are depths out of `least` to `most` [m].
+    - A share `dropout` of all pixels is lost, in blobs twice as wide as the window, as are depths out of `least` to
+      `most` [m].
 
     width [px]: of the imagers, scaling their focal length; None: as wide as the image.
     """

@@ -109,8 +109,8 @@ class Track:
 class Primitive:
     """One solid: box, cylinder, sphere or capsule.
 
-    size [m]: full x, y, z; radius, height; radius; or radius, axis length. T_world_shape (4, 4): its pose, the first
-    if it moves. It is present while from_ns <= stamp < to_ns.
+    size [m]: full x, y, z of a box; radius, height of a cylinder; radius of a sphere; radius, axis length of a
+    capsule. T_world_shape (4, 4): its pose, the first if it moves. It is present while from_ns <= stamp < to_ns.
     """
 
     name: str
@@ -206,7 +206,7 @@ def _capsule_closest(p: Float64, radius: float, half: float) -> tuple[Float64, F
 
 
 def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) -> Float64:
-    """Parameter (R,) of the first hit of origin + t * directions, or inf."""
+    """Parameter t (R,) of the first hit of rays origin + t * directions (R, 3), inf without one."""
     T_shape_world = invert_transform(primitive.T_world_shape)
     origin = T_shape_world[:3, :3] @ origin_world + T_shape_world[:3, 3]
     directions = directions_world @ T_shape_world[:3, :3].T
@@ -249,7 +249,7 @@ def _cylinder_span(origin: Float64, directions: Float64, radius: float, half: fl
 
 
 def _capsule_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
-    """Interval of t inside a capsule: hull of its cylinder's and balls', by convexity."""
+    """Interval of t inside a capsule: from the first to the last of its cylinder and balls, because it is convex."""
     end = np.array([0.0, 0.0, half])
     spans = [
         _cylinder_span(origin, directions, radius, half),

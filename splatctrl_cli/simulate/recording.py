@@ -74,7 +74,7 @@ class RecordingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Solids (`primitives`, ending with the `temporary`), an arm's motion, and cameras, else the table's.
+    """Solids (`primitives`, ending with the `temporary`), an arm's motion, and cameras (none: the table's).
 
     has_people: images mask temporary solids.
     """
@@ -195,7 +195,7 @@ class Recording:
     def clearances(self) -> tuple[np.ndarray, Float64]:
         """Stamps (T,) int64 [ns] of joint states, and the arm's true clearance (T,) [m].
 
-        Least exact distance of moving collision spheres to the scene; unmodelled parts to 1 mm.
+        The least exact distance of moving collision spheres to the scene; unmodelled parts count to 1 mm.
         """
         states = list(self.joint_states())
         moving, spheres = self._body.moving_spheres, self._body.sphere_set

@@ -39,7 +39,7 @@ class Truth:
     unmodelled: tuple[str, ...] = ()
 
     def distance(self, points_world: Float64, stamp_ns: int) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) to all but the robot."""
+        """Signed distance (Q,) [m] of points (Q, 3) to the solids present at a stamp, without the robot."""
         return distance_to(self.primitives, points_world, stamp_ns)
 
     def closest(self, points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
@@ -65,7 +65,7 @@ def distance_along(primitives: Sequence[Primitive], points_world: Float64, stamp
 
 
 def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m] and surface point of the nearest solid (inf, NaN: none)."""
+    """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest present solid; inf and NaN without any."""
     points = np.asarray(points_world, dtype=np.float64)
     distance = np.full(len(points), np.inf)
     surface = np.full((len(points), 3), np.nan)
@@ -113,7 +113,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
 
 def load_truth(path: Path) -> Truth:
-    """Read a truth file. Raises InputError for another or damaged one."""
+    """Read a truth file. Raises InputError for a missing, another or a damaged one."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
