@@ -183,12 +183,14 @@ class ArrayFile(ABC):
         """Stamps (T,) [ns] of times in `unit_ns`, or of a dtype with its own unit."""
         _, dtype = self._checked(name, least=least, kinds="iufM")
         times = np.concatenate([np.zeros(0, dtype), *(block.reshape(-1) for block in self._blocks(name))])
+        if not np.isfinite(times).all():
+            raise InputError(
+                f"{self.path}: {name}: expected times, got NaN, NaT or infinity", remedy="check the file"
+            )
         if times.dtype.kind == "M":
             times, unit_ns = times.astype("datetime64[ns]").astype(np.int64), 1
         if times.dtype.kind in "iu":
             return np.asarray(times.astype(np.int64) * unit_ns + epoch_ns)
-        if not np.isfinite(times).all():
-            raise InputError(f"{self.path}: {name}: expected times, got NaN or infinity", remedy="check the file")
         whole = np.floor(times)
         parts = np.round((times - whole) * unit_ns).astype(np.int64)
         return np.asarray(whole.astype(np.int64) * unit_ns + parts + epoch_ns)

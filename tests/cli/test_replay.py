@@ -142,14 +142,16 @@ def test_a_start_in_collision_names_the_sphere(
     assert "got sphere hand[" in capsys.readouterr().err
 
 
-def test_a_base_that_stands_in_the_scene_is_one_line(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_base_that_stands_in_the_scene_is_noted_by_the_verdict(
+    desk: Desk, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert desk.replay(*scene_of(desk, BALL, ((-0.2, 0.0, 0.05), 0.12)), "-q") == 0
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "no joint moves" in line]
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "fixed spheres" in line]
     listed = json.loads((desk.folder / "out" / "events.json").read_text())["static_violations"]
     nearest = min(listed, key=lambda one: one["clearance"])
     assert len(listed) > 1 and nearest["clearance"] < 0
-    assert line.startswith(f"mount: {len(listed)} spheres of link0 that no joint moves within the margin")
-    assert f"down to {1e3 * nearest['clearance']:.1f} mm ({nearest['sphere']})" in line
+    assert nearest["sphere"].startswith("link0[")
+    assert f"; {len(listed)} fixed spheres stand within the margin of their surroundings" in line
 
 
 def test_logs_that_do_not_fit_are_refused(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:

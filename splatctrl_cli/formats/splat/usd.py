@@ -119,14 +119,16 @@ def _gaussians(path: Path, prim: Any, geometry: Any) -> GaussianSet:
             f"{path}: {HARMONICS}: expected {(degree + 1) ** 2} for each of {num} Gaussians, got {len(harmonics)}"
         )
     primvars = geometry.PrimvarsAPI(prim)
-    labels = primvars.GetPrimvar("label").Get() if primvars.HasPrimvar("label") else np.zeros(num)
+    labels = np.asarray(primvars.GetPrimvar("label").Get() if primvars.HasPrimvar("label") else np.zeros(num))
+    if labels.shape != (num,) or labels.dtype.kind not in "iuf" or np.any((labels < 0) | (labels > 255)):
+        raise InputError(f"{path}: label: expected a number from 0 to 255 for each of {num} Gaussians")
     return GaussianSet(
         centers=centers,
         scales=_array(path, prim, "scales", 3),
         quats_wxyz=unit_quaternions(str(path), np.roll(_array(path, prim, "orientations", 4), 1, axis=1)),
         opacities=_array(path, prim, "opacities", 1)[:, 0],
         harmonics=harmonics.reshape(num, -1, 3),
-        labels=np.asarray(labels).astype(np.uint8),
+        labels=labels.astype(np.uint8),
     )
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config.fixed import CLOUD_POINTS, CLOUD_RESIDUAL
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.image_file import MOST_PIXELS
 from splatctrl_cli.geometry import invert_transform, project, transform_from, transform_points
 from splatctrl_cli.libraries import of_extra
@@ -151,6 +151,8 @@ def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[
         height, width = points.shape[:2]
         camera = pinhole_of(points)
         if given is not None:
+            if len(given) > 4:
+                raise UsageError(f"--intrinsics: expected FX,FY,CX,CY for {path.name}, got distortion coefficients")
             fx, fy, cx, cy = given
             camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
         fits.append((residual(points, camera), is_world, camera))

@@ -4,6 +4,7 @@ import errno
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +192,11 @@ def test_what_is_no_particle_field_is_refused(tmp_path: Path) -> None:
     (tmp_path / "b.usda").write_text("no such file")
     with pytest.raises(InputError, match="no USD file that the library can open"):
         read_usd(tmp_path / "b.usda", suffix=".usda")
+    write_usd(tmp_path / "c.usda", replace(gaussian_set(2), labels=np.uint8([0, 1])), {}, suffix=".usda")
+    text = (tmp_path / "c.usda").read_text().replace("label = [0, 1]", "label = [0, 1, 1]")
+    (tmp_path / "c.usda").write_text(text)
+    with pytest.raises(InputError, match="label: expected a number from 0 to 255 for each of 2 Gaussians"):
+        read_usd(tmp_path / "c.usda", suffix=".usda")
 
 
 def test_a_field_without_scales_is_refused(tmp_path: Path) -> None:

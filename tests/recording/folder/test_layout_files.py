@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.recording.capture.capture import CaptureSource
@@ -123,6 +123,9 @@ def test_a_lone_cloud_without_viewpoint_is_its_own_world_and_that_is_said(tmp_pa
     source = open_source(tmp_path / "a.pcd")
     assert source.loss.notes[1].startswith("VIEWPOINT is the origin")
     assert len(list(source.records())) == 1
+    lens = SourceOptions(intrinsics={"camera": (10.0, 11.0, 4.0, 3.0, 0.1, 0.0, 0.0, 0.0)})
+    with pytest.raises(UsageError, match=r"--intrinsics: expected FX,FY,CX,CY for a\.pcd, got distortion"):
+        open_source(tmp_path / "a.pcd", lens)
 
 
 def test_clouds_without_viewpoints_ask_for_poses(tmp_path: Path) -> None:

@@ -218,8 +218,9 @@ def test_an_npz_without_the_array_lists_those_there(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", t=np.arange(3.0), q=np.zeros((3, 2)))
     path = described(tmp_path, file="run.npz", position=["angles"])
     assert "'angles': expected an array of numbers, got none; arrays there: t, q" in refusal(path)
-    np.savez(tmp_path / "run.npz", t=np.array([0.0, np.nan, 1.0]), q=np.zeros((3, 2)))
-    assert "t: expected times, got NaN" in refusal(described(tmp_path, file="run.npz", position=["q"]))
+    for t in (np.array([0.0, np.nan, 1.0]), np.array([0, "NaT", 2], "datetime64[ns]")):
+        np.savez(tmp_path / "run.npz", t=t, q=np.zeros((3, 2)))
+        assert "t: expected times, got NaN, NaT" in refusal(described(tmp_path, file="run.npz", position=["q"]))
     np.savez(tmp_path / "run.npz", t=np.zeros(0), q=np.zeros((0, 2)))
     assert "q: expected rows, got none; record it again" in refusal(
         described(tmp_path, file="run.npz", position=["q"])
