@@ -45,14 +45,14 @@ class Sight:
 
     @property
     def age_s(self) -> float:
-        """Age [s] of the image."""
+        """Age [s] of the image at the moment."""
         return (self.moment.stamp_ns - self.frame.stamp_ns) * 1e-9
 
 
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
-    """Indices of at most `num` states with least clearance (T,), ascending.
+    """Indices of at most `num` states with least clearance (T,), the least first.
 
-    Each is the least within `APART`, so that an event counts once. NaN does not count.
+    Each is the least within `APART` [s] on either side, so that an event counts once. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])
@@ -71,7 +71,7 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
 
 
 def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
-    """The newest image up to each moment that best shows its worst sphere, or None.
+    """Each moment's image: of the cameras' newest up to then, the one that best shows its worst sphere, or None.
 
     One pass over frames (by stamp), one kept per camera.
     """
