@@ -74,7 +74,10 @@ class ScoreProtocol:
         return not (self.scored or self.every)
 
     def split(self, numbers: Sequence[int], where: str) -> Split:
-        """Split views `numbers` of scan `where`; others are left out. Raises InputError for missing ones."""
+        """Split the views `numbers` of a scan, named `where` in errors; unnamed views are left out.
+
+        Raises InputError if named views are missing, or if none train or are scored.
+        """
         if self.scores_training:
             return Split(training=tuple(numbers), scored=tuple(numbers))
         if self.every:

@@ -91,7 +91,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 
 def draw_sight(path: Path, sight: Sight) -> None:
-    """Write the image with silhouettes, the worst bold, a line to its obstacle, and caption."""
+    """Write the image with the spheres' silhouettes, the worst bold, a line to its obstacle, and the caption."""
     moment, frame = sight.moment, sight.frame
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)

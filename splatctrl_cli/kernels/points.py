@@ -64,7 +64,7 @@ class Cubes:
         return len(self._native)
 
     def members(self) -> tuple[NDArray[np.int32], Int64]:
-        """Return cubes (N,) of points, first points (K,) of cubes."""
+        """Return the cube (N,) of each point, and the first point (K,) of each cube."""
         of_point, first = np.empty(len(self._points), np.int32), np.empty(len(self), np.int64)
         self._native.members(of_point, first, self._num_threads)
         return of_point, first

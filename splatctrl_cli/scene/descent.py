@@ -27,8 +27,8 @@ from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
 class Descent:
     """Optimiser of a buffer's M splats, with noise drawn from seed and iteration.
 
-    background: colour behind the splats, None until chosen. heard: called after each iteration. device: it does
-    `run` and `rendering`, which then raise DeviceError if it fails; None: the processor does.
+    background: colour behind the splats, None until chosen. heard: called after each iteration. device: computes
+    `run` and `rendering`, which raise DeviceError if it fails; None: the processor computes them.
     """
 
     def __init__(

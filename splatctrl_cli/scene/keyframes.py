@@ -105,8 +105,8 @@ def kept_radii(
 ) -> Float32:
     """Radii (N,) [m] that keep spheres within measured depth, shrunk to no less than `least` [m].
 
-    A sphere shrinks while a point of its edge floats by `tolerance` [m] before depth around its pixel in some view.
-    So it does while its nearest point floats before the centre pixel's depth.
+    A sphere shrinks while a point of its edge floats by more than `tolerance` [m] before depth around its pixel in
+    some view. So it does while its nearest point floats before the centre pixel's depth.
     """
     cameras = [view.camera for view in views]
     depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]

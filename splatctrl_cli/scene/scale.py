@@ -88,7 +88,7 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
 
 
 def _block_side(depth: Float32) -> int:
-    """Side of a block [px]: a share 1 / `NOISE_BLOCKS` of the width, at least `NOISE_LEAST_SIDE`, as neighbours share noise."""
+    """Side of a block [px]: 1 / `NOISE_BLOCKS` of the width, at least `NOISE_LEAST_SIDE`: neighbours share noise."""
     return int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
 
 

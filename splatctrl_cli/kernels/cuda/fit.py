@@ -75,7 +75,7 @@ def bytes_needed(
 class DeviceFit:
     """Optimiser of N splats on a device, for views of `sizes` (H, W) at first.
 
-    Raises OutOfMemory, with what would fit.
+    Raises OutOfMemory, which names what would fit, if there is no room.
     """
 
     def __init__(

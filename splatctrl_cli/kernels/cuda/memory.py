@@ -34,7 +34,7 @@ class Launch:
 
 
 class Graph(Protocol):
-    """Launches in order."""
+    """Launches that run one after the other."""
 
     def run(self, num_times: int = 1) -> None:
         """Queue the launches `num_times`."""
