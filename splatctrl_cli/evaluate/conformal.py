@@ -37,7 +37,7 @@ class ConformalBound:
 def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None:
     """The bound of misses (T,) [m], one per frame set by time, NaN for none.
 
-    None below FEWEST_STRETCHES stretches. Their number limits `confidence`.
+    None below FEWEST_STRETCHES stretches. `confidence` is lowered to what their number allows.
     """
     if not np.isfinite(misses).any():
         return None
@@ -87,7 +87,7 @@ def autocorrelation_time(misses: Float64) -> int:
 
 
 def stretches(num_sets: int, length: int) -> Index:
-    """The stretch (T,) of each set: `length` sets, starting `length` after the last one's end.
+    """The stretch (T,) of each set: `length` sets, which begin `length` sets after the last set of the previous one.
 
     Other sets count to the previous stretch, which only raises its score: the bound still holds.
     """

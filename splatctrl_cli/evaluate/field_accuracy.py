@@ -45,7 +45,7 @@ class OverEstimate:
 
     @property
     def holds(self) -> bool:
-        """True if no cell, of any, exceeds the allowance."""
+        """True if there are cells, and none exceeds the allowance."""
         return self.count > 0 and self.count_beyond == 0
 
 
@@ -220,7 +220,7 @@ REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
 @dataclass(frozen=True, kw_only=True)
 class TrueCells:
-    """Q sampled cells, world: centres, `FIELDS`, true distance (Q,) [m], nearest surface point."""
+    """Q sampled cells, world: centres and nearest surface points (Q, 3) [m], `FIELDS` and true distance (Q,) [m]."""
 
     points: Float64
     fields: Mapping[str, Float64]
@@ -267,8 +267,9 @@ def compare_with_truth(
 ) -> TruthComparison:
     """Accuracy of `FIELDS`, and reliability of probabilities, where `frames` saw the surface.
 
-    name: of the truth, for errors. workspace: where the scene keeps splats, None if unknown. probabilities: functions
-    of points (Q, 3) and sdf (Q,) [m]. Raises NotEvaluableError with no cell near an object.
+    name: of the truth, for errors. workspace: where the scene keeps splats, None if unknown. median_radius [m]: of
+    the splats. probabilities: functions of points (Q, 3) and sdf (Q,) [m]. Raises NotEvaluableError with no cell near
+    an object.
     """
     sdf, distance = cells.fields["sdf"], cells.distance
     is_blank = ~np.isfinite(sdf)
@@ -338,8 +339,8 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     """Errors of the grid's distances at cells sampled by `seed`, against the exact mesh distance.
 
     The mesh is in the grid's frame [m]. Inside a closed mesh, where the field is a shell, nothing is compared; an
-    open mesh's unsigned distance is the truth on both sides. `seen` is empty. Raises InputError for no mesh,
-    NotEvaluableError with no cell near it.
+    open mesh's unsigned distance is the truth on both sides. `seen` is empty. Raises InputError for a file that is no
+    mesh, NotEvaluableError with no cell near it.
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)

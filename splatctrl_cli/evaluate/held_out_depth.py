@@ -56,9 +56,9 @@ def cloud_score(
 
     As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; others count
     only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference. completeness:
-    the whole reference to the surface. chamfer: the mean of both. completeness_seen: of points that a training camera
-    saw (R,). nan without points. unit: metres per unit of the reference's file, for messages. Raises
-    NotEvaluableError without near points, or if another unit fits.
+    the whole reference to the surface. chamfer: the mean of both. completeness_seen: of reference points that a
+    training camera saw, by seen (R,). nan without points. unit: metres per unit of the reference's file, for
+    messages. Raises NotEvaluableError without near points, or if another unit fits.
     """
     if not max_distance > 0:
         raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
@@ -123,8 +123,8 @@ def spaced(points: Float64, spacing: float) -> Float64:
     """Points (P, 3), visited in random order, farther than `spacing` [m] from all kept before.
 
     As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts; one point per cube
-    would improve accuracy by a tenth. Cubes of half the edge are merged first (the whole edge above 6 million
-    points).
+    would improve accuracy by a tenth. Points in one cube of half the edge are merged first (of the whole edge, if
+    more than 6 million points are left).
     """
     _check_spacing(spacing)
     some = thinned(points, spacing / 2)
@@ -240,8 +240,8 @@ def compare_with_held_out_depth(
     """Errors of interpolated distances on `max_points` held-out rays, sampled by `seed`.
 
     frames: of held-out cameras, at the bake's stamp, in the grid's frame. counted: per frame (H, W), False on objects
-    that the field leaves out (the robot). Raises InputError for masks that do not fit, NotEvaluableError without a
-    measured point in the grid.
+    that the field leaves out (the robot); None: all count. Raises InputError for masks that do not fit,
+    NotEvaluableError without a measured point in the grid.
     """
     distances = grid_distances(grid)
     upper = grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1)

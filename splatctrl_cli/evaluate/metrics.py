@@ -96,7 +96,7 @@ class Metric(Generic[R]):
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """A column (T,) folded to a value; accumulate: up to each state, if defined."""
+    """A column (T,) folded to a value; accumulate: up to each state, from `start` on, None if undefined."""
 
     of: Callable[[Float64], float | None]
     start: float = np.nan
@@ -115,7 +115,7 @@ def least(values: Float64) -> float | None:
 
 
 def lowest(values: Float64) -> float | None:
-    """The least value, perhaps infinite, without NaN; or None."""
+    """The least value that is not NaN, perhaps infinite; None without one."""
     return _of_known(np.min, values)
 
 

@@ -50,8 +50,10 @@ class ScoreProtocol:
     """A named scoring protocol.
 
     mask: pixels of the published figure: of a mask if given, of the object (mask required), or with reference depth.
-    fill: colour outside the mask in the published SSIM; is_zero_padded: its border without a mask. size [px], scans:
-    as published. Without training and scored views, a rule splits.
+    fill: colour outside the mask in the published SSIM; is_zero_padded: without a mask, that SSIM has zeros beyond
+    the border. size (width, height) [px], scans: as published. Without scored views, every `every`-th view from
+    `first` on is scored, or with `every` 0 all views, which also train. Without training views, those not scored
+    train.
     """
 
     name: str
@@ -72,7 +74,10 @@ class ScoreProtocol:
         return not (self.scored or self.every)
 
     def split(self, numbers: Sequence[int], where: str) -> Split:
-        """Split views `numbers` of scan `where`; others are left out. Raises InputError for missing ones."""
+        """Split the views `numbers` of a scan, named `where` in errors; unnamed views are left out.
+
+        Raises InputError if named views are missing, or if none train or are scored.
+        """
         if self.scores_training:
             return Split(training=tuple(numbers), scored=tuple(numbers))
         if self.every:
@@ -98,7 +103,7 @@ class ScoreProtocol:
 
 
 def _regnerf(num_training: int) -> ScoreProtocol:
-    """N of nine input views train, 25 are scored, 15 left out.
+    """The first N of nine input views train, 25 are scored, the others left out.
 
     google-research/google-research, regnerf/internal/datasets.py, class DTU, split 'pixelnerf'; figures over the
     object (regnerf/eval.py), 400x300 by ``factor = 4`` of regnerf/configs.
@@ -144,7 +149,7 @@ PROTOCOLS = {protocol.name: protocol for protocol in _FIXED}
 
 
 def score_protocol(name: str) -> ScoreProtocol:
-    """The protocol of a name or ``holdout:`` rule, else UsageError."""
+    """The protocol of a name or ``holdout:`` rule. Raises UsageError, with the choices, for another."""
     if name.startswith("holdout:"):
         return _holdout(name)
     if name in PROTOCOLS:
@@ -197,11 +202,11 @@ class ObservedSpace:
     plane: Float64
 
     def near(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] near the box, to be compared."""
+        """(Q,) True for points (Q, 3) [m] in or near the box: only these are compared."""
         return np.asarray(((points >= self.low - BEFORE) & (points < self.high + BEYOND)).all(axis=1))
 
     def observed(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] that count in the accuracy."""
+        """(Q,) True for points (Q, 3) [m] in observed cells, which count in the accuracy."""
         cells = np.rint((points - self.low) / self.resolution).astype(np.int64)
         inside = np.flatnonzero(((cells >= 0) & (cells < self.is_observed.shape)).all(axis=1))
         observed = np.zeros(len(points), np.bool_)
@@ -209,7 +214,7 @@ class ObservedSpace:
         return observed
 
     def above(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] that count in the completeness."""
+        """(Q,) True for points (Q, 3) [m] above the ground, which count in the completeness."""
         return np.asarray(points @ self.plane[:3] + self.plane[3] > 0)
 
 

@@ -78,7 +78,7 @@ CORRECTABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixe
 
 @dataclass(frozen=True, kw_only=True)
 class ViewScore:
-    """One view: valid_share has reference depth; `all`, `seen` and `masked` are regions.
+    """One view: valid_share of its pixels have reference depth; `all`, `seen` and `masked` are regions.
 
     ssim_published: filled outside a mask; without one, if the protocol has it. size: width, height [px]. corrected:
     with corrected pose, exposure and depth bend.
@@ -137,8 +137,8 @@ def score_view(
     """Score a rendering against `frame`, by `PROTOCOL`.
 
     color (H, W, 3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen, mask (H, W):
-    pixels seen in training, and of the mask rule. The published SSIM has grey `fill` outside the mask, or
-    is_zero_padded without one. Invalid pixels of `frame` are in no region.
+    pixels seen in training, and of the mask rule. The published SSIM has grey `fill` outside the mask; without a
+    mask, it exists only if is_zero_padded, with zeros beyond the border. Invalid pixels of `frame` are in no region.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
@@ -178,7 +178,7 @@ def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float
     """Share of the splats' mass with centres in voxels observed free; nan without mass.
 
     Mass is opacity times squared radius, what a splat can cover. The robot's are left out, since they cross free
-    space. free_below: a free voxel's occupancy.
+    space. free_below: occupancy below which a seen voxel is free.
     """
     mass = np.where(splats.labels == Label.ROBOT, 0.0, splats.opacities * splats.radii.astype(np.float64) ** 2)
     is_free = (grid.num_updates > 0) & (grid.log_odds < math.log(free_below / (1.0 - free_below)))
@@ -189,9 +189,9 @@ def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float
 
 
 def in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
-    """Share of masked pixels whose `depth` is nearer than the reference by IN_FRONT.
+    """Share of masked pixels with both depths whose `depth` is nearer by more than IN_FRONT.
 
-    nan without a pixel with both depths.
+    nan without such pixels.
     """
     both = mask & (depth > 0) & (reference > 0)
     return float(np.mean(depth[both] < reference[both] - IN_FRONT)) if both.any() else math.nan

@@ -299,7 +299,7 @@ def _holds(comparison: str, bound: float, value: float) -> bool:
 
 
 def gate(text: str) -> str:
-    """`text` itself, for argparse, else UsageError."""
+    """`text` itself, for argparse. Raises UsageError unless it is a requirement."""
     parse_gate(text)
     return text
 

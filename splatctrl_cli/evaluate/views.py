@@ -19,8 +19,8 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, R
 class View:
     """A frame to score, its name, and the training frames known at its time.
 
-    The name is the camera and a number: within the camera's frames with a clock, among all views without, or the
-    stamp.
+    The name is the camera and a number: within the camera's frames with a clock, among all views without, or their
+    stamp if it is the views' own number.
     """
 
     name: str
@@ -118,7 +118,7 @@ def _agrees(points_world: NDArray[np.floating], frame: RgbdFrame, tolerance: flo
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
-    """Indices (K,) of points (Q, 3) in the image, their depth, and the measured."""
+    """Indices (K,) of points (Q, 3) in the image, their own depth (K,) [m], and the depth measured there (K,) [m]."""
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
     landing = np.flatnonzero(points_camera[:, 2] > 1e-6)
     pixels = np.floor(project(frame.intrinsics, points_camera[landing]) + 0.5)
@@ -147,7 +147,8 @@ class DepthErrors:
 def psnr(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None) -> float:
     """Peak signal-to-noise ratio [dB] for a peak of 1: ``-10 log10(mean squared error)``.
 
-    image, reference (H, W, 3) in [0, 1]; mask (H, W). inf for identical images, nan for an empty mask.
+    image, reference (H, W, 3) in [0, 1]; mask (H, W): pixels that count, None = all. inf for identical images, nan
+    for an empty mask.
     """
     squared = np.square(image.astype(np.float64) - reference)
     selected = squared if mask is None else squared[mask]
@@ -162,9 +163,9 @@ def ssim_map(
 ) -> Float64:
     """Structural similarity (H, W, 3) of images in [0, 1] (Wang et al. 2004).
 
-    Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments. The border is mirrored with its edge
-    pixel. Zero-padding, as in 3D Gaussian splatting (graphdeco-inria/gaussian-splatting, utils/loss_utils.py), hides
-    errors there.
+    Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments. The border is mirrored, with its
+    edge pixel repeated. Zero-padding, as in 3D Gaussian splatting (graphdeco-inria/gaussian-splatting,
+    utils/loss_utils.py), hides errors there.
     """
     x, y = image.astype(np.float64), np.asarray(reference, dtype=np.float64)
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (

@@ -45,14 +45,14 @@ class Sight:
 
     @property
     def age_s(self) -> float:
-        """Age [s] of the image."""
+        """Age [s] of the image at the moment."""
         return (self.moment.stamp_ns - self.frame.stamp_ns) * 1e-9
 
 
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
-    """Indices of at most `num` states with least clearance (T,), ascending.
+    """Indices of at most `num` states with least clearance (T,), the least first.
 
-    Each is the least within `APART`, so that an event counts once. NaN does not count.
+    Each is the least within `APART` [s] on either side, so that an event counts once. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])
@@ -71,7 +71,7 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
 
 
 def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
-    """The newest image up to each moment that best shows its worst sphere, or None.
+    """Each moment's image: of the cameras' newest up to then, the one that best shows its worst sphere, or None.
 
     One pass over frames (by stamp), one kept per camera.
     """
@@ -91,7 +91,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 
 def draw_sight(path: Path, sight: Sight) -> None:
-    """Write the image with silhouettes, the worst bold, a line to its obstacle, and caption."""
+    """Write the image with the spheres' silhouettes, the worst bold, a line to its obstacle, and the caption."""
     moment, frame = sight.moment, sight.frame
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)

@@ -41,8 +41,8 @@ class Baker:
     """Channels of a field over splats at the cells of `layout`.
 
     The cut into planes and the thread count change no bit. counts: ``se_without_value``, cells with exact distance
-    instead of the kernel's; ``se_over_estimates``, those where it exceeds the exact one by `RESOLUTION`; likewise
-    gpdf.
+    instead of the kernel's; ``se_over_estimates``, those where it exceeds the exact one by more than
+    `RESOLUTION`; likewise for gpdf.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Baker:
         threads: int = 0,
         device: Memory | None = None,
     ) -> None:
-        """device: a card to use, without masks.
+        """device: a card that computes instead of the processor, without masks.
 
         Raises as `Spheres.of`; UsageError for unknown channels, or without sdf.
         """

@@ -1,6 +1,6 @@
 """Splats of a field as spheres, checked and clustered once.
 
-A space-filling curve sorts points into clusters of 16, these into groups of 16, boxed.
+A space-filling curve sorts points into clusters of 16, and these into groups of 16, each with a box.
 """
 
 from dataclasses import dataclass
@@ -161,7 +161,7 @@ def shaped_points(points: NDArray[np.floating]) -> Float64:
 
 
 def not_finite(points: Float64) -> InputError:
-    """Error for the first point (Q, 3) not finite."""
+    """Error that names the first point (Q, 3) that is not finite."""
     i = int(np.argmax(~np.isfinite(points).all(axis=1)))
     return InputError(f"query point {i}: expected finite coordinates, got {points[i].tolist()}")
 

@@ -19,7 +19,10 @@ from splatctrl_cli.records import DistanceField, Float32, Float64
 
 
 class SphereField:
-    """Exact distance to a union of spheres, ``hard(x) = min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz."""
+    """Exact distance to a union of spheres, ``hard(x) = min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz.
+
+    Inside, it is minus the depth in the deepest sphere, not the distance to the union's surface.
+    """
 
     def __init__(self, centers: ArrayLike, radii: ArrayLike, *, threads: int = 1) -> None:
         """centers (N, 3) [m], world; radii (N,) [m]. Raises as `Spheres.of`."""
@@ -44,7 +47,7 @@ class SphereField:
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
-        """points (Q, 3) [m] -> index (Q,) of the sphere."""
+        """points (Q, 3) [m] -> index (Q,) of the sphere that gives the distance."""
         local = self.spheres.points.relative(checked_points(points))
         entry = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)[2]
         return self.spheres.points.source[entry]
@@ -89,7 +92,7 @@ class LogSumExpField(ABC):
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return `query_raw`, exact where undefined."""
+        """Distance and gradient as in `query_raw`, or the exact ones where those are undefined."""
         return or_exact(self.query_raw(points), self.spheres, points)
 
 
@@ -225,7 +228,7 @@ class SeField(LogSumExpField):
 
 
 class SafeField:
-    """The smaller of the exact distance and a kernel field.
+    """The smaller of the exact distance and a kernel field; exact where the kernel field is undefined.
 
     Row-sum lumping over-estimates the clearance to a sparse object before a dense one; the minimum never exceeds
     the exact distance.
@@ -294,7 +297,7 @@ def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Di
 
 
 def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> DistanceField:
-    """Make the field that ``config.distance`` names."""
+    """Make the field that ``config.distance`` names, over spheres (N, 3), (N,) [m]. Raises as `Spheres.of`."""
     return field_over(Spheres.of(centers, radii), config, threads=threads)
 
 
@@ -302,7 +305,8 @@ def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, thr
 class March:
     """Result of a march from Q points.
 
-    distance (Q,) [m]: walked, plus rest; hit (Q, 3) [m]; rest (Q,) [m]: field there.
+    hit (Q, 3) [m]: points reached; rest (Q,) [m]: what the field reads there; distance (Q,) [m]: length walked plus
+    rest.
     """
 
     distance: Float64
@@ -313,9 +317,10 @@ class March:
 def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps: int = MARCH_STEPS) -> March:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
-    Steps follow the local gradient: with a fixed direction, a walk can pass an object by. They are as long as the
-    field reads, at most the `exact` distance, and so cross no sphere. The Matern field's zero level stands before
-    the spheres (`health.planar_zero_level`). Points at or behind it stay. Raises UsageError for less than one step.
+    Each of the `steps` goes against the local gradient: with a fixed direction, a walk can pass an object by. It is
+    as long as the field reads, at most the `exact` distance, and so crosses no sphere. The Matern field's zero level
+    stands before the spheres (`health.planar_zero_level`). Points at or behind it stay. Raises UsageError for less
+    than one step.
     """
     if steps < 1:
         raise UsageError(f"marching: expected at least 1 step, got {steps}")

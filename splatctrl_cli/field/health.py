@@ -1,4 +1,4 @@
-"""Health of a splat set for fields."""
+"""Checks that splats are dense and thick enough for a distance field."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
@@ -14,8 +14,8 @@ from splatctrl_cli.config.fixed import MAX_RADIUS_SPREAD, ROUGH_LENGTH
 class FieldHealth:
     """Ratios that decide a field's quality, with warnings.
 
-    spacing: median distance to the nearest other splat [m], 0 for one; radius: median [m]; planar_zero_level:
-    height [m] where a dense plane's kernel field is zero.
+    spacing: median distance to the nearest other splat [m], 0 for a single splat; radius: median [m];
+    planar_zero_level: height [m] where a dense plane's kernel field is zero.
     """
 
     spacing: float
@@ -34,7 +34,7 @@ class FieldHealth:
 def field_health(
     centers: NDArray[np.floating], radii: NDArray[np.floating], length: float, *, kernels: Collection[str]
 ) -> FieldHealth:
-    """Health of splats (N, 3), (N,) [m] for kernels (se, gpdf)."""
+    """Health of splats (N, 3), (N,) [m] for kernels (se, gpdf) of this length scale [m]."""
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
     return FieldHealth(
@@ -93,7 +93,7 @@ def _set_warnings(
 
 
 def median_spacing(centers: NDArray[np.floating]) -> float:
-    """Median distance from a splat (N, 3) [m] to its nearest other; 0 for one."""
+    """Median distance from a splat (N, 3) [m] to the nearest other one; 0 for fewer than two."""
     if len(centers) < 2:
         return 0.0
     points = np.asarray(centers, dtype=np.float64)

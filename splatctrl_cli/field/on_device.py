@@ -44,7 +44,7 @@ class OnDevice:
         return self._asked(points).distance.astype(np.float64) if len(points) else np.zeros(0)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
-        """points (Q, 3) [m] -> index (Q,) of the exact distance's sphere."""
+        """points (Q, 3) [m] -> index (Q,) of the sphere that gives the exact distance."""
         if not len(points):
             return np.zeros(0, np.int64)
         found = self._asked(points, "entry")

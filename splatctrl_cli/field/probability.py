@@ -38,7 +38,7 @@ class CollisionProbability(Protocol):
 class CalibratedProbability:
     """``Phi((mean - clearance) / sigma)``, with the field's measured error [m].
 
-    mean: what it reads too much; sigma: standard deviation.
+    mean: what it reads too much on average; sigma: the standard deviation.
     """
 
     sigma: float

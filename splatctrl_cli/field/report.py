@@ -21,7 +21,8 @@ NUM_BINS = 41  # about 0 to 2; the last one includes longer ones
 class GradientLengths:
     """Gradient lengths: 1 for a distance (Eikonal equation), less where a kernel field is flat.
 
-    histogram: bin k is within half a `bin_width` of k times that; share_near_one: within 0.05.
+    histogram: bin k counts lengths within half a `bin_width` of k times that, the last bin also longer ones;
+    share_near_one: within 0.05 of 1.
     """
 
     histogram: tuple[int, ...]
@@ -33,7 +34,7 @@ class GradientLengths:
 
 @dataclass(frozen=True, kw_only=True)
 class Excess:
-    """Cells where a kernel field exceeds the exact distance."""
+    """Number and share of cells where a kernel field exceeds the exact distance, and by how much at most [m]."""
 
     count: int
     share: float
@@ -44,8 +45,8 @@ class Excess:
 class GridStatistics:
     """Statistics of a grid; None or empty without channels for it.
 
-    num_blank: sdf NaN; num_inside: sdf <= 0; lowest, highest: of sdf [m]; observed: cells by state; hard_share: sdf
-    is exact; excess: by kernel field.
+    num_blank: sdf NaN; num_inside: sdf <= 0; lowest, highest: of sdf [m]; observed: cells by state; hard_share: of
+    cells whose sdf is exact; excess: by kernel field.
     """
 
     num_cells: int

@@ -54,7 +54,10 @@ def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
 
 
 class UnknownSpace:
-    """`apply_unknown` for slabs, from never-seen cells found before the bake."""
+    """`apply_unknown` for slabs, from never-seen cells found before the bake.
+
+    num_never_seen and num_changed count the cells treated so far.
+    """
 
     def __init__(
         self, layout: GridLayout, config: FieldConfig, occupancy: OccupancyGrid | None, thresholds: OccupancyConfig

@@ -36,8 +36,9 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
     """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
     Each centre spreads one unit over eight nodes (trilinear), these are convolved, and it reads them back. Its own
-    term becomes k(0) = 1. That blurs by h^2 / 3 per axis; convolving with ``2 k - (mean of k at the six
-    neighbours)`` undoes it to second order. Raises UsageError for more than `MAX_BLOCKS` blocks.
+    term becomes k(0) = 1. Spreading and reading blur by h^2 / 3 per axis (h: node spacing); convolving with ``2 k -
+    (mean of k at the six neighbours)`` undoes it to second order. Raises UsageError for more than `MAX_BLOCKS`
+    blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
     nodes = (centers - centers.min(axis=0)) / voxel
@@ -137,7 +138,7 @@ BYTES_PER_PAIR = 44  # of the matrix and its pairs; 40 were measured
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """M of eq. 12 (N,) as ``scaled exp(log_scale)``; residual: relative to its group's largest y."""
+    """M of eq. 12 (N,) as ``scaled exp(log_scale)``; residual: the largest, relative to its group's largest y."""
 
     scaled: Float64
     log_scale: Float64
@@ -172,7 +173,7 @@ def solve_process(
 
 
 def conjugate_gradients(matrix: "csr_array", values: Float64, tolerance: float) -> tuple[Float64, int, float]:
-    """x (N,) with ``max |A x - y| <= tolerance``, the iterations, and that residual.
+    """x (N,) with ``max |A x - y| <= 2 tolerance``, the iterations, and that residual.
 
     A unit diagonal needs no preconditioner. Raises NotEvaluableError if A is not positive definite or after
     `CG_ITERATIONS`.
@@ -281,7 +282,7 @@ class Weights:
     """w (N,) as ``sign exp(log_size)``: the occupancy is ``o(x) = sum_i w_i k_d(-r_i) k(x, p_i)``.
 
     The Gaussian kernel has no ``k_d(-r_i)``: radii enter by the terms' shares. sign (N,) +-1, None if all positive;
-    num_iterations, residual: of a solver.
+    num_iterations, residual: of a solver, None without one.
     """
 
     log_size: Float64

@@ -42,7 +42,7 @@ class Chain:
         return centers, jacobians
 
     def frame(self, q: Float64, body: int, in_body: Float64) -> tuple[Float64, Float64]:
-        """World pose (3, 4) of a frame `in_body` (3, 4), Jacobian (6, J), linear first."""
+        """World pose (3, 4) of a frame at `in_body` (3, 4) in `body`, and its Jacobian (6, J), linear first."""
         pose, jacobian = np.empty((3, 4)), np.empty((6, len(q)))
         native.chain_frame(*self._arrays, np.ascontiguousarray(q), body, in_body, pose, jacobian)
         return pose, jacobian
@@ -55,7 +55,7 @@ class Chain:
 def pair_gaps(centers: Float64, radii: Float64, pairs: Int64) -> tuple[Float64, Float64]:
     """Gaps (P,) [m] of sphere surfaces, unit directions (P, 3) from second to first centre.
 
-    centers (S, 3), radii (S,) [m]; pairs (P, 2). Zero direction for coincident centres.
+    centers (S, 3), radii (S,) [m]; pairs (P, 2). A direction is zero where the centres coincide.
     """
     gap, direction = np.empty(len(pairs)), np.empty((len(pairs), 3))
     native.pair_gaps(np.ascontiguousarray(centers), radii, pairs, gap, direction)

@@ -53,8 +53,8 @@ class Offsets:
 class GridSpan:
     """The cells centred at ``origin + voxel (i, j, k)``, i in [first, last), of a grid.
 
-    origin (3,) [m], in the spheres' frame; `first`, `last`: multiples of `BLOCK`, or the grid's end; mask (blocks
-    of the grid): zero where a block keeps its values.
+    origin (3,) [m], in the spheres' frame; `first`: a multiple of `BLOCK`; `last`: another, or the grid's end; mask
+    (blocks of the whole grid): zero where a block keeps its values.
     """
 
     origin: Float64
@@ -81,7 +81,7 @@ class LogSumExp:
     """The terms of a kernel field.
 
     offsets: for culling; exact (16 C,): offsets [m] of Matern, log weights of the Gaussian; radii (16 C,) [m];
-    tolerance: share of the terms left out of Matern, or rise [m] of the Gaussian.
+    tolerance: of terms left out, their largest share of Matern's sum, or the largest rise [m] of the Gaussian.
     """
 
     is_matern: bool
@@ -115,8 +115,8 @@ def matern(
 ) -> tuple[Float32, Float32]:
     """``-l log sum_i c_i exp(-(|x - p_i| - o_i) / l)`` (Q,) and its gradient (Q, 3).
 
-    sign (16 C,): c, 1 if None. Without signs, truncation of a share raises the result by at most ``-l log(1 -
-    truncation)``. NaN where the sum is not positive.
+    sign (16 C,): c, 1 if None. Terms left out are at most the share `truncation` of the sum of sizes: without signs,
+    the result rises by at most ``-l log(1 - truncation)``. NaN where the sum is not positive.
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     native.field_matern(

@@ -86,8 +86,9 @@ class EdgeRoom:
     ) -> tuple[Float64, Int64]:
         """Share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,).
 
-        A row that less `rounding` is below `contact` [m] collides; one that an edge does not move loses `still`
-        [m]. The proof stops `give_up` [rad] before a collision. With only_whole, an edge not all free has share 0.
+        A row whose value less `rounding` is below `contact` [m] collides; one that an edge does not move loses
+        `still` [m] over it. Less than `give_up` [rad] before a collision stays unproved. With only_whole, an edge
+        that is not all free has share 0.
         """
         share, num_checks = np.empty(len(start)), np.empty(len(start), np.int64)
         native.advance_edges(

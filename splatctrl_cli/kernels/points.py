@@ -64,7 +64,7 @@ class Cubes:
         return len(self._native)
 
     def members(self) -> tuple[NDArray[np.int32], Int64]:
-        """Return cubes (N,) of points, first points (K,) of cubes."""
+        """Return the cube (N,) of each point, and the first point (K,) of each cube."""
         of_point, first = np.empty(len(self._points), np.int32), np.empty(len(self), np.int64)
         self._native.members(of_point, first, self._num_threads)
         return of_point, first
@@ -91,7 +91,7 @@ class SplatTree:
         self._native: Any = native.SplatTree(np.ascontiguousarray(centers), np.ascontiguousarray(radii))
 
     def are_further(self, points: NDArray[np.floating], gap: float) -> Bool:
-        """Points (K, 3) further than `gap` [m] from the eight balls with nearest centres."""
+        """Points (K, 3) further than `gap` [m] from each of the eight balls with the nearest centres."""
         out = np.empty(len(points), np.uint8)
         self._native.are_further(np.ascontiguousarray(points, np.float64), gap, out, self._num_threads)
         return out.view(bool)

@@ -38,7 +38,7 @@ class TriangleTree:
     def gaps(
         self, poses: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
     ) -> tuple[Float64, Int64]:
-        """Signed gap (T,) [m] and number of the nearest ball, negative inside.
+        """Signed gap (T,) [m] from the nearest ball to the triangles, negative inside, and that ball's number (T,).
 
         Balls (N, 3), (N,) [m]; poses (T, 4, 4): from their frame to the triangles'. Infinite and -1 without any.
         """

@@ -1,4 +1,4 @@
-"""The rasteriser as a torch function: for other losses, and as oracle of the fused optimiser.
+"""The rasteriser as a torch function: for custom losses, and as the oracle of the fused optimiser.
 
 The fitter needs no torch.
 """

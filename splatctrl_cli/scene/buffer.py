@@ -23,7 +23,7 @@ class Seeds(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """Numbers of seeds in fresh slots, reused slots, and none."""
+    """Number of seeds that got a fresh slot, a reused slot, or none."""
 
     added: int = 0
     relocated: int = 0
@@ -78,7 +78,10 @@ class SplatBuffer:
         self.parameters[slots, LOG_RADIUS] = np.log(radius)
 
     def fill(self, seeds: Seeds, opacity: float, keep_free: int = 0, label: Label = Label.OBJECT) -> Filled:
-        """Put seeds into dead slots, in order, except the last `keep_free`; the rest are unmet."""
+        """Put seeds into dead slots, in slot order, with `opacity` and `label`.
+
+        The last `keep_free` dead slots stay free. Seeds without a slot are unmet.
+        """
         dead = np.flatnonzero(~self.is_alive)
         slots = dead[: max(min(len(seeds), len(dead) - keep_free), 0)]
         count = len(slots)
@@ -96,7 +99,7 @@ class SplatBuffer:
     def copy(self, sources: NDArray[np.intp], opacities: Float64, radii: Float64) -> int:
         """Copy slots `sources` (K,), with repetitions, into dead slots as available; return how many.
 
-        opacities (M,), radii (M,) [m]: new ones of sources and copies. Labels are copied; moments restart.
+        opacities (M,), radii (M,) [m]: new values for sources and copies. Labels are copied; moments restart.
         """
         slots = np.flatnonzero(~self.is_alive)[: len(sources)]
         sources = sources[: len(slots)]

@@ -42,7 +42,7 @@ def count_carried(
 ) -> None:
     """Count the declared boxes that explain robot pixels, where the `bare` surface does not.
 
-    time_s: of the frame, from the first joint state.
+    bare: the robot's surface without what it carries; time_s: of the frame, from the first joint state.
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     poses = dict(zip(surface.links, T_world_link, strict=True))

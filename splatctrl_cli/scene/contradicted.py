@@ -33,8 +33,9 @@ BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
 class Contradicted:
     """Blocks of `side` pixels (h, w) of a frame that another frame contradicts.
 
-    until (h, w) [m]: where its rays cross another's surface, 0 = nowhere; is_blank (h, w): no depth there; through
-    (h, w) [m]: its own surface where another's rays cross it, 0 = nowhere.
+    until (h, w) [m]: depth at which a block's rays cross the surface of another frame, 0 = they do not; is_blank (h,
+    w): the block has no depth; through (h, w) [m]: depth of the block's own surface where rays of another frame
+    cross it, 0 = none do.
     """
 
     side: int
@@ -43,16 +44,19 @@ class Contradicted:
     through: Float32
 
     def pixels(self, shape: tuple[int, ...]) -> Bool:
-        """Pixels (H, W) whose depth is on no surface."""
+        """Pixels (H, W) whose depth is on no surface, as their rays cross another frame's."""
         return self._spread((self.until > 0) & ~self.is_blank, shape)
 
     def unproven(self, frame: RgbdFrame) -> RgbdFrame:
-        """Frame without depth that another's rays cross: it proves no free space."""
+        """Frame without the depth that rays of another frame cross: it proves no space free."""
         is_through = self._spread(self.through > 0, frame.depth.shape)
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
     def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Points (K, 3) [m], world, half a voxel apart, on its rays before that surface."""
+        """Points (K, 3) [m], world, half a voxel apart on rays of its blocks, up to `until` or `through`.
+
+        is_blank: take the blocks without depth, or those with it.
+        """
         end = np.maximum(self.until, self.through)
         v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
         depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
@@ -70,7 +74,7 @@ class Contradicted:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surface:
-    """Object points (K, 3) [m], world, off depth edges, with block indices (K,) and depth (K,) [m]."""
+    """Object points (K, 3) [m], world, away from depth edges, with block indices (K,) and depth (K,) [m]."""
 
     points: Float64
     v: Index
@@ -83,8 +87,8 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
 
     All rays of a contradicted block and its neighbours cross a surface of another frame. They end more than
     `CONTRADICTED` [m] behind it, or return no depth, in range and outside stereo shadows. No return from the drawn
-    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong: rays
-    to `SEEN_THROUGH_PIXELS` crossed blocks prove no free space.
+    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong:
+    where others' rays cross at least `SEEN_THROUGH_PIXELS` adjacent blocks, these prove no space free.
     """
     surfaces = [_surface(*one) for one in seen]
     through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
@@ -118,7 +122,7 @@ def _side(frame: RgbdFrame) -> int:
 
 
 def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
-    """Pixels (h, w, side^2) of an image's blocks."""
+    """Pixels (h, w, side^2) of an image's blocks, without incomplete ones at its ends."""
     h, w = (size // side for size in image.shape)
     parts = image[: h * side, : w * side].reshape(h, side, w, side)
     return parts.swapaxes(1, 2).reshape(h, w, side * side)
@@ -138,7 +142,7 @@ def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class _Rays:
-    """Depth [m] that a block's rays reach (h, w), and blocks that unexpectedly return none."""
+    """Depth (h, w) [m] that all rays of a block and its neighbours reach; blocks that unexpectedly return none."""
 
     frame: RgbdFrame
     side: int
@@ -156,7 +160,10 @@ class _Rays:
         return cls(frame=frame, side=side, surely=surely, is_blank=np.asarray(is_blank))
 
     def run_through(self, surface: _Surface, until: Float32) -> Index:
-        """Write the depth of crossed surface points into `until` (h, w); return those with depth behind."""
+        """Write the depth of crossed surface points into `until` (h, w).
+
+        Returns the indices of those points behind which a ray measures depth.
+        """
         pixel, z = pixels_at(self.frame, surface.points)
         width = self.frame.intrinsics.width
         v, u = pixel // width // self.side, pixel % width // self.side

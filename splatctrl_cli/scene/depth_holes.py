@@ -1,6 +1,6 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
-Depth surrounds a hole. An object in it is on its rays, before what is seen around. Rays of other cameras and later
+Depth surrounds a hole. An object in it is on its rays, before what is seen around it. Rays of other cameras and later
 images clear it. Depth is also lost at depth edges: the nearer surface may extend there.
 """
 
@@ -95,8 +95,8 @@ def lost_edges(
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
     Its depth is that of the nearest object next to it. Its radius is one pixel: a surface shown there ends before
-    the next centre. Lone object pixels are noise. Balls that a frame sees through by `see_through`, or that near to
-    the robot, are left out: the latter are its outline.
+    the next centre. Lone object pixels are noise. Balls that a frame sees through by `see_through` are left out.
+    Balls as near to the robot are left out, too: they are its outline.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing

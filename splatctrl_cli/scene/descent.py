@@ -27,8 +27,8 @@ from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
 class Descent:
     """Optimiser of a buffer's M splats, with noise drawn from seed and iteration.
 
-    background: colour behind the splats, None until chosen. heard: called after each iteration. device: for `run`
-    and `rendering`, else the processor; failures raise DeviceError.
+    background: colour behind the splats, None until chosen. heard: called after each iteration. device: computes
+    `run` and `rendering`, which raise DeviceError if it fails; None: the processor computes them.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Descent:
         return terms
 
     def keep(self, views: Sequence[View]) -> None:
-        """Drop other views' images from the device."""
+        """Drop images of all other views from the device."""
         if self.device is not None:
             self.device.keep([view.target for view in views])
 

@@ -177,7 +177,7 @@ class SceneFitter:
         return replace(self._audit(views, filled, removed, terms), **audited(masks))
 
     def plant(self, cloud: PointCloud) -> Filled:
-        """Start from coloured points, seeded with a share `fill` of the budget."""
+        """Start from coloured points, seeded with at most a share `fill` of the budget."""
         source = Candidates(points=cloud.points, colors=cloud.colors, pixels=np.zeros(len(cloud), np.float32))
         count = max(int(self.config.fill * self.config.max_splats), 1)
         self.density = density_for([source], count, self.config)
@@ -224,12 +224,12 @@ class SceneFitter:
         return self.buffer.splats(self.num_threads)
 
     def shell_splats(self) -> SplatSet | None:
-        """Splats beyond the workspace, for pictures only."""
+        """Splats beyond the workspace, for pictures only; None without a shell."""
         return None if self.shell is None else self.shell.splats()
 
     @property
     def unrepresented(self) -> Balls:
-        """Occupied voxels without a splat, after the last step."""
+        """Occupied voxels, except the robot's, without a splat after the last time step or refining."""
         if self._unrepresented is None:
             seen = [view.frame.depth[::8, ::8] for view in self.window.newest]
             depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0, np.float32)
@@ -251,7 +251,7 @@ class SceneFitter:
         return self.occupancy.known(self.unrepresented)
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
-        """Frame as the optimiser takes it."""
+        """Frame as the optimiser takes it; mask: of a robot in it."""
         min_range = self.occupancy.config.min_range
         mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
         reach = NEAREST_REACH * (self.config.scale or 1.0)
@@ -269,7 +269,7 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """Colour of pixels without depth, or without any depth, of pixels without splats."""
+        """Background: colour of pixels without depth; if no view has depth, of pixels that no splat covers."""
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]
@@ -296,7 +296,7 @@ class SceneFitter:
         return relabel(self.buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
-        """Remove what the optimiser moved off the robot, into air or out, or made faint."""
+        """Remove what the optimiser moved off the robot, into air or out, or made faint; count it in `removed`."""
         drifted = self._relabel(robot, seen)
         self.buffer.kill(drifted)
         floating = self._floating(views)
@@ -324,7 +324,7 @@ class SceneFitter:
         return {reason: int(mask.sum()) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
-        """Fill dead slots at pixels of M_add; the first full view sets the density."""
+        """Fill dead slots at pixels of M_add; on the first full view, the density uses `fill` of the budget."""
         found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
         added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
         every = thinning(added)
@@ -366,7 +366,8 @@ class SceneFitter:
     ) -> Filled:
         """Add splats where measured surfaces are far from all spheres, in alternate halves per step.
 
-        The robot's surface has spheres of its own. For other surfaces, slots are evicted every EVICT_EVERY steps.
+        The robot's surface has spheres of its own. If slots are missing for other surfaces, splats are evicted
+        every EVICT_EVERY steps, and counted in `removed`.
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
@@ -401,9 +402,9 @@ class SceneFitter:
     def _show_contact(
         self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, steady: Sequence[Bool]
     ) -> Filled:
-        """Give objects near moving links dense splats of half `contact_radius`.
+        """Give objects near moving links splats of half `contact_radius`, at most `contact_radius` apart.
 
-        Only steady pixels count: noise would stay while the arm hides it.
+        Only `steady` pixels (H, W) count: noise would stay while the arm hides it.
         """
         if robot is None:
             return Filled()
@@ -422,7 +423,7 @@ class SceneFitter:
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
         """Put object splats near the robot on measured depth, and shrink those that stand out.
 
-        The least radius is half of `contact_radius`, at once for hidden splats.
+        They shrink down to half of `contact_radius`; hidden splats get at most that radius at once.
         """
         if robot is None:
             return
@@ -445,7 +446,10 @@ class SceneFitter:
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf
     ) -> Bool:
-        """Points (K,) that no view sees through by `see_through` or `least` [m]: others are noise."""
+        """Points (K,) that no view sees through by the smaller of `see_through` and `least` [m]: others are noise.
+
+        least 0 counts as unlimited.
+        """
         gap = min(self.occupancy.config.see_through, least or np.inf)
         return ~seen_through(points, views, gap, self.num_threads, label)
 

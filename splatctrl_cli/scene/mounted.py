@@ -14,7 +14,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 
 
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """At most `MOUNTED_MAX_VIEWS` frames, more than `MOUNTED_APART` apart."""
+    """The first frames, at most `MOUNTED_MAX_VIEWS`, that are more than `MOUNTED_APART` [m] apart."""
     chosen: list[RgbdFrame] = []
     places: list[Float64] = []
     for frame in frames:
@@ -28,7 +28,7 @@ def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None:
     """Pixels (H, W) of what moves with one camera, by `spread_views`; None for fewer than six.
 
-    They keep their colour, are not flat, and rarely have depth of `min_range` [m].
+    They keep their colour, are not flat, and rarely have depth of `min_range` [m] or more.
     """
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None

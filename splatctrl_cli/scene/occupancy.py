@@ -42,8 +42,8 @@ class OccupancyMap:
     def take_in(self, frames: Sequence[RgbdFrame]) -> None:
         """Add the depth images of one time step; human pixels set the human bit.
 
-        Rays that pass clear it, and the solid bit; other pixels of masked images clear it, too. Occluded people
-        stay.
+        Rays that pass a voxel clear its human and solid bits. If masked images hit it with other pixels alone, these
+        clear the human bit, too. Occluded people stay.
         """
         self._begin_step(frames)
         masked = [(frame, frame.human) for frame in frames if frame.human is not None]
@@ -59,7 +59,7 @@ class OccupancyMap:
             self._label_hits(frame, mask != 0, set_bits=Label.HUMAN)
 
     def _begin_step(self, frames: Sequence[RgbdFrame]) -> None:
-        """Count a time step; beyond `MAX_STEPS`, every second one merges into its predecessor."""
+        """Count a time step by its earliest stamp; at `MAX_STEPS`, every second one merges into its predecessor."""
         if len(self.step_stamps_ns) == MAX_STEPS:
             self.step_stamps_ns = self.step_stamps_ns[::2]
             is_step = self.last_seen < min(Unseen)
@@ -67,7 +67,7 @@ class OccupancyMap:
         self.step_stamps_ns.append(min(frame.stamp_ns for frame in frames))
 
     def integrate(self, frame: RgbdFrame) -> None:
-        """Add one depth image: free along its rays, hit at their ends."""
+        """Add one depth image: voxels are free along its rays, hit at their ends, and both last seen now."""
         integrate_depth(
             self._packed,
             self.log_odds,
@@ -192,10 +192,10 @@ class OccupancyMap:
         return bits
 
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
-        """Largest occupancy (N,) of the eight nearest voxels; True if one was seen.
+        """Largest occupancy (N,) of the eight nearest voxels, and True (N,) if one of them was ever seen.
 
-        The eight reach half a voxel to all sides: a surface that near supports a splat. Never-seen ones count only
-        if all are (one half).
+        The eight reach half a voxel to all sides: a surface that near supports a splat. Never-seen voxels do not
+        count; if all eight are never seen, the occupancy is one half.
         """
         base = np.floor((points_world - self.origin) / self.config.voxel).astype(np.int64)
         limit = np.array(self.log_odds.shape) - 1
@@ -261,7 +261,8 @@ class OccupancyMap:
 class PeopleMemory:
     """Flat indices `voxels` (K,) of people, and `stamps_ns` (K,) of their last observation.
 
-    `OccupancyMap.take_in` clears voxels seen otherwise; unobserved for `memory` [s], they become never seen.
+    `OccupancyMap.take_in` clears voxels that are seen free or as something else. Voxels that no camera has observed
+    for longer than `memory` [s] become unknown.
     """
 
     def __init__(self, memory: float) -> None:

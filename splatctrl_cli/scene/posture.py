@@ -29,7 +29,7 @@ class RobotPosture:
     num_threads: int = 1
 
     def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
-        """Surface and its links' poses (L, 4, 4) at a stamp, else of the spheres."""
+        """Surface and poses (L, 4, 4) of its links at a stamp; without a surface, the spheres serve as one."""
         if self.surface is None:
             return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]
@@ -56,9 +56,9 @@ class RobotPosture:
 def posture_of(
     robot: RobotModel, q: Float64, at_frames: Mapping[int, Float64], carried: Sequence[tuple[str, Box]] = ()
 ) -> RobotPosture:
-    """The robot at joint positions q (J,), and at each frame stamp [ns].
+    """The robot at joint positions q (J,).
 
-    carried: boxes in link frames, part of its surface.
+    at_frames: joint positions (J,) by frame stamp [ns]; carried: boxes in link frames, part of its surface.
     """
     spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried) if carried else robot.surface
     surfaces = {stamp: robot.surface_at(stamp) for stamp in at_frames} if robot.changes else {}

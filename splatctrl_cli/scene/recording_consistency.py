@@ -49,7 +49,7 @@ CAUSES = (
 
 
 def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) -> list[Agreement]:
-    """Agreement of camera pairs with enough common pixels, in a still scene.
+    """Agreement of camera pairs with enough common pixels, from views of one moment or of a still scene.
 
     Views of one camera are paired, too. Depth counts from `min_range` to `max_range` [m].
     """
@@ -82,7 +82,7 @@ def _agreement(cameras: tuple[str, str], rows: Float64) -> Agreement:
 
 
 def differences(a: RgbdFrame, b: RgbdFrame, min_range: float, max_range: float) -> Float64:
-    """|dz| and depth (K, 2) [m] in view b, of view a's points within `PAIR_SAME_SURFACE`."""
+    """|dz| and depth (K, 2) [m] in view b, of view a's points within `PAIR_SAME_SURFACE` of b's depth."""
     stride = max(1, a.intrinsics.height // fixed.PAIR_ROWS)
     is_used = np.zeros(a.depth.shape, bool)
     is_used[::stride, ::stride] = True
@@ -109,7 +109,7 @@ class PoseJump:
 
 
 def largest_jump(poses: Iterable[tuple[int, str, Float64]]) -> PoseJump | None:
-    """Longest move of a camera between frames within a second; None without any.
+    """Longest move of a camera between successive frames at most a second apart; None without frames.
 
     poses: stamp [ns], camera and T_world_camera, by stamp.
     """

@@ -48,7 +48,7 @@ def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Fil
 
 @dataclass(frozen=True, kw_only=True)
 class Misfit:
-    """A view's mean absolute colour error (H, W), 0 in uncounted pixels."""
+    """A view's mean absolute colour error (H, W), 0 where the pixel is not mappable."""
 
     frame: RgbdFrame
     error: Float32
@@ -60,9 +60,9 @@ def use_idle(
     config: SceneConfig,
     rng: np.random.Generator,
 ) -> tuple[Filled, int]:
-    """Use dead slots beyond the reserve as `when_idle` says; return also the weak splats' number.
+    """Use dead slots beyond the reserve as `when_idle` says; return also the number of weak splats removed.
 
-    misfits: of views, and how much each slot (M,) shows.
+    misfits: returns those of the views, and how much each slot (M,) shows.
     """
     is_alive, reserve = buffer.is_alive, int(config.gap_reserve * config.max_splats)
     if config.when_idle == "leave" or not is_alive.any():
@@ -81,8 +81,8 @@ def use_idle(
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
     """At most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
 
-    The error is a 3 x 3 mean, weighted by a pixel's area of surface. Seeds keep their diameters apart, as views
-    share spots.
+    The error is a 3 x 3 mean, weighted by a pixel's area of surface. No two seeds are closer than their
+    diameters, as several views show one spot.
     """
     every = thinning(misfit.error > 0 for misfit in misfits)
     masks = [thinned(misfit.error > 0, every) for misfit in misfits]

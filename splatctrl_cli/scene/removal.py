@@ -31,7 +31,7 @@ def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool
 
 
 def least_around(depth: Float32, half: int) -> Float32:
-    """Least value (H, W) within `half` pixels."""
+    """Least value (H, W) in the square of 2 half + 1 pixels around each."""
     window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
     return np.asarray(cv2.erode(depth, window, borderType=cv2.BORDER_REPLICATE), np.float32)
 
@@ -50,7 +50,7 @@ def removals(
 
     broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
     seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: was
-    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
+    robot or human, is no longer. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
 
     Splats in never-seen surroundings stay, unless the rule is "literal". `counts_time`: this is a time step, which
     counts towards the patience.
@@ -97,7 +97,7 @@ def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tupl
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
-    """Slots (M,) of at most `num` splats to evict, and the seeds in order.
+    """Slots (M,) of at most `num` splats to evict, and the seeds in the order in which they get slots.
 
     Only object splats go: redundant ones that show least, then those far from the robot's path, for seeds near it.
     shown (M,): how much slots show; tolerance [m]: as in `redundant`.
@@ -127,7 +127,7 @@ def redundant(
     tolerance: float,
     num_threads: int = 1,
 ) -> NDArray[np.intp]:
-    """At most `num_wanted` splats of `order` that others can replace.
+    """The first splats of `order`, at most `num_wanted`, that the others together can replace.
 
     splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within
     `tolerance` [m] of its sphere, among the eight nearest centres. It may go if all its voxels keep another: this
@@ -155,7 +155,7 @@ def redundant(
 def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
     """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
-    Each is EVICT_NEARER farther from the path than its seed: no two surfaces exchange slots in turn.
+    Each is at least EVICT_NEARER farther from the path than its seed, so that no two surfaces exchange slots in turn.
     """
     to_splat = distance_to_box(centers, path)
     farthest = np.argsort(-to_splat, kind="stable")[:num_wanted]

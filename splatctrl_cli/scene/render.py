@@ -26,7 +26,7 @@ class Rendering:
     opacity: Float32
 
     def normalised_depth(self) -> Float32:
-        """See `normalised_depth`."""
+        """Depth / opacity (H, W) [m] for opacity of 0.5 or more, else 0."""
         return normalised_depth(self.depth, self.opacity)
 
     def before(self, background: Color) -> "Rendering":

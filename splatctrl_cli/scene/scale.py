@@ -62,10 +62,10 @@ class RecordedDepth:
 def depth_noise(images: Sequence[Float32]) -> float:
     """Standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
-    At depth z, that is times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
-    Inverse depth of a plane is linear in the pixel: residuals of linear fits to blocks are noise, and a low
-    quantile leaves out edges. Fits absorb noise that neighbours share. Blocks two or three times as wide may raise
-    it, up to twice; more is shape.
+    The standard deviation at depth z is that times z^2, as in disparity sensors (Khoshelham and Elberink 2012:
+    1.425e-3 of a Kinect). Inverse depth of a plane is linear in the pixel: residuals of linear fits to blocks are
+    noise, and a low quantile leaves out edges. Fits absorb noise that neighbours share. Blocks two or three times as
+    wide may raise it, up to twice; more is shape.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))
@@ -88,7 +88,7 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
 
 
 def _block_side(depth: Float32) -> int:
-    """Side of a block: wide enough for noise that neighbours share."""
+    """Side of a block [px]: 1 / `NOISE_BLOCKS` of the width, at least `NOISE_LEAST_SIDE`: neighbours share noise."""
     return int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
 
 

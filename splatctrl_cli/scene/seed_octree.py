@@ -1,7 +1,7 @@
 """Nested cubes over coloured points: one splat each, more where there is detail.
 
-The paper seeds every pixel. With fewer, equal cubes, objects are as coarse as the floor. Here a cube splits in
-eight while its points differ in colour or lie off a plane.
+The paper seeds every pixel. On a smaller budget, equal cubes leave objects as coarse as the floor. Here a cube splits
+in eight while its points differ in colour or lie off a plane.
 """
 
 from collections.abc import Sequence

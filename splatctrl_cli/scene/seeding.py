@@ -40,7 +40,7 @@ def _placed(frame: RgbdFrame) -> Float64:
 
 
 def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
-    """Pixels (H, W) in the workspace with depth of at least `min_range` [m]."""
+    """Pixels (H, W) in the workspace with valid depth of at least `min_range` [m]."""
     is_valid = (frame.depth > 0) & (frame.depth >= min_range)
     return np.asarray(is_valid & workspace.contains(points_world))
 
@@ -48,9 +48,9 @@ def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, mi
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
     """M_add (H, W): pixels to seed, eq. 5 with a term for holes.
 
-    A mappable pixel is seeded if a hole (opacity below `hole_opacity`), or closer than the map by lambda_MDE times
-    the median depth error. The median is of explained mappable pixels, clipped at both ends; the map's depth is
-    normalised by opacity.
+    A mappable pixel is seeded if it is a hole (opacity below `hole_opacity`), or closer than the map by more than
+    lambda_MDE times the median depth error. The median is over mappable pixels that the map explains; this
+    threshold has a floor and a ceiling. The map's depth is normalised by opacity.
     """
     is_hole = rendering.opacity < config.hole_opacity
     error = rendering.normalised_depth() - frame.depth
@@ -70,12 +70,12 @@ class Candidates(Columns):
 
 
 def thinning(masks: Iterable[Bool]) -> int:
-    """Return n: every n-th pixel of masks (H, W) is within `SEED_MOST_PIXELS`."""
+    """Return n such that every n-th pixel of masks (H, W) leaves about `SEED_MOST_PIXELS` or fewer."""
     return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
 
 
 def thinned(mask: Bool, every: int) -> Bool:
-    """Every n-th pixel of a mask (H, W), in row order."""
+    """Keep the first of each `every` pixels of a mask (H, W), in row order."""
     if every == 1:
         return mask
     kept = np.zeros(mask.size, bool)

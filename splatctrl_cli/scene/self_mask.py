@@ -281,7 +281,7 @@ def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
 
 
 def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:
-    """Largest difference [m] of the robot's measured and rendered depth."""
+    """Largest allowed difference [m] of the robot's measured and rendered depth."""
     return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
 
@@ -289,7 +289,8 @@ def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_S
 class LinkResidual:
     """The residual of one link over several masks.
 
-    median [m]: of measured minus rendered depth; reach [m]: the least `SelfMask.reach`.
+    median [m]: of measured minus rendered depth over num_pixels, None without any; num_inside: as in `SelfMask`;
+    reach [m]: the least `SelfMask.reach` of masks that show the link.
     """
 
     median: float | None
@@ -299,7 +300,7 @@ class LinkResidual:
 
     @property
     def sign(self) -> int:
-        """1 behind the rendered surface, -1 before."""
+        """1 if the robot is measured behind its rendered surface, -1 before it, 0 at it or unknown."""
         return 0 if self.median is None else int(np.sign(self.median))
 
 
@@ -338,9 +339,9 @@ def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
 def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -> dict[str, Any]:
     """Part of the self-mask in ``run.json``, over all time steps.
 
-    `self_mask`: by link, median residual and reach [mm], and pixels; `self_mask_residual_mm`: the largest of judged
-    links, None without any; `inside_robot_points`, with the first step and link. Links with `MASK_PIXELS` are
-    judged, those in `holding` only if no others are: their surface was itself learned.
+    `self_mask`: by link, median residual and reach [mm], and pixels; `self_mask_residual_mm`: the largest size
+    of judged links' residuals, None without any; `inside_robot_points`, with the first step and link. Links with at
+    least `MASK_PIXELS` are judged, those in `holding` only if no others are: their surface was itself learned.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}

@@ -32,7 +32,7 @@ Masked = Sequence[tuple[View, Bool]]
 
 
 def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
-    """Valid pixels (H, W) whose depth of at least `min_range` [m] is outside the workspace."""
+    """Valid pixels (H, W) with depth of at least `min_range` [m] outside the workspace, except `mounted` ones."""
     depth = view.target.depth
     left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0)
     left_out &= True if view.frame.valid is None else view.frame.valid
@@ -40,7 +40,7 @@ def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
 
 
 class Shell:
-    """Extra splats, `scene.shell` of `scene.max_splats`, for views beyond the workspace.
+    """Extra splats, a share `scene.shell` of `scene.max_splats`, for what views show beyond the workspace.
 
     Lengths scale by the median depth of the first such pixels.
     """

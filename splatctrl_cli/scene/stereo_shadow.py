@@ -11,8 +11,8 @@ def shadowed(depth: Float32, focal: float) -> Bool:
     """Pixels (H, W) without depth in the shadow of something nearer in their row.
 
     depth (H, W) [m], 0 = none; focal [px]. With baseline B, an object at z hides B focal (1/z - 1/z_behind) pixels
-    behind it, on one side. The image shows side and baseline; z_behind is the largest depth around connected pixels
-    without depth.
+    behind it, always on the same side. Side and baseline are measured from the image (`_baseline`); z_behind is the
+    largest depth around connected pixels without depth.
     """
     is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
     for turn in (1, -1):  # the nearer object is right of its shadow, then left
@@ -34,7 +34,8 @@ def _baseline(depth: Float32, following: Index, focal: float) -> float:
     """Baseline [m] of shadows left of nearer objects; 0 without any.
 
     following (H, W): column of the next depth, W = none. Each step nearer by `SHADOW_STEP` gives a baseline by its
-    lost pixels. The median is of the higher half, weighted by height: fattened outlines cover low steps' shadows.
+    lost pixels. The median is over the higher half of the steps, weighted by height: fattened outlines cover low
+    steps' shadows.
     """
     following = following[:, 1:]
     before = depth[:, :-1]

@@ -17,7 +17,7 @@ def surface_steps(
     half that distance, if less.
 
     The plane fits 1 / depth of object pixels beyond the outline, within `MASK_PLANES` widths. It counts if
-    residuals match the sensor (`depth_error` [m] at 1 m) and its variance is below `MASK_UNSURE`.
+    its residuals match the sensor (`depth_error` [m] at 1 m) and its variance is at most `MASK_UNSURE` of a pixel's.
     """
     steps = np.full(depth.shape, MASK_STEP, np.float32)
     beyond, asked = is_object & ~is_edge, is_object & is_edge

@@ -15,9 +15,10 @@ from splatctrl_cli.scene.seeding import thinned, thinning, world_points_at
 
 @dataclass(frozen=True, kw_only=True)
 class TimeStep:
-    """Frames taken together, at most one per camera with a clock, and joint positions.
+    """Frames taken together (with a clock, at most one per camera), and the joint positions then.
 
-    position (J,) at the last frame, in source order, None without a near joint state; velocity (J,) [1/s].
+    position (J,) at the last frame, in the source's joint order, None without a near joint state; velocity (J,)
+    [1/s].
     """
 
     frames: tuple[RgbdFrame, ...]
@@ -26,7 +27,7 @@ class TimeStep:
 
     @property
     def positions(self) -> dict[int, Float64]:
-        """Joint positions (J,) by frame stamp [ns]; may be empty."""
+        """Joint positions (J,) by frame stamp [ns]; empty without a near joint state."""
         if self.position is None or self.velocity is None:
             return {}
         last_ns = self.frames[-1].stamp_ns
@@ -54,11 +55,11 @@ class TimeStep:
 class AuditRow:
     """Result of one time step.
 
-    Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames at their last iteration, None if none
-    shows the workspace. dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface.
-    unrepresented: occupied voxels without a splat. without_depth: such frames; blind: such cameras. self_mask: by
-    link, measured minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link, unexplained
-    points inside.
+    Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames at their last iteration, None if none shows
+    the workspace. dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface.
+    unrepresented: occupied voxels without a splat. without_depth: frames without any depth; blind: their cameras.
+    self_mask: by link, measured minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link,
+    unexplained points inside.
     """
 
     stamp_ns: int
@@ -101,8 +102,8 @@ def time_steps(
 ) -> Iterator[TimeStep]:
     """Group frames of `cameras` by stamp, or without a clock, FRAMES_PER_STEP at a time.
 
-    With a clock, a frame that repeats its camera's depth is skipped, and counted in `repeats`. `observe` gets every
-    record: one pass serves both.
+    With a clock, a frame with exactly its camera's last depth is skipped, and counted in `repeats` by camera.
+    `observe` gets every record: one pass serves both.
     """
     last_depth: dict[str, Float32] = {}
     frames: list[RgbdFrame] = []

@@ -38,7 +38,8 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
 def confirmed(found: Balls, before: Balls | None) -> Balls:
     """Balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
-    Smaller groups are often noise or gaps not yet filled. before: of the last time step, None in the first.
+    Smaller groups are often noise or gaps not yet filled. before: of the last time step; None in the first,
+    where all count.
     """
     voxel = 2.0 * found.radius / 3**0.5
     if before is None or not len(found):
@@ -106,7 +107,7 @@ class GridAgreement:
 
     @property
     def holds(self) -> bool:
-        """True if both shares reach a reconstruction's."""
+        """True if both shares are as large as a reconstruction leaves them; False with nothing to compare."""
         return self.on_surface >= SPLATS_ON_SURFACE and self.represented >= OCCUPIED_WITH_SPLATS
 
 

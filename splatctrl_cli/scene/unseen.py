@@ -17,7 +17,7 @@ OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
 
 
 def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> None:
-    """Note `Unseen` for never-seen voxels within `ASKED_REACH` of the robot."""
+    """Note why (`Unseen`) no camera ever saw voxels within `ASKED_REACH` of the robot."""
     voxels = occupancy.unexplained(robot.centers, robot.radii + ASKED_REACH)
     points = occupancy.centers_of(voxels)
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))

@@ -86,7 +86,7 @@ class CudaDevice:
         _check(driver.cuStreamSynchronize(self._handle))
 
     def record(self, launches: Sequence[Launch]) -> "CudaGraph":
-        """Record graphs of one replay and of MANY."""
+        """Record the launches as two graphs: of one replay, and of MANY."""
         graphs = {}
         with _named_faults():
             for count in (1, MANY):

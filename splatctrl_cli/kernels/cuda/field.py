@@ -51,7 +51,7 @@ class Answers:
     """Wanted results in (X, Y, Z) cells or (Q,) points [m].
 
     bound: exact distance minus margin; entry: nearest sphere's; kernels: exact where undefined; counts: by kernel,
-    cells undefined, and above the exact distance.
+    cells where it is undefined, and where it exceeds the exact distance by more than `resolution`.
     """
 
     distance: Float32
@@ -97,7 +97,7 @@ class DeviceField:
         self._rooms = {}
 
     def bake(self, span: GridSpan, wanted: Collection[str], *, margin: float = 0.0) -> Answers:
-        """Return `wanted` (fields of `Answers`, kernels) in a span, without its mask; margin [m]."""
+        """Return `wanted` (fields of `Answers`, kernels) in a span; its mask is ignored; margin [m]: of bound."""
         grid = np.zeros((), GRID)
         grid["place"], grid["size"], grid["planes"] = (*span.origin, span.voxel), span.shape, (span.first, span.last)
         shape = span.shape_of_channel

@@ -75,7 +75,7 @@ def bytes_needed(
 class DeviceFit:
     """Optimiser of N splats on a device, for views of `sizes` (H, W) at first.
 
-    Raises OutOfMemory, with what would fit.
+    Raises OutOfMemory, which names what would fit, if there is no room.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class DeviceFit:
         self._addresses, self._images, self._sizes = {}, {}, {}
 
     def expect(self, sizes: Sequence[tuple[int, int]]) -> None:
-        """Expect views of sizes (H, W). Raises OutOfMemory."""
+        """Expect views of sizes (H, W). Raises OutOfMemory if they do not fit."""
         self._asked = list(sizes)
         if self._needed(self.num_splats) > self._usable():
             raise self._too_large()
@@ -122,7 +122,7 @@ class DeviceFit:
             self.device.write(self._addresses[name], values)
 
     def take(self, parameters: Float32, moments: Moments) -> None:
-        """Read splats (N, 8) and Adam's state."""
+        """Read splats (N, 8) and Adam's state into these arrays."""
         for name, values in self._state(parameters, moments).items():
             self.device.read(self._addresses[name], values)
 
@@ -192,7 +192,7 @@ class DeviceFit:
                 return self.read_image("planes", view, 5)
 
     def gradients(self, view: int, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
-        """Loss and its derivatives (N, 8); parameters stay."""
+        """Derivatives (N, 8) of a view's loss by the parameters, which stay, and the loss."""
         height, width = self.views[view].height, self.views[view].width
         while True:
             self.rewind([view], weights, settings, 0)
@@ -203,14 +203,14 @@ class DeviceFit:
                 return out, self._terms([view])[view]
 
     def list_lengths(self, view: int) -> NDArray[np.int32]:
-        """Splats (K,) on tile lists, at the size's last launch."""
+        """Number of splats (K,) on each tile's list, after the last launch on the view's size."""
         height, width = self.views[view].height, self.views[view].width
         out = np.empty(-(-height // TILE) * -(-width // TILE), np.int32)
         self.device.read(self._addresses[f"num_entries {height} {width}"], out)
         return out
 
     def read_image(self, name: str, view: int, channels: int) -> Float32:
-        """Read `planes`, `plane_gradients` or `maps` (channels, H, W) of the size's last launch."""
+        """Read `planes`, `plane_gradients` or `maps` (channels, H, W), after the last launch on the view's size."""
         height, width = self.views[view].height, self.views[view].width
         out = np.empty((channels, height, width), np.float32)
         self.device.read(self._addresses[f"{name} {height} {width}"], out)
@@ -266,7 +266,7 @@ class DeviceFit:
     def rewind(
         self, schedule: Sequence[int], weights: LossWeights | None, settings: OptimiserSettings | None, seed: int = 0
     ) -> None:
-        """Set a schedule before the next launches; by default, for rendering."""
+        """Set a schedule before the next launches; weights and settings None: for rendering only."""
         run = np.zeros((), RUN)
         if settings is not None and weights is not None:
             w = weights
@@ -321,7 +321,7 @@ class DeviceFit:
         return known
 
     def launches(self, height: int, width: int, gradients: int = 0) -> list[Launch]:
-        """Launches of one iteration; gradients: their address, or 0 to step."""
+        """Launches of one iteration on a view of that size; gradients: the address to write them to, or 0 to step."""
         at: Callable[[str], int] = self._addresses.__getitem__
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         patches_x, patches_y = -(-width // PATCH), -(-height // PATCH)

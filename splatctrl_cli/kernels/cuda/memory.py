@@ -11,7 +11,7 @@ FIT, FIELD = "fit.cu", "field.cu"  # the sources of kernels
 
 
 class DeviceError(RuntimeError):
-    """The device is missing, unusable, or failed."""
+    """The device is missing, unusable, or failed; `remedy` says what to do about it."""
 
     def __init__(self, message: str, *, remedy: str = "") -> None:
         super().__init__(message)
@@ -34,7 +34,7 @@ class Launch:
 
 
 class Graph(Protocol):
-    """Launches in order."""
+    """Launches that run one after the other."""
 
     def run(self, num_times: int = 1) -> None:
         """Queue the launches `num_times`."""

@@ -26,7 +26,7 @@ def source_digest() -> bytes:
 
 
 def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, source: str = FIT) -> Any:
-    """Machine code of a source, cached in cuda-core's or the given folder, if writable."""
+    """Machine code of a source for a compute capability, cached in cuda-core's or the given folder, if writable."""
     options = ProgramOptions(
         name=source, arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
     )
