@@ -18,7 +18,7 @@ SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """Every `stride`-th pixel of depth (h, w) [m] or colour; full width, height [px]."""
+    """Depth (h, w) [m] at every `stride`-th pixel, or colour (h, w, 3) averaged between; full width, height [px]."""
 
     stamp_ns: int
     stride: int
@@ -330,7 +330,7 @@ def _correlation(color: Float64, depth: Float64) -> Float64:
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:
-    """Rows and columns of the best shift, its correlation, and the next best."""
+    """Rows and columns of the best shift, its correlation, and the best one away from it."""
     height, width = surface.shape
     rows, columns = height // limits.EDGE_SEARCHED, width // limits.EDGE_SEARCHED
     near = surface[

@@ -155,7 +155,7 @@ CHECKS: Mapping[str, Check] = {check.code: check for check in _checks()}
 class Finding:
     """One finding: `code` is its entry in `CHECKS`, `where` the topic, camera or joint.
 
-    value: the figure, in `unit`; stamp_ns: first occurrence; or None.
+    value: the figure, in `unit`; stamp_ns: first occurrence; both None without one.
     """
 
     severity: Severity

@@ -1,4 +1,4 @@
-"""Fixed numbers of the method, deliberately no settings.
+"""Fixed numbers of the method, which are deliberately no settings.
 
 Each was measured, or follows from the method or a comparison; another would make runs incomparable. A unit in
 brackets precedes the meaning; others are shares, factors or counts.
