@@ -41,7 +41,7 @@ from splatctrl_cli.scene.scale import RecordedDepth
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Bounded data of a recording.
+    """Data that a check keeps of a recording, in bounded memory.
 
     frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
     of the first images. states: in the model's order, if any. cut: says that not all was read. is_guessed: True if

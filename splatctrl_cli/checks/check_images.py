@@ -127,7 +127,7 @@ class ImageWatch:
 
     @property
     def unit(self) -> float | None:
-        """Metres per count; None for metres."""
+        """Metres per count of depth; None for depth in metres."""
         return self.scale if self.scale is not None else None if self.is_float else MILLIMETRE
 
     def add_undecoded(self, encoding: str, width: int, height: int) -> None:
@@ -148,7 +148,7 @@ def _constant(depth: Float32) -> list[float]:
 
 
 def stride_of(height: int) -> int:
-    """Rows per kept row."""
+    """Number of rows per kept row."""
     return max(1, -(-height // limits.KEPT_ROWS))
 
 
@@ -184,7 +184,7 @@ def image_findings(images: ImageWatch) -> list[Finding]:
 
 
 def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
-    """A note on images not decoded."""
+    """A note that not every image was decoded, if so."""
     few = [images for images in topics if images.num_decoded + images.num_bad < images.count and images.num_decoded]
     if not few:
         return []

@@ -1,4 +1,4 @@
-"""Nodes through processes in graph order; unchanged results are kept."""
+"""The scheduler of a batch: nodes run in graph order, in processes; unchanged results are kept."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Matches of scene or field, log, truth and robot by content.
+"""Checks by content that scene or field, log, truth and robot belong together.
 
 Camera names are alike on every rig and prove nothing.
 """

@@ -135,9 +135,9 @@ def _at_worst(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links overlap. No moving link comes within the margin of a fixed one that carries none, such as a table
-    of the URDF. Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest
-    gap) unless the recording was. Measured by collision surfaces, or by spheres if these cannot be read.
+    """No two links overlap. No moving link comes within the margin of a fixed one that carries no joint, such as a
+    table of the URDF. Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their
+    largest gap) unless the recording was. Measured by collision surfaces, or by spheres if these cannot be read.
     """
     least = least_of(judged.replay.audit.figures["self_clearance"])
     events = events_of(judged.replay, EventKind.SELF_COLLISION)

@@ -12,7 +12,7 @@ class Progress(Protocol):
     is_quiet: bool
 
     def log(self, line: str) -> None:
-        """One line."""
+        """Show one line."""
         ...
 
 
