@@ -188,7 +188,7 @@ def output_path(
     A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
     card leaves it, too. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
     its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind.
-    It also does for a folder that no command wrote, another writer, or an unwritable parent. Raises WriteError if
+    It also does so for a folder that no command wrote, another writer, or an unwritable parent. Raises WriteError if
     `is_write_failure`; other errors pass.
     """
     try:

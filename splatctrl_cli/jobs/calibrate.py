@@ -244,7 +244,7 @@ def depth_frame(stored: StoredFrame) -> RgbdFrame:
 
 
 def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
-    """Fixed cameras: that of --hold; else none with a robot or a moving camera, or the first without."""
+    """Fixed cameras: that of --hold; else none with a robot or a moving camera; else the first."""
     if request.hold is not None and request.hold not in cameras:
         raise UsageError(f"--hold {request.hold}: no such camera", remedy=f"use one of: {', '.join(cameras)}")
     if request.hold is not None:

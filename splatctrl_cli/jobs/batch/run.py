@@ -239,7 +239,7 @@ class Clock:
         return f"[{self._total - self._left.total()}/{self._total}]"
 
     def left(self) -> str:
-        """The time left in words; "over" it if a job has no mean yet, empty if none has."""
+        """The time left in words: "over" a time if a job has no mean yet, empty if none has."""
         means = self._means | {job: sum(each) / len(each) for job, each in self._seen.items()}
         known = Counter({job: count for job, count in self._left.items() if count and job in means})
         if not known:

@@ -348,7 +348,7 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
 def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
     """Least clearance [m] of spheres, surface, and between states.
 
-    The last two are None if unknown. If the spheres' own breaks the margin, they are None and it is NaN.
+    The last two are None if unknown. If the spheres break the margin, they are None and the first is NaN.
     """
     clearance = judged.replay.audit.clearance
     spheres = least_of(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
