@@ -93,7 +93,7 @@ def arm_agreement(
 def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[float, float] | None:
     """Best clock offset [s] of a camera against the joint states, and its misfit [m].
 
-    None if others fit about as well, or it lies at the edge.
+    None if other offsets fit about as well, or the best fits badly or lies at the edge.
     """
 
     def misfit(offset: float) -> float:
@@ -119,7 +119,7 @@ def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture)
 
 
 def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[int, int] | None:
-    """Two joints whose exchange fits depth, or None."""
+    """Two joints whose exchange puts the arm where depth shows it, or None."""
     few = spread(frames, limits.SWAPPED_FRAMES)
     plain = arm_agreement(model, few, posture)
     best: tuple[float, tuple[int, int]] | None = None
@@ -199,7 +199,7 @@ def motion_findings(
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
 ) -> tuple[dict[str, float], list[Finding]]:
-    """Clock offsets [s] that improve cameras, and findings on the arm."""
+    """Clock offsets [s] of cameras that then show the arm better, and findings on the arm."""
     posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
     timings: dict[str, tuple[float, float]] = {}

@@ -143,7 +143,7 @@ def _is_rival(entry: TopicSurvey, camera: CameraTopics, chosen: Calibration) -> 
 
 
 def tf_findings(found: Survey, cameras: Sequence[CameraTopics], options: SourceOptions) -> list[Finding]:
-    """Separate trees, frames with two parents."""
+    """Findings on separate trees, and on frames with two parents."""
     roots = found.tf.roots
     findings = [warning("tf-parents", "tf", text, "let one node publish each frame") for text in found.tf.notes]
     if len(roots) > 1:

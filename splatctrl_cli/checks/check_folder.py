@@ -41,11 +41,11 @@ from splatctrl_cli.scene.scale import RecordedDepth
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Bounded data of a recording.
+    """Data that a check keeps of a recording, in bounded memory.
 
     frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
-    of the first images. states: in the model's order, if any. cut: says that not all was read. is_guessed: the unit
-    of lengths is.
+    of the first images. states: in the model's order, if any. cut: says that not all was read. is_guessed: True if
+    the unit of lengths is.
     """
 
     frames: Sequence[RgbdFrame]
@@ -118,7 +118,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
-    """Log brightness (N, B) by bands of rows, less a parabola; 0 if unexplained.
+    """Log brightness (N, B) by bands of rows, less a parabola; 0 if bands explain little.
 
     Shadows and pose errors do not follow rows; gloss and vignetting vary slowly, lamps on mains within 10 or 8 ms.
     """

@@ -18,7 +18,7 @@ SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """Every `stride`-th pixel of depth (h, w) [m] or colour; full width, height [px]."""
+    """Depth (h, w) [m] at every `stride`-th pixel, or colour (h, w, 3) averaged between; full width, height [px]."""
 
     stamp_ns: int
     stride: int
@@ -127,7 +127,7 @@ class ImageWatch:
 
     @property
     def unit(self) -> float | None:
-        """Metres per count; None for metres."""
+        """Metres per count of depth; None for depth in metres."""
         return self.scale if self.scale is not None else None if self.is_float else MILLIMETRE
 
     def add_undecoded(self, encoding: str, width: int, height: int) -> None:
@@ -148,7 +148,7 @@ def _constant(depth: Float32) -> list[float]:
 
 
 def stride_of(height: int) -> int:
-    """Rows per kept row."""
+    """Number of rows per kept row."""
     return max(1, -(-height // limits.KEPT_ROWS))
 
 
@@ -184,7 +184,7 @@ def image_findings(images: ImageWatch) -> list[Finding]:
 
 
 def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
-    """A note on images not decoded."""
+    """A note that not every image was decoded, if so."""
     few = [images for images in topics if images.num_decoded + images.num_bad < images.count and images.num_decoded]
     if not few:
         return []
@@ -330,7 +330,7 @@ def _correlation(color: Float64, depth: Float64) -> Float64:
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:
-    """Rows and columns of the best shift, its correlation, and the next best."""
+    """Rows and columns of the best shift, its correlation, and the best one away from it."""
     height, width = surface.shape
     rows, columns = height // limits.EDGE_SEARCHED, width // limits.EDGE_SEARCHED
     near = surface[

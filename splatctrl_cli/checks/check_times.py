@@ -96,7 +96,7 @@ class TimesWatch:
 
     @property
     def median_interval(self) -> float | None:
-        """[s]; None for fewer than two times."""
+        """Median interval [s]; None for fewer than two different times."""
         return float(np.median(list(self._intervals))) if len(self._intervals) else None
 
     @property

@@ -20,7 +20,7 @@ _NEAR = 0.05  # [m] in front of the camera
 
 @dataclass(kw_only=True)
 class CameraMotion:
-    """A camera's stamps (K + 1) [ns], and changes (h, w) in [0, 1] between."""
+    """A camera's stamps (K + 1) [ns], and K changes (h, w) in [0, 1] between them."""
 
     intrinsics: Intrinsics
     T_world_camera: Float64
@@ -95,7 +95,7 @@ def predicted_change(depth_a: Float32, depth_b: Float32) -> Float32:
 
 
 def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Pearson correlation; 0 if constant. Dot products would vary with threads."""
+    """Pearson correlation; 0 if one is constant. Sums, since dot products would vary with threads."""
     x, y = np.asarray(a, dtype=np.float64).ravel(), np.asarray(b, dtype=np.float64).ravel()
     x, y = x - x.mean(), y - y.mean()
     length = float(np.sqrt(np.sum(x * x)) * np.sqrt(np.sum(y * y)))

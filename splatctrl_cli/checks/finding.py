@@ -155,7 +155,7 @@ CHECKS: Mapping[str, Check] = {check.code: check for check in _checks()}
 class Finding:
     """One finding: `code` is its entry in `CHECKS`, `where` the topic, camera or joint.
 
-    value: the figure, in `unit`; stamp_ns: first occurrence; or None.
+    value: the figure, in `unit`; stamp_ns: first occurrence; both None without one.
     """
 
     severity: Severity
@@ -241,7 +241,7 @@ class CheckReport:
 
     @property
     def sorted_findings(self) -> list[Finding]:
-        """Worst first, else in order."""
+        """The findings, worst first, then as found."""
         return sorted(self.findings, key=lambda finding: ORDER.index(finding.severity))
 
     def lacks(self, need: Need) -> tuple[str, ...]:
@@ -259,7 +259,7 @@ class CheckReport:
         return {str(s): sum(f.severity is s for f in self.findings) for s in ORDER}
 
     def seconds(self, finding: Finding) -> float | None:
-        """First occurrence, from the recording's start."""
+        """Time [s] of the first occurrence since the recording's start, None if unknown."""
         if finding.stamp_ns is None or self.start_ns is None:
             return None
         return round((finding.stamp_ns - self.start_ns) * 1e-9, 3)

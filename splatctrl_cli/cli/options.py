@@ -32,7 +32,7 @@ def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
 
 
 def source_options(args: argparse.Namespace) -> SourceOptions:
-    """Options of `add_source`. Raises UsageError for a wrong form."""
+    """Read the options that `SOURCE` declares. Raises UsageError for a value of the wrong form."""
     return request_of(
         SourceOptions,
         args,

@@ -173,7 +173,7 @@ def group(title: str, *options: Adds) -> Adds:
 
 
 def either(*options: Adds, required: bool = False) -> Adds:
-    """Exclusive options."""
+    """Options of which at most one may be given; exactly one if `required`."""
     return lambda container: add_all(container.add_mutually_exclusive_group(required=required), options)
 
 

@@ -20,7 +20,7 @@ SCHEMA_FILE = Path(__file__).parent.parent / "report" / "output.schema.json"
 
 
 def enveloped(result: Mapping[str, Any], code: int) -> dict[str, Any]:
-    """Add schema name and exit code in front."""
+    """Put the schema's name and the exit code in front of a result."""
     first = {"schema": SCHEMA, "exit_code": code}
     return {**first, **result, **first}
 

@@ -1,4 +1,4 @@
-"""Numbers of the method by section of the paper, whose value, if any, is the default."""
+"""Numbers of the method by section of the paper. The paper's value is the default where it gives one."""
 
 from splatctrl_cli.config.load import PRESETS, Config, check_voxel, load_config, sources_of
 from splatctrl_cli.config.sections import (

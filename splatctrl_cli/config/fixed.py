@@ -1,4 +1,4 @@
-"""Fixed numbers of the method, deliberately no settings.
+"""Fixed numbers of the method, which are deliberately no settings.
 
 Each was measured, or follows from the method or a comparison; another would make runs incomparable. A unit in
 brackets precedes the meaning; others are shares, factors or counts.
@@ -240,7 +240,7 @@ FIT_BISECTIONS = 10  # of the lattice spacing, and of t, the largest protrusion
 FIT_ROUNDS = 12  # of assignment and recentring
 FIT_STEPS = (0.5, 0.25, 0.125, 0.0625)  # of the lattice spacing, tried about each centre
 FIT_TIE = 0.05  # a candidate within this share of the best gain may be picked
-DEFAULT_SPHERES = 64  # of --num-spheres: as many as the public sets for the Panda have
+DEFAULT_SPHERES = 64  # of --max-spheres: as many as the public sets for the Panda have
 
 # Verdict
 SLIGHTLY_UNDER = 1e-3  # [m] under a margin that solver, rounding and a map that is still being fitted may leave

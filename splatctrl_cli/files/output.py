@@ -188,7 +188,7 @@ def output_path(
     A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
     card leaves it, too. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
     its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind.
-    The same holds for a folder of no command, another writer, or an unwritable parent. Raises WriteError if
+    It also does so for a folder that no command wrote, another writer, or an unwritable parent. Raises WriteError if
     `is_write_failure`; other errors pass.
     """
     try:
@@ -280,7 +280,7 @@ def flush(path: Path) -> None:
 
 
 def _check_replaceable(path: Path, *, is_folder: bool) -> None:
-    """Raise UsageError if --force could remove foreign files: ours have a marker."""
+    """Raise UsageError if --force could remove foreign files: our folders are empty or have a marker."""
     if path.name in ("", ".."):
         raise UsageError(f"{path}: has no name of its own to write under", remedy="give another --out")
     if is_folder and path.is_file():
@@ -337,7 +337,7 @@ class Stopwatch:
 
 
 def part_digests(folder: Path) -> dict[str, str]:
-    """sha256 of every file below `folder`, by relative name."""
+    """sha256 of every file below `folder` except `NO_PARTS`, by relative name."""
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return {name: sha256(folder / name) for name in names if name.partition("/")[0] not in NO_PARTS}
 

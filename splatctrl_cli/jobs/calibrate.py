@@ -51,7 +51,7 @@ class CalibrateRequest(RobotOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateResult:
-    """The written calibration, and distances [m] of points to other cameras or the robot.
+    """The written calibration, and distances [m] of points to what another camera or the robot shows there.
 
     before, after: `Adjustment.distance`. moved: by camera [m], [deg].
     """
@@ -170,7 +170,7 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
 
 
 def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:
-    """Up to `CALIBRATION_FRAMES` simultaneous frames of each camera, and board sightings.
+    """Up to `CALIBRATION_FRAMES` simultaneous frames of each camera, without colour, and board sightings.
 
     Raises NotEvaluableError if no frame shows the board.
     """
@@ -244,7 +244,7 @@ def depth_frame(stored: StoredFrame) -> RgbdFrame:
 
 
 def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
-    """Fixed cameras: none with a robot or a moving camera, else one."""
+    """Fixed cameras: that of --hold; else none with a robot or a moving camera; else the first."""
     if request.hold is not None and request.hold not in cameras:
         raise UsageError(f"--hold {request.hold}: no such camera", remedy=f"use one of: {', '.join(cameras)}")
     if request.hold is not None:

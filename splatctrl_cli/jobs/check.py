@@ -31,9 +31,9 @@ _ALLOWING = {  # the options that take an error on
 class CheckRequest:
     """One check of a recording; several `paths` only for logs of one session.
 
-    num_images: read of each topic, None for all. urdf: robot to compare joint states and depth with; with `spheres`
-    alone the log's own. base: its pose in world as x, y, z, qx, qy, qz, qw. locked: values [rad or m] of unlogged
-    joints. fail_on: least severity that fails: "error", "warning" or NEVER.
+    num_images: images to read of each topic, None for all. urdf: robot to compare joint states and depth with; with
+    `spheres` alone the log's own. base: its pose in world as x, y, z, qx, qy, qz, qw. locked: values [rad or m] of
+    unlogged joints. fail_on: least severity that fails: "error", "warning" or NEVER.
     """
 
     paths: tuple[Path, ...]

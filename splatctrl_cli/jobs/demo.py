@@ -103,7 +103,7 @@ class Step:
 
 
 def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda result, folder: None) -> DemoResult:
-    """Run all steps, and draw their pictures. Raises InputError for no recording.
+    """Run all steps, and draw their pictures. Raises InputError if `data` is no recording.
 
     told: called with each result, and the temporary folder of `out`.
     """

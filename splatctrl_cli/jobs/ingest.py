@@ -1,4 +1,4 @@
-"""Recordings into capture folders."""
+"""Conversion of recordings into capture folders."""
 
 import json
 from collections.abc import Mapping
@@ -47,7 +47,7 @@ class IngestResult:
 
     @property
     def exit_code(self) -> int:
-        """3 for damaged input."""
+        """3 if part of the input was damaged, else 0."""
         return DAMAGED if self.summary.loss.damaged else 0
 
 

@@ -42,14 +42,14 @@ class Cut:
     voxel: float
 
     def of(self, grid: DistanceGrid, channel: str) -> Float64:
-        """The channel in the plane, rows upwards."""
+        """The channel in the plane, rows upwards along the later axis."""
         where: list[Any] = [slice(None, None, self.step)] * 3
         where[self.axis] = self.index
         return np.asarray(np.swapaxes(grid.channels[channel][tuple(where)], 0, 1), np.float64)
 
 
 def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
-    """Write slices of `sdf` through the cell at `point` [m], across z, y and x.
+    """Write slices of `sdf` through the cell nearest to `point` [m], across z, y and x.
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is veiled and hatched.
     """
@@ -69,7 +69,7 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 
 
 def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
-    """Write slices of `probability` through the cell at `point` [m], with the surface."""
+    """Write slices of `probability` through the cell nearest to `point` [m], with the surface."""
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
             image = axes.imshow(

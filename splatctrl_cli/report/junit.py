@@ -179,7 +179,7 @@ def check_replaceable(path: Path) -> None:
 
 
 def junit_text(suites: Sequence[Suite]) -> str:
-    """The suites as reproducible XML 1.0; other characters are escaped."""
+    """The suites as reproducible XML 1.0; characters that XML cannot hold are escaped."""
     seconds = _seconds(sum(suite.seconds for suite in suites))
     root = ElementTree.Element("testsuites", {"name": "splatctrl", **_counts(suites), "time": seconds})
     for suite in suites:
@@ -254,7 +254,7 @@ def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> N
 
 
 def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping[str, str]) -> list[str]:
-    """A workflow command per most severe case, on the recording if in the repository."""
+    """A workflow command for each of the most severe cases; its file is the recording, if in the repository."""
     level = "error" if is_fatal else "warning"
     lines = []
     for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:MOST_ANNOTATIONS]:

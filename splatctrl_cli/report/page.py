@@ -200,7 +200,7 @@ def packed(space: Space) -> str:
 
 
 def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
-    """Append values, padded to 4 bytes: [type, first byte, count].
+    """Append values by column, padded to 4 bytes; return [type, first byte, count].
 
     Columns deflate better than rows.
     """

@@ -84,7 +84,7 @@ def field_slice_picture(
     """Write the slice of `sdf` across `axis` (0, 1, 2) nearest to `value` [m].
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
-    as cut circles. Raises NotEvaluableError outside the grid.
+    as the circles in which the plane cuts them. Raises NotEvaluableError outside the grid.
     """
     index = round((value - grid.origin[axis]) / grid.voxel)
     count = grid.channels["sdf"].shape[axis]

@@ -1,6 +1,6 @@
 """Pictures of a replay: clearance and events, commands, and divergence.
 
-Long curves are drawn as their range per column: no extreme is lost, and time stays constant.
+Long curves are drawn as their range per column: no extreme is lost, and drawing takes no longer.
 """
 
 from collections.abc import Mapping, Sequence

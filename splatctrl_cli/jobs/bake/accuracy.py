@@ -160,7 +160,7 @@ def _held_out_cameras(
 ) -> tuple[str, ...]:
     """Return the named cameras, or all not known to have trained.
 
-    Raises UsageError for a training or missing camera, or without any.
+    Raises UsageError for a camera that trained or does not exist, or if none is left.
     """
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
     wrong = [name for name in names if name not in known]

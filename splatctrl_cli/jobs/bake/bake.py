@@ -65,7 +65,7 @@ def bake_to_disk(
     """Bake the channels into ``partial/channels``; the baker's counts then cover all slabs.
 
     kept: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last
-    slab. Raises UsageError if that bake had other settings, or without room on disk or in memory.
+    slab. Raises UsageError if that bake had other settings, or if disk or memory lacks room.
     """
     baker, request, folder = job.baker, job.request, partial / FOLDER
     layout, config = baker.layout, request.config
@@ -337,7 +337,7 @@ def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence
 
 
 def _middle(job: _Job) -> list[float]:
-    """Point [m] where slices are drawn: the middle of the splats without outliers."""
+    """Point [m] where slices are drawn: the middle of the grid's splats without outliers, or of an empty grid."""
     box, centers = job.baker.layout.box, job.obstacles.splats.centers
     inside = centers[box.contains(centers)]
     lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)

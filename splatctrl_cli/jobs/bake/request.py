@@ -68,9 +68,10 @@ class BakeRequest(RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class BakeSource:
-    """Splats with the occupancy of the same moment; None (empty) if a bare file lacks it.
+    """Splats with the occupancy of the same moment; a bare splat file leaves the other fields None or empty.
 
-    unrepresented: occupied voxels without a splat. workspace: the box outside which no splats are kept.
+    unrepresented: occupied voxels without a splat. stamp_ns: time of the splats. workspace: the box outside which no
+    splats are kept. cameras: those that made the scene.
     """
 
     splats: SplatSet
@@ -214,7 +215,7 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
 
 
 def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
-    """Box of the grid: as given, or of robot, previous field, or splats with padding."""
+    """Box of the grid: as given, else of the robot's reach, the previous field, or the splats with padding."""
     if request.box is not None:
         return request.box
     if request.urdf is not None:

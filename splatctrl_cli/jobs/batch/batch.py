@@ -42,8 +42,8 @@ CONNECT_S = 10.0  # to a scheduler
 class BatchRequest:
     """Run a suite's file into `out` (default: the suite's).
 
-    shard: (i, n) runs every n-th recording from the i-th on. dask: address of a scheduler. again: rerun finished
-    nodes.
+    workers: processes at once. shard: (i, n) runs every n-th recording from the i-th on. dask: address of a Dask
+    scheduler that runs the nodes instead. again: rerun finished nodes.
     """
 
     suite: Path
@@ -127,7 +127,7 @@ def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node
 
 
 def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
-    """Judge a batch, with a reason for each node."""
+    """Judge a batch: each node has a reason, passed if it ended as expected."""
     num = len({run.recording for run in runs})
     damaged = dict.fromkeys(run.recording for run in runs if _is_damaged(run))
     return verdict_of(
@@ -195,7 +195,7 @@ def write_batch(
 ) -> None:
     """Write batch.json: every node with a key, and the last run of others.
 
-    Nodes not reached are to do.
+    Nodes not reached have the state "to do".
     """
     found = list[Run]()
     for node in nodes:
@@ -214,7 +214,10 @@ def write_batch(
 
 
 def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: str) -> None:
-    """Raise UsageError if a folder is of another sweep or study (`what`); InputError if unreadable."""
+    """Raise UsageError if `out` is of a sweep or study (`what`) with other settings, or of another command.
+
+    Its file `name` has the settings; raises InputError if that is unreadable.
+    """
     file = out / name
     if not file.is_file():
         if any((out / other).exists() for other in (*MARKERS, FILE)):

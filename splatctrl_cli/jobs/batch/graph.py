@@ -41,7 +41,7 @@ class CommandLine(Protocol):
     entry: str
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
-        """Words for options, with paths from `folder`, and the files they read.
+        """Words for options, whose paths are relative to `folder`, and the files they read.
 
         Raises UsageError for an unknown option.
         """
@@ -218,7 +218,7 @@ def _text(value: Any) -> str:
 
 
 def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
-    """Matrix choices in a name; with the job where two share an option."""
+    """Write matrix choices for a node's name, with the job's name if two jobs share an option."""
     chosen = {
         f"{job.name}.{option}": (option.removeprefix("set."), values)
         for job in jobs
@@ -260,7 +260,7 @@ def _joined(variants: Sequence[Variant]) -> Variant | None:
 
 
 def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
-    """Add matrix choices to options; ``set.SECTION.KEY`` adds to the settings, likewise `TABLES`."""
+    """Add matrix choices to options; ``set.SECTION.KEY`` and ``perturb.NAME`` add an entry to their table."""
     merged = dict(options)
     for key, value in chosen.items():
         table, dot, entry = key.partition(".")

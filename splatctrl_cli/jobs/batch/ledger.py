@@ -101,7 +101,7 @@ class Ledger(AbstractContextManager["Ledger"]):
     """The ledger of batches in one folder; several processes may open it."""
 
     def __init__(self, folder: Path) -> None:
-        """Open the ledger. Raises InputError for another or a newer file."""
+        """Open the ledger. Raises InputError for a file that is no ledger, or a newer one."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self.path = folder, folder / NAME
         self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
@@ -176,7 +176,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         return {row["job"]: float(row["mean"]) for row in rows}
 
     def runs(self, conditions: Sequence[str] = (), *, only_last: bool = True) -> Iterator[Run]:
-        """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10". Raises UsageError."""
+        """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10". Raises UsageError for others."""
         clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
         for condition in conditions:
             match = _COMPARISON.fullmatch(condition.strip())

@@ -1,4 +1,4 @@
-"""Nodes through processes in graph order; unchanged results are kept."""
+"""The scheduler of a batch: nodes run in graph order, in processes; unchanged results are kept."""
 
 import json
 import os
@@ -32,7 +32,7 @@ PRINTED = "printed"  # stamp of a node that only prints
 
 @dataclass(kw_only=True)
 class Scheduler:
-    """A runner of nodes on an executor of `slots` places; hint: cause of a wait."""
+    """A runner of nodes on an executor of `slots` places; hint: why a wait may be in vain."""
 
     ledger: Ledger
     entry: str
@@ -232,14 +232,14 @@ class Clock:
         self._seen: dict[str, list[float]] = {}
 
     def passed(self, run: Run) -> str:
-        """Count a run."""
+        """Count a run, and return "[finished/all]"."""
         self._left[run.job] -= 1
         if run.started >= self.started and run.state != SKIPPED:
             self._seen.setdefault(run.job, []).append(run.seconds)
         return f"[{self._total - self._left.total()}/{self._total}]"
 
     def left(self) -> str:
-        """The time left: "over" if a job has no mean; empty without any."""
+        """The time left in words: "over" a time if a job has no mean yet, empty if none has."""
         means = self._means | {job: sum(each) / len(each) for job, each in self._seen.items()}
         known = Counter({job: count for job, count in self._left.items() if count and job in means})
         if not known:

@@ -37,7 +37,7 @@ class Limits:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One command of a suite; options by long name, matrix: values by option, combined to variants.
+    """One command of a suite. options: by long name; matrix: values by option, each combination a variant.
 
     expect: a verdict's label or outcome, or "exit N".
     """

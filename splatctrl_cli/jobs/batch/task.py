@@ -1,7 +1,7 @@
 """One node's run in a forked child under limits, with log, result and end.
 
 A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time in one
-thread, read as JSON lines from stdin. When stdin ends, so does the run.
+thread, and reads each as a line of JSON from stdin. When stdin ends, so does the run.
 """
 
 import contextlib
@@ -47,7 +47,7 @@ WROTE = (0, 1, 3, 5)  # exit codes of a command that left its output
 class Task:
     """Work of a runner: call `entry` with `words`, write `result` (stdout), `log` (stderr), `end`.
 
-    timeout [s], memory [bytes]: 0 for none. Plain values, for other machines.
+    key: the node's, kept in `end`. timeout [s], memory [bytes]: 0 for no limit. Plain values, for other machines.
     """
 
     entry: str
@@ -135,7 +135,7 @@ def read_end(path: Path, key: str) -> End | None:
 
 
 def stamp_of(out: Path) -> str:
-    """Size and time of an output's run.json, or of the file; empty without."""
+    """Size and time of an output's run.json or capture.json, or of the file; empty if there is no output."""
     for place in (out / "run.json", out / "capture.json", out):
         with contextlib.suppress(OSError):
             found = place.stat()
@@ -168,7 +168,7 @@ def _started(entry: str) -> "subprocess.Popen[str]":
 
 
 def main(entry: str) -> None:
-    """Run tasks from stdin, ends to stdout, until stdin ends."""
+    """Run tasks from stdin and write their ends to stdout, until stdin ends."""
     module = importlib.import_module(entry.partition(":")[0])
     function: Entry = getattr(module, entry.partition(":")[2])
     getattr(module, "preload", lambda: None)()

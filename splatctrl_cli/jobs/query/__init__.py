@@ -1,1 +1,1 @@
-"""Queries of fields."""
+"""Queries of fields and scenes."""

@@ -50,9 +50,10 @@ _DECIMALS = 7  # of a length [m]: finer than float32
 class Answers:
     """Answers at Q points, world; None if unavailable, NaN or -1 where a point has none.
 
-    in_box (Q,). distance (Q,) [m], gradient (Q, 3). bound (Q,) [m]: lower bound of the exact distance to the splats.
-    probability (Q,) of collision. label (Q,) `Label` and splat (Q,), file index, of the nearest sphere. observed (Q,)
-    `VoxelState`. surface (Q, 3) [m]: end of sphere marching, where the field reads rest (Q,) [m].
+    in_box (Q,): in the source's box. distance (Q,) [m], gradient (Q, 3). bound (Q,) [m]: lower bound of the exact
+    distance to the splats. probability (Q,) of collision. label (Q,) `Label` and splat (Q,), file index, of the
+    nearest sphere. observed (Q,) `VoxelState`. surface (Q, 3) [m]: end of sphere marching, where the field reads
+    rest (Q,) [m].
     """
 
     in_box: Bool | None = None
@@ -80,7 +81,7 @@ class SceneAnswers:
     ) -> None:
         """Build the fields, on the card `device` if given.
 
-        Raises UsageError if unknown space counts: only a grid has it.
+        Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
         """
         if config.field.unknown != "free":
             raise UsageError(

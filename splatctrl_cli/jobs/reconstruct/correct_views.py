@@ -36,7 +36,7 @@ class Corrections:
 
     @property
     def options(self) -> str:
-        """Command-line form."""
+        """The corrections as command-line options."""
         return " ".join(
             n for n, given in (("--refine-poses", self.poses), ("--refine-exposure", self.exposure)) if given
         )

@@ -29,7 +29,7 @@ class KeptMaps:
         self._last: _Map | None = None
 
     def is_due(self, index: int, stamp_ns: int) -> bool:
-        """True every `snapshot_every` steps, once per `snapshot_period`."""
+        """True every `snapshot_every` steps, but at most once in each multiple of `snapshot_period`."""
         scene, taken = self._config.scene, self._writer.snapshots
         if index % scene.snapshot_every:
             return False
@@ -42,7 +42,7 @@ class KeptMaps:
     def shows_news(self, fitter: SceneFitter) -> bool:
         """True if at least `NEWS_LEAST` spheres may be a new obstacle.
 
-        They exceed the last kept map's by half a voxel, in voxels free there.
+        They stand out of the last kept map's spheres by more than half a voxel, in voxels free there.
         """
         if not self._writer.snapshots:
             return False

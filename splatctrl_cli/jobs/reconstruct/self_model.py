@@ -76,7 +76,7 @@ def arm_of(model: RobotModel, source: FrameSource) -> Arm:
 def arm_seen(model: RobotModel, source: RecordSource, progress: Progress) -> tuple[Arm, list[RgbdFrame]] | None:
     """`arm_of` a log and its `frames_of`.
 
-    None without meshes, a log that moves the robot, or posed frames (logged).
+    None without meshes, without a log that moves the robot, or (logged) without posed frames.
     """
     if not isinstance(source, LOGGED) or not source.joint_names or not model.surface.trees:
         return None

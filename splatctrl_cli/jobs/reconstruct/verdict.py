@@ -119,7 +119,7 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
 
 
 def _blind(made: Reconstructed) -> Iterator[Reason]:
-    """Cameras with stale depth, or none for longer than evidence lasts."""
+    """Cameras with stale depth, or with no depth for longer than evidence lasts."""
     for camera, num in made.metrics["repeated_frames"].items():
         yield noted("depth", f"camera {camera}: {num} frames repeat the depth of the one before: left out")
     without = made.metrics["frames_without_depth"]

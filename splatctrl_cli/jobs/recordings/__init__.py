@@ -1,1 +1,1 @@
-"""Recordings of jobs, and their match with scenes."""
+"""Recordings that jobs read, and checks that a scene was made from them."""

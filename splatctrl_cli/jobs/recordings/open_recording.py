@@ -30,8 +30,8 @@ class RecordingRequest:
     """A recording at `path`: log, capture, image folder, or DTU data set.
 
     scan: None for the only one. options: for a scan its holdout alone. protocol: training and scored views. masks,
-    depths: folders with what a scan lacks. downscale: None for the protocol's size. beside: more logs of the session;
-    UsageError with an image folder.
+    depths: folders with what a scan lacks. downscale: None for the protocol's size. beside: more logs of the session.
+    Raises UsageError if `beside` is given with an image folder.
     """
 
     path: Path
@@ -58,7 +58,7 @@ def open_to_train(
 ) -> RecordSource:
     """Open the recording without held-out views.
 
-    Raises UsageError for foreign options. Raises InputError for a scan without depth, a camera jump above
+    Raises UsageError for options of other recordings. Raises InputError for a scan without depth, a camera jump above
     `max_pose_jump` [m], and errors of `check`, except `allowed` codes.
     """
     if recording.is_dtu:
@@ -147,7 +147,7 @@ def check_pose_jumps(source: FrameSource, limit: float) -> None:
 
 
 class CameraAgreement:
-    """Agreement of cameras; disagreement [m]: of each pair with enough shared view.
+    """Agreement of cameras; disagreement [m]: how far apart a pair with enough shared view sees surfaces.
 
     is_allowed: warn instead of refusing. is_still: views of a step show the same scene. guess: a guessed unit, in
     words.

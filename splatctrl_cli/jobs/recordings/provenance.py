@@ -1,4 +1,4 @@
-"""Matches of scene or field, log, truth and robot by content.
+"""Checks by content that scene or field, log, truth and robot belong together.
 
 Camera names are alike on every rig and prove nothing.
 """
@@ -226,7 +226,7 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
 
 
 def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
-    """Mismatch of states at stamps (T,) [ns] and a scene's span; None if they (nearly) overlap."""
+    """Mismatch of states at stamps (T,) [ns], T > 0, and a scene's span; None if they (nearly) overlap."""
     first, last = int(states_ns[0]), int(states_ns[-1])
     apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
     if apart_ns <= RECORDINGS_APART_NS:

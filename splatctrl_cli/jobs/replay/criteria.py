@@ -277,7 +277,7 @@ def clocks(judged: Judged) -> Iterator[Reason]:
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
-    """Closed loop: every step is solved; a user's controller always answers validly."""
+    """Every step of the closed loop is solved; a user's controller always answers validly."""
     if judged.replay.outside is not None:
         yield _answers(judged, judged.replay.outside)
         return
@@ -318,7 +318,7 @@ def _answers(judged: Judged, outside: OutsideController) -> Reason:
 
 
 def scene_hits(judged: Judged) -> Iterator[Reason]:
-    """Closed loop: nothing appears inside the arm."""
+    """Nothing appears inside the arm; judged in closed loop."""
     trace = judged.replay.closed_loop
     if trace is None:
         return
@@ -336,7 +336,7 @@ def scene_hits(judged: Judged) -> Iterator[Reason]:
 
 
 def goal(judged: Judged) -> Iterator[Reason]:
-    """Closed loop: the goal is reached."""
+    """The goal is reached; judged in closed loop."""
     trace, request = judged.replay.closed_loop, judged.request
     if trace is None or request.follow or request.twist_topic is not None:
         return

@@ -182,8 +182,8 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
     """Largest miss of each held-out frame set near the motion, without the robot.
 
     Near is within `reach` [m]; sets count within the audited time. One at a time is in memory. Each is compared with
-    the map that judged the states just before it, when that map is oldest. A newer map may contain other cameras of
-    the same moment.
+    the map that judged the states just before it, when that map is oldest. The next map contains other cameras of
+    the same moment, so it misses less than the one that judges.
     """
     swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
@@ -239,7 +239,7 @@ def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
 
 
 class Swept:
-    """Space within `reach` [m] of an arm's moving spheres, up to SPHERE_CELL more."""
+    """Space within `reach` [m] of an arm's moving spheres, or up to the diagonal of a SPHERE_CELL farther."""
 
     def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
         """Enclose cells (K, 3), whole numbers of SPHERE_CELL, by radii (K,) [m], the largest in each."""
@@ -271,7 +271,7 @@ class Swept:
 
 
 class TrueSurfaces:
-    """True surface points (T, 3) [m] nearest to each state; `seen` by a camera so far."""
+    """True surface points (T, 3) [m] nearest to each state; `seen` (T,): by a camera by then."""
 
     def __init__(self, points: Rows, stamp_ns: Stamps, inputs: ReplayInputs) -> None:
         self._points, self._stamp_ns = points, stamp_ns

@@ -40,7 +40,7 @@ from splatctrl_cli.voxels import EvidenceClass
 class Limit:
     """A row of the evidence table; column: of `NEAR_COLUMNS`, for `parts` the least of their classes.
 
-    most: largest share allowed; least [m]: smallest distance (0: the margin). For the documentation, asked: the
+    most: largest share allowed; least [m]: distance to exceed (0: the margin). For the documentation, asked: the
     quantity; why: the reason.
     """
 
@@ -223,10 +223,10 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
 
 
 def map_error(judged: Judged) -> Iterator[Reason]:
-    """With `--evidence`: the surface clearance less the bound on the map's error is at least 0.
+    """The surface clearance less the bound on the map's error is at least 0; judged with `--evidence`.
 
-    A smaller clearance shows no contact, but the map cannot exclude one: not evaluable, unless another criterion
-    fails. The same holds for too little evidence.
+    With a smaller clearance no contact was seen, but the map cannot exclude one: not evaluable, unless another
+    criterion fails. The same holds for too little evidence.
     """
     found, surface = judged.replay.map_error, least_of(judged.replay.between["surface"])
     if found is None:

@@ -74,7 +74,7 @@ def goal_waypoints(
 
 
 def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64:
-    """Configuration (J,) of --goal-joints; omitted gripper fingers stay as logged at the end."""
+    """Configuration (J,) of --goal-joints; omitted gripper fingers stay as logged at the end. Raises InputError."""
     is_arm = [name not in model.urdf.grippers for name in model.joint_names]
     if len(values) == sum(is_arm):
         posture = logged_end.copy()
@@ -167,7 +167,7 @@ def check_twists(request: ReplayRequest) -> None:
 def twist_track(
     request: ReplayRequest, model: RobotModel, span_ns: tuple[int, int], console: Progress
 ) -> TwistTrack | None:
-    """Read the twists of --twist-topic; span_ns: first and last joint state.
+    """Read the twists of --twist-topic, None without it; span_ns: first and last joint state.
 
     Raises InputError for an unknown frame, or no overlap in time.
     """

@@ -32,7 +32,7 @@ class LaterDepth:
 
 
 class NewerDepth:
-    """Comparison of states with their own depth if maps are late, the last with the next."""
+    """Comparison of states with the depth of their own time if maps are late, and of the last with the next depth."""
 
     def __init__(self, scene: KnownScene, margin: float, clearance_in: ClearanceIn) -> None:
         self._scene, self._margin, self._clearance_in = scene, margin, clearance_in

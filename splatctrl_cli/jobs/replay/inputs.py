@@ -254,7 +254,7 @@ class LoggedStates:
         return dict(zip(LOG_FIGURES, values, strict=True))
 
     def counts(self) -> dict[str, int]:
-        """Number of poses or intervals behind each metric."""
+        """Number of poses or intervals behind each metric but `num_poses`."""
         num_poses = 0 if self.poses is None else self.poses.num_poses
         num_intervals = 0 if self.clock is None else self.clock.num_intervals
         return {name: num_intervals if name.startswith("clock_") else num_poses for name in [*LOG_FIGURES][1:]}
@@ -299,7 +299,7 @@ def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[Expected
 
 
 def recorded_postures(states: StateColumns) -> Float64:
-    """About SELF_POSTURES postures (R, J), evenly over the log."""
+    """Postures (R, J) evenly over the log: at least SELF_POSTURES and below twice as many, or all."""
     return states.position[np.arange(0, len(states), max(len(states) // SELF_POSTURES, 1))]
 
 

@@ -84,7 +84,7 @@ def _latency_ns(request: ReplayRequest) -> int:
 
 
 def reads_whole_log(request: ReplayRequest, source: RecordSource) -> bool:
-    """True if a lockstep reads every frame of the log, none left out as evidence."""
+    """True if a lockstep reads every frame of the log: none of its cameras is evidence."""
     return request.lockstep and request.evidence not in source.cameras
 
 

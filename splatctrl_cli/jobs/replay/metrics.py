@@ -327,7 +327,7 @@ def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
 
 
 def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> float | None:
-    """First time [s] at which a metric over the states so far breaks.
+    """First time [s] at which a metric over the states so far does not hold.
 
     None for metrics that are not of single states.
     """

@@ -199,7 +199,7 @@ def _replay(
 def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
     """Stamp from which to replay the log.
 
-    Raises InputError after its end, NotEvaluableError if the log ends before the scene.
+    Raises InputError for a start after its end, NotEvaluableError if the log ends before the scene.
     """
     scene, stamps = inputs.scene, inputs.states.stamp_ns
     if scene.first_ns is not None and scene.first_ns > stamps[-1]:

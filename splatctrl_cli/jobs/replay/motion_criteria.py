@@ -39,7 +39,7 @@ def clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def certified_clearance(judged: Judged) -> Iterator[Reason]:
-    """With a grid alone: the bound that holds between its cells keeps the margin."""
+    """The bound between grid cells keeps the margin; judged with a grid alone."""
     clearance = judged.replay.audit.clearance
     if "certified" not in clearance:
         return
@@ -60,13 +60,13 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_of_people(judged: Judged) -> Iterator[Reason]:
-    """With `control.human_margin`: people keep that distance."""
+    """The arm keeps `control.human_margin` from people; judged if that exceeds the margin."""
     if judged.inputs.scene.has_people_margin:
         yield from _by_source(judged, "barrier")
 
 
 def true_clearance(judged: Judged) -> Iterator[Reason]:
-    """With `--truth`: the true clearance of every moving sphere keeps the margin."""
+    """The true clearance of every moving sphere keeps the margin; judged with `--truth`."""
     if judged.replay.true_clearance is not None:
         yield from _by_source(judged, "true")
 
@@ -135,9 +135,9 @@ def _at_worst(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links overlap. No moving link comes within the margin of a fixed one that carries none, such as a table
-    of the URDF. Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest
-    gap) unless the recording was. Measured by collision surfaces, or by spheres if these cannot be read.
+    """No two links overlap. No moving link comes within the margin of a fixed one that carries no joint, such as a
+    table of the URDF. Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their
+    largest gap) unless the recording was. Measured by collision surfaces, or by spheres if these cannot be read.
     """
     least = least_of(judged.replay.audit.figures["self_clearance"])
     events = events_of(judged.replay, EventKind.SELF_COLLISION)
@@ -182,7 +182,7 @@ def _beside_fixture(judged: Judged) -> Reason | None:
 
 
 def _brought_together(judged: Judged) -> Reason | None:
-    """The first pair our controller brought below its lowered margin and nearer than the recording."""
+    """The worst pair that our controller brought below its lowered margin and nearer than the recording had it."""
     inputs, replay = judged.inputs, judged.replay
     if replay.outside is not None:
         return None
@@ -258,13 +258,15 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
-    """At most one percent above the URDF's limits, in the motion and in the commands of a user's controller."""
+    """Velocities of the motion, and those that a user's controller commands, exceed the URDF's limits by at most one
+    percent.
+    """
     too_fast = commanded(judged)
     yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST) if too_fast is None else (too_fast,)
 
 
 def acceleration_limits(judged: Judged) -> Iterator[Reason]:
-    """At most one percent above `control.max_acceleration`, where it is set."""
+    """Accelerations exceed `control.max_acceleration`, where it is set, by at most one percent."""
     yield from _share_of_limit(judged, "acceleration", EventKind.TOO_SUDDEN)
 
 
@@ -344,7 +346,10 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
 
 
 def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
-    """Least clearance [m] of spheres, surface, and between states; the last two None if already broken."""
+    """Least clearance [m] of spheres, surface, and between states.
+
+    The last two are None if unknown. If the spheres break the margin, they are None and the first is NaN.
+    """
     clearance = judged.replay.audit.clearance
     spheres = least_of(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
     if spheres is None or spheres < judged.threshold:

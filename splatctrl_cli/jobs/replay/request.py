@@ -39,11 +39,11 @@ class ReplayRequest(RobotOptions, RunOptions):
     """One replay: the options of ``splatctrl replay``, by name.
 
     log: read by `options`. urdf: None for the robot of the log. The scene is `scene` (a reconstruction), `field` (a
-    baked grid) or `lockstep` (reconstruct on the way, on `device`). start_time [s] may be FIRST_MAP. evidence: a
-    held-out camera, or k for each k-th frame set, to bound the map's error. require_evidence, require_proof: no pass
-    without evidence, or with space about the arm assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's
-    class ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the verdict sets no exit
-    code.
+    baked grid) or `lockstep` (reconstruct meanwhile, on `device`). Times are in seconds; start_time may be FIRST_MAP.
+    evidence: a held-out camera, or k for each k-th frame set, to bound the map's error. require_evidence,
+    require_proof: no pass without evidence, or with space about the arm assumed free. unseen: `JUDGE` or `OCCUPIED`.
+    controller: a user's class ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the
+    verdict sets no exit code, except by `require`.
     """
 
     log: Path
@@ -133,8 +133,9 @@ class Replay:
 
     num_before_scene: requested states before the first scene, left out, over lead_in_s [s]. start_time_s: of the
     first state in the log. between, near, strain, statics, closest: as in `ReplayRecord`. unwatched, overtaken: from
-    later depth. map_age_s (T,). divergence: of a closed loop from the log: joints [rad], position [m], rotation
-    [rad]. outside: a user's controller.
+    later depth. obstacles (T,): nearest to the nearest sphere, in words. map_age_s (T,): of the scene in use.
+    divergence: of a closed loop from the log: joints [rad], position [m], rotation [rad]. outside: a user's
+    controller.
     """
 
     model: RobotModel

@@ -50,7 +50,7 @@ NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # columns of evidence about the
 class ReplayRecord:
     """Audit of T states in the scenes known at their times, with what happened.
 
-    obstacles: nearest to the nearest sphere.
+    obstacles: in words, the nearest to the nearest sphere.
     between: clearance bound since the state before (`lower` [m], NaN at the first). `met`: 1 if a posture on the way
     has it. `unbounded` [s]: time without a bound. `surface` [m]: clearance of the body. `represented` [m]: of the
     spheres to splats alone.

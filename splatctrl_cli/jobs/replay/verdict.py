@@ -66,7 +66,7 @@ def _doubted(reason: Reason) -> Reason:
 
 
 def _how(judged: Judged) -> str:
-    """ "waived", "proven" (cameras saw all space within the margin free), or neither."""
+    """Return "waived", "proven" (cameras saw all space within the margin free), or an empty text."""
     if any(waivers(judged.request)):
         return "waived"
     assumed = nearby(judged, judged.replay.near["assumed"])

@@ -69,7 +69,7 @@ class WriteReportResult(WrittenFile):
 def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> WriteReportResult:
     """Write the page.
 
-    Raises InputError for no or an incomplete run or batch, one too new, or unlike `against`.
+    Raises InputError if `path` is no run or batch, incomplete, too new, or not comparable with `against`.
     """
     if is_batch(request.path):
         page = _of_batch(request, open_batch(request.path), progress)

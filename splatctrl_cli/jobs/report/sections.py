@@ -127,7 +127,8 @@ STATES = {Change.WORSE: "failed"}  # of a row
 def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple[list[Table], frozenset[str]]:
     """Tables of changes, the second folded, and the jobs with a regression or another verdict.
 
-    before: a folder or baseline; None for no tables. has_links: each job has a section. Raises InputError.
+    before: a folder or baseline; None for no tables. has_links: each job has a section. Raises InputError
+    if they cannot be compared.
     """
     if before is None:
         return [], frozenset()

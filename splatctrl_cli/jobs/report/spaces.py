@@ -182,7 +182,7 @@ def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple
 
 
 def spread(times: list[float], when: float) -> list[int]:
-    """At most MOST_SETS of `times`: first, last, the one at `when`, others evenly."""
+    """Indices of at most MOST_SETS of `times`: first, last, the one at `when`, others evenly."""
     if not times:
         return []
     count = len(times)

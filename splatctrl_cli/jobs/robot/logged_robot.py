@@ -47,7 +47,10 @@ def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
 
 
 def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:
-    """Robot of --urdf, with a warning if the logs describe another; by default theirs."""
+    """Robot of --urdf, with a warning if the logs describe another; by default theirs, None without one.
+
+    Raises InputError.
+    """
     if given is None:
         return logged_urdf(paths)
     file = read_urdf(given)
@@ -87,7 +90,7 @@ def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
 
 
 def differs(file: UrdfFile, paths: Sequence[Path]) -> str:
-    """Describe how a model differs from all in the logs; empty if alike or none."""
+    """Describe how a model differs from all in the logs; empty if it is like one of them, or there is none."""
     words = []
     for path, description in logged_descriptions(paths):
         try:

@@ -12,7 +12,7 @@ class Progress(Protocol):
     is_quiet: bool
 
     def log(self, line: str) -> None:
-        """One line."""
+        """Show one line."""
         ...
 
 
@@ -29,7 +29,7 @@ SILENT = Silent()
 
 
 class Wait:
-    """A wait of many steps, announced, then reported with the time left."""
+    """A wait of many steps, announced, then reported with the time left; total: None if unknown."""
 
     def __init__(self, progress: Progress, what: str, unit: str, total: int | None = None) -> None:
         self._progress, self._what, self._unit, self._total = progress, what, unit, total

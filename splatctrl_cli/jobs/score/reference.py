@@ -112,7 +112,7 @@ def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference
 
 
 def missing_views(source: DtuSource, protocol: ScoreProtocol | None) -> Iterator[str]:
-    """Sentences on a scan's missing views that change the scored ones, or lack depth."""
+    """Sentences on a scan's views that are missing, if that changes the scored ones, or lack depth."""
     numbers = sorted({*source.split.training, *source.split.scored, *source.split.left_out})
     missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
     if missing and protocol is not None and protocol.every:
@@ -195,7 +195,7 @@ def recording_check(
 ) -> dict[str, Any]:
     """Compare the recording with the scene's own; raises InputError for another, unless allowed.
 
-    Compares first frames of training cameras (unless an older version), and digests of equal file names.
+    Compares first frames of training cameras (an older version kept none), and digests of equal file names.
     """
     recorded = scene.run.get("metrics", {}).get("first_frames")
     then = scene.run.get("inputs", {})

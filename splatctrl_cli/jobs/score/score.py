@@ -45,7 +45,7 @@ class ScoreRequest:
 
     recording: its options' cameras are scored. baseline: score.json of an earlier score. newest: render a view from
     the newest snapshot not later than it, else from the final splats. images: pictures of ``all`` views, each
-    camera's ``best-worst``, or ``none``. Raises UsageError for all without a folder.
+    camera's ``best-worst``, or ``none``. Raises UsageError for ``all`` without `out`.
     """
 
     scene: Path
@@ -83,7 +83,7 @@ class ScoreResult:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Views behind each figure."""
+        """Number of views behind each figure."""
         return self.verdict.counts
 
     @property

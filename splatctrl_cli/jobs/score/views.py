@@ -252,7 +252,7 @@ def _reference(settings: CloudSettings) -> Float64:
 
 
 def _surface(scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int, spacing: float) -> Float64:
-    """World points (P, 3) [m] of the final splats' rendered depth, without the robot, thinned."""
+    """World points (P, 3) [m] of the final splats' depth at `frames`, without the robot, `spacing` [m] apart."""
     splats = final_splats(scene)
     splats = splats.select(splats.labels != Label.ROBOT)
     shown = (rendered(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)

@@ -1,4 +1,4 @@
-"""Keys of a sweep, and the jobs with their values."""
+"""Keys that a sweep may vary, and the jobs of a run with values of them."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence

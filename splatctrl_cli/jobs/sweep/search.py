@@ -93,7 +93,7 @@ class LeastChange:
 
 
 def find_least(judge: JudgeAt, alone: Sequence[float | None], *, tolerance: float) -> LeastChange | None:
-    """Find the shortest joint change that flips the outcome of (0, ..., 0).
+    """Find the shortest joint change that flips the outcome of (0, ..., 0); None if no direction tried has one.
 
     Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
     SWEEP_DIRECTIONS of Halton's sequence, then turns the best by a quarter and an eighth towards and away from each
