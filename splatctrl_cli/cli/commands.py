@@ -314,7 +314,7 @@ COMMANDS = {
         },
     ),
     "config": Command(
-        summary="print every setting and where it comes from, check a file, begin one",
+        summary="print every setting and where it comes from, or check a file",
         examples=("config my.toml --set scene.max_splats=3000", "config --template"),
         run="config:run",
         options=_CONFIG,
