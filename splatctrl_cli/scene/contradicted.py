@@ -27,6 +27,7 @@ from splatctrl_cli.scene.stereo_shadow import shadowed
 
 T = TypeVar("T", bound=np.generic)
 BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
+ALONG = np.array([[1.0, -2.0, 1.0]], np.float32)  # twice the deviation from the mean of two neighbours
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,12 +133,22 @@ def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
     side = _side(frame)
     depth = _blocks(frame.depth, side)
     nearest, farthest = depth.min(axis=2), depth.max(axis=2)
-    is_flat = cv2.dilate(farthest, BESIDE) - cv2.erode(nearest, BESIDE) < 2 * MASK_STEP
+    is_flat = (cv2.erode(nearest, BESIDE) > 0) & _is_plane(nearest) & _is_plane(farthest)
     is_object = _blocks(mask.kinds == PixelKind.OBJECT, side).all(axis=2)
     v, u = np.nonzero(is_flat & is_object)
     middle, mean = side // 2, depth.mean(axis=2)[v, u]
     points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
     return _Surface(points=transform_points(frame.T_world_camera, points), v=v, u=u, depth=mean)
+
+
+def _is_plane(depth: Float32) -> Bool:
+    """True (h, w) where a depth differs from the plane through its neighbours by less than `MASK_STEP`.
+
+    Inverse depth of a plane is linear over the image, however it is tilted.
+    """
+    inverse = 1 / np.maximum(depth, np.float32(1e-3))
+    bend = [cv2.filter2D(inverse, -1, line, borderType=cv2.BORDER_REPLICATE) for line in (ALONG, ALONG.T)]
+    return np.asarray(np.maximum(*map(np.abs, bend)) * depth**2 < 2 * MASK_STEP)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, object_mask
 from splatctrl_cli.voxels import EvidenceClass
+from tests.plain import plain_frame
 from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame
 
 CONFIG = OccupancyConfig()
@@ -84,6 +85,35 @@ def test_a_camera_without_depth_where_another_measures_a_surface_looked_in_vain(
     points = found.points(dark, CONFIG, is_blank=True)
     assert len(points) and not found.pixels(dark.depth.shape).any()
     assert np.linalg.norm(points - [0.0, 0.0, BLOCK / 2], axis=1).min() < CONFIG.voxel
+
+
+def grazing(angle: float, away: float) -> RgbdFrame:
+    """A camera that looks at the origin of the floor, `angle` [rad] above it and `away` [m] from it."""
+    forward = np.array([0.0, np.cos(angle), -np.sin(angle)])
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([[1.0, 0.0, 0.0], np.cross(forward, [1.0, 0.0, 0.0]), forward])
+    T[:3, 3] = -away * forward
+    v, _ = np.mgrid[: INTRINSICS.height, : INTRINSICS.width]
+    down = -(T[2, 1] * (v - INTRINSICS.cy) / INTRINSICS.fy + T[2, 2])
+    depth = np.where(down > 0.05, T[2, 3] / np.maximum(down, 0.05), 0).astype(np.float32)
+    return plain_frame(depth, INTRINSICS, T, camera="cam1")
+
+
+@pytest.mark.parametrize("angle", [np.pi / 2, 0.6, 0.4])
+def test_a_floor_seen_at_any_angle_says_where_a_dark_block_returns_no_depth(angle: float) -> None:
+    """At 0.4 rad a pixel of the floor lies 4 cm behind its neighbour."""
+    found, _ = contradicted(masks_of(block_measured_at(0.0), grazing(angle, 1.2)), is_drawn=False)
+    is_blank = found.is_blank & (found.until > 0)
+    assert is_blank.sum() > 0.5 * found.is_blank.sum()
+
+
+def test_depth_beside_a_step_is_no_surface() -> None:
+    """Each pixel of the ribs is beside one: it may show either height."""
+    ribbed, dark = frame(x=BESIDE, camera="cam1"), block_measured_at(0.0)
+    ribbed.depth[:, 0::4] += 0.05
+    ribbed.depth[:, 1::4] += 0.05
+    found, _ = contradicted(masks_of(dark, ribbed), is_drawn=False)
+    assert found.is_blank.any() and not found.until.any()
 
 
 def test_where_no_camera_has_depth_nothing_is_missing() -> None:
