@@ -66,6 +66,10 @@ def test_assignments_win_over_the_file_and_the_file_over_the_defaults(tmp_path: 
         ),
         ("control.self_slack_cost=10", "control.self_slack_cost: expected at least control.slack_cost = 1000"),
         ("control.period=0.1 control.max_time=0.05", "control.max_time: expected at least"),
+        (
+            "control.max_acceleration=[1,'x']",
+            "expected float or list of float, 0 or 0.01 to 1000 rad/s^2, got [1, 'x']",
+        ),
         ("planner.shortest=2", "planner.shortest: expected at most planner.reach = 1.5 rad, got 2.0"),
     ],
 )
