@@ -16,13 +16,8 @@ CAMERA = camera_array(
 
 def leaves(dtype: torch.dtype) -> list[torch.Tensor]:
     rng = np.random.default_rng(4)
-    values = [
-        rng.uniform(-0.2, 0.2, (25, 3)),
-        rng.uniform(0.01, 0.05, 25),
-        rng.uniform(0.1, 0.9, 25),
-        rng.uniform(0, 1, (25, 3)),
-    ]
-    return [torch.tensor(value.astype(np.float32), dtype=dtype, requires_grad=True) for value in values]
+    ranges = ((-0.2, 0.2, (25, 3)), (0.01, 0.05, 25), (0.1, 0.9, 25), (0, 1, (25, 3)))
+    return [torch.tensor(np.float32(rng.uniform(*each)), dtype=dtype, requires_grad=True) for each in ranges]
 
 
 def test_a_loss_differentiates_through_it_as_through_the_reference() -> None:
@@ -36,18 +31,13 @@ def test_a_loss_differentiates_through_it_as_through_the_reference() -> None:
 
 
 def test_gradient_descent_recovers_a_colour() -> None:
-    centers, radii, opacities, colors = leaves(torch.float32)
-    with torch.no_grad():
-        target = rasterise(CAMERA, centers, radii, opacities, colors)
-    guess = torch.full_like(colors, 0.5, requires_grad=True)
+    *shape, colors = (leaf.detach() for leaf in leaves(torch.float32))
+    target, guess, losses = rasterise(CAMERA, *shape, colors), torch.full_like(colors, 0.5, requires_grad=True), []
     adam = torch.optim.Adam([guess], lr=0.05)
-    first = last = 0.0
-    for step in range(60):
-        loss = (
-            (rasterise(CAMERA, centers.detach(), radii.detach(), opacities.detach(), guess) - target).square().mean()
-        )
+    for _ in range(60):
+        loss = (rasterise(CAMERA, *shape, guess) - target).square().mean()
         adam.zero_grad()
         loss.backward()
         adam.step()
-        first, last = (loss.item() if step == 0 else first), loss.item()
-    assert last < 0.01 * first
+        losses.append(loss.item())
+    assert losses[-1] < 0.01 * losses[0]
