@@ -69,27 +69,26 @@ def test_the_account_is_that_of_the_reference() -> None:
     assert found.places[hidden][2] < 0 and found.nearest[EvidenceClass.CONTRADICTED] == np.inf
 
 
-def test_every_point_has_one_class_at_its_own_distance() -> None:
-    """One voxel of each class in turn, off the tip of the arm."""
-    arm = PlanarArm()
+@pytest.mark.parametrize(
+    "kind", [EvidenceClass.CONTRADICTED, EvidenceClass.UNANSWERED, EvidenceClass.OUTSIDE, EvidenceClass.SWEPT]
+)
+def test_every_point_has_one_class_at_its_own_distance(kind: EvidenceClass) -> None:
+    """One voxel of a class, off the tip of the arm."""
+    arm, free = PlanarArm(), np.uint8(EvidenceClass.FREE)
     place = NEAR_LATTICE * np.round(off_the_tip(arm, 0.04) / NEAR_LATTICE)
     gap = min(np.linalg.norm(place - arm.sphere_centers(LATER), axis=1) - arm.sphere_set.radii) - NEAR_LATTICE / 2
-    for kind in (EvidenceClass.CONTRADICTED, EvidenceClass.UNANSWERED, EvidenceClass.OUTSIDE, EvidenceClass.SWEPT):
-
-        def around(points: Float64, kind: EvidenceClass = kind) -> UInt8:
-            is_there = np.linalg.norm(points - place, axis=1) < 1e-6
-            return np.where(is_there, np.uint8(kind), np.uint8(EvidenceClass.FREE))
-
-        found = NearSpace(arm, 0.06).look(0, LATER, seen_by(around))
-        assert (found.nearest[kind], found.places[kind].tolist()) == (pytest.approx(gap), place.tolist())
-        assert found.shares[kind] > 0 and found.assumed > 0
+    seen = seen_by(lambda points: np.where(np.linalg.norm(points - place, axis=1) < 1e-6, np.uint8(kind), free))
+    found = NearSpace(arm, 0.06).look(0, LATER, seen)
+    assert (found.nearest[kind], found.places[kind].tolist()) == (pytest.approx(gap), place.tolist())
+    assert found.shares[kind] > 0 and found.assumed > 0
 
 
-def test_what_was_seen_too_long_ago_is_stale() -> None:
-    space = NearSpace(PlanarArm(), 0.03, max_age=1.0)
-    fresh, old = (space.look(stamp, LATER, seen_by(EvidenceClass.FREE)) for stamp in (SECOND, 2 * SECOND))
-    assert (fresh.shares[EvidenceClass.FREE], old.shares[EvidenceClass.STALE]) == (1.0, 1.0)
-    assert (fresh.assumed, old.assumed, old.age) == (0.0, 1.0, pytest.approx(2.0))
+@pytest.mark.parametrize(
+    ("stamp", "kind", "assumed"), [(SECOND, EvidenceClass.FREE, 0.0), (2 * SECOND, EvidenceClass.STALE, 1.0)]
+)
+def test_what_was_seen_too_long_ago_is_stale(stamp: int, kind: EvidenceClass, assumed: float) -> None:
+    found = NearSpace(PlanarArm(), 0.03, max_age=1.0).look(stamp, LATER, seen_by(EvidenceClass.FREE))
+    assert (found.shares[kind], found.assumed, found.age) == (1.0, assumed, pytest.approx(stamp / SECOND))
 
 
 def test_seen_after_the_state_is_ahead_of_it() -> None:

@@ -179,14 +179,13 @@ def test_pixels_on_the_outline_that_lead_from_the_robot_down_to_the_floor_are_no
 
 @pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
 def test_less_than_fifty_square_millimetres_before_the_robot_are_noise(columns: int, kind: PixelKind) -> None:
-    depth = ball_depth()
-    depth[60, 79 : 79 + columns] += [0.012, -0.012, -0.012][columns - 1]
-    found = kinds(depth)
-    assert (found[60, 79 : 79 + columns] == kind).all()
-    assert (found[SHOWN] == PixelKind.ROBOT).sum() == SHOWN.sum() - columns
-    depth = np.full(SHOWN.shape, FLOOR)
+    """Beside the robot it may be all that is seen of a thing."""
+    depth, piece = ball_depth(), np.s_[60, 79 : 79 + columns]
+    depth[piece] += [0.012, -0.012, -0.012][columns - 1]
     depth[20, 20] = 0.8
-    assert kinds(depth)[20, 20] == PixelKind.OBJECT  # beside the robot it may be all that is seen of a thing
+    found = kinds(depth)
+    assert (found[piece] == kind).all() and found[20, 20] == PixelKind.OBJECT
+    assert (found[SHOWN] == PixelKind.ROBOT).sum() == SHOWN.sum() - columns
 
 
 @pytest.mark.parametrize(("side", "gap", "earlier", "kind"), [
