@@ -148,16 +148,20 @@ def test_steps_become_events_by_what_shaped_them() -> None:
         step(interventions=(row("upper[1]", RowKind.SCENE, 0.5), row("fore[1]", RowKind.SCENE, 3.0))),
         step(interventions=(row("fore[1]", RowKind.SCENE, 2.5),), scale=0.5),
         step(rung=Rung.RELAXED, relaxed=(RowSlack(name="fore[1]", slack=0.03),)),
-        step(rung=Rung.HOLD, scale=0.0),
+        step(rung=Rung.HOLD, scale=0.0, violated_fixed=("upper[0]",), fixed_distance=-0.02, clearance=0.4),
     ]
     found = {event.kind: event for event in events_of(STAMPS, step_signals(steps))}
-    assert set(found) == {
-        EventKind.SCENE, EventKind.LIMIT, EventKind.SCALED_BACK, EventKind.RELAXED, EventKind.HOLD
-    }  # fmt: skip
-    assert found[EventKind.SCENE].names == ("fore[1]", "upper[1]") and found[EventKind.SCENE].worst == 3.0
+    assert found.pop(EventKind.HOLD).first_ns == 500_000_000
+    assert {kind: (event.worst, event.state) for kind, event in found.items()} == {
+        EventKind.SCENE: (3.0, 2),
+        EventKind.LIMIT: (0.1, 1),
+        EventKind.SCALED_BACK: (0.5, 3),
+        EventKind.RELAXED: (0.03, 4),
+        EventKind.CANNOT_ACT: (-0.02, 5),
+    }
+    assert found[EventKind.SCENE].names == ("fore[1]", "upper[1]")
+    assert found[EventKind.LIMIT].names == ("elbow highest",) and found[EventKind.CANNOT_ACT].names == ("upper[0]",)
     assert found[EventKind.SCENE].worst_name == "fore[1]"
-    assert found[EventKind.LIMIT].names == ("elbow highest",) and found[EventKind.SCALED_BACK].worst == 0.5
-    assert found[EventKind.RELAXED].worst == 0.03 and found[EventKind.HOLD].first_ns == 500_000_000
     assert not events_of(STAMPS, step_signals([None] * 6))
 
 
@@ -185,10 +189,3 @@ def test_a_map_is_stale_where_it_is_older_than_allowed() -> None:
 )
 def test_an_obstacle_says_what_and_where(more: dict[str, Any], words: str) -> None:
     assert str(Obstacle(distance=0.1, position=(1, 0, 0.5), **more)) == words
-
-
-def test_a_row_that_no_joint_changes_is_an_event_of_its_own_distance() -> None:
-    held = step(violated_fixed=("upper[0]",), fixed_distance=-0.02, clearance=0.4)
-    (event,) = [event for event in events_of(STAMPS[:2], step_signals([step(), held])) if event.kind == "cannot-act"]
-    assert event.kind is EventKind.CANNOT_ACT and event.worst == -0.02
-    assert (event.state, event.names) == (1, ("upper[0]",))

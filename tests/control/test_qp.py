@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.barriers import (
@@ -24,12 +25,11 @@ from splatctrl_cli.control.qp import (
     descend,
     residuals,
 )
-from splatctrl_cli.control.step import ControlStep, QpIkController
+from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.terms import (
     Barrier,
     BarrierTerm,
     Cost,
-    CostTerm,
     State,
     eliminated_weight,
     reach_cost,
@@ -200,10 +200,12 @@ def test_the_velocity_box_is_never_empty_and_points_back_inside(outside: float) 
 def test_task_costs_are_the_printed_squares_up_to_a_constant() -> None:
     rng = np.random.default_rng(0)
     J, u, w, v = rng.normal(size=(6, 7)), rng.normal(size=6), rng.uniform(0.5, 2, 6), rng.normal(size=7)
-    H, c = reach_cost(J, u, w)
-    assert 0.5 * v @ H @ v + c @ v + u @ (w * u) == pytest.approx((u - J @ v) @ (w * (u - J @ v)))
-    H, c = stray_cost(u, 0.3)
-    assert 0.5 * u @ H @ u + c @ u + 0.3 * u @ u == pytest.approx(0.0)
+    reach, stray = reach_cost(J, u, w), stray_cost(v, 0.3)
+    for (H, c), constant, printed in (
+        (reach, u @ (w * u), (u - J @ v) @ (w * (u - J @ v))),
+        (stray, 0.3 * v @ v, 0.0),
+    ):
+        assert 0.5 * v @ H @ v + c @ v + constant == pytest.approx(printed)
 
 
 def test_the_rotation_vector_is_the_axis_times_the_angle() -> None:
@@ -215,13 +217,15 @@ def test_the_rotation_vector_is_the_axis_times_the_angle() -> None:
 
 
 def test_the_pose_error_carries_the_frame_to_the_goal() -> None:
-    start = transform_from([1.0, 2, 3], [0.1, 0.2, -0.3, 0.9])
-    goal = transform_from([1.5, 2, 2], [0.3, 0.0, 0.1, 1.0])  # in the world's axes: not turned about the start's
+    """In the world's axes: not turned about the start's."""
+    start, goal = (
+        transform_from([1.0, 2, 3], [0.1, 0.2, -0.3, 0.9]),
+        transform_from([1.5, 2, 2], [0.3, 0.0, 0.1, 1.0]),
+    )
     error = pose_error(start, goal)
-    angle = np.linalg.norm(error[3:])
-    turn = np.append(np.sin(angle / 2) * error[3:] / angle, np.cos(angle / 2))
-    np.testing.assert_allclose(rotation_from_quat(turn) @ start[:3, :3], goal[:3, :3], atol=1e-12)
     np.testing.assert_allclose(error[:3], [0.5, 0, -1])
+    turn = Rotation.from_rotvec(error[3:]).as_matrix()
+    np.testing.assert_allclose(turn @ start[:3, :3], goal[:3, :3], atol=1e-12)
 
 
 def test_the_reference_is_capped_in_norm_and_keeps_its_direction() -> None:
@@ -249,16 +253,15 @@ class SlowShoulder(BarrierTerm):
 
 @pytest.mark.parametrize("program", ["reduced", "printed"])
 def test_terms_of_ones_own_add_up_with_those_of_the_paper(program: str) -> None:
-    arm, q = PlanarArm(), np.array([0.3, 0.9])
-    config, goal = ControlConfig(program=program), arm.frame_pose(np.array([0.9, 1.4]), "tip")
-
-    def stepped(*terms: CostTerm | BarrierTerm) -> ControlStep:
-        return QpIkController(arm, config, far_away(), frame="tip", terms=terms).step(q, goal)
-
-    plain, held, slow = stepped(), stepped(HoldElbow()), stepped(SlowShoulder())
+    arm, config = PlanarArm(), ControlConfig(program=program)
+    plain, held, slow, both = (
+        QpIkController(arm, config, far_away(), frame="tip", terms=terms).step(
+            np.array([0.3, 0.9]), arm.frame_pose(np.array([0.9, 1.4]), "tip")
+        )
+        for terms in ((), (HoldElbow(),), (SlowShoulder(),), (HoldElbow(), SlowShoulder()))
+    )
     assert np.all(np.abs(plain.velocity) > 0.1) and not plain.interventions
     assert abs(held.velocity[1]) < 0.01 and abs(held.velocity[0]) > 0.1
     assert slow.velocity[0] == pytest.approx(-0.05, abs=1e-6) and slow.scale == 1.0
     assert [row.name for row in slow.interventions] == ["shoulder backwards"]
-    both = stepped(HoldElbow(), SlowShoulder())
     assert abs(both.velocity[0]) <= 0.05 + 1e-6 and abs(both.velocity[1]) < 0.01
