@@ -119,9 +119,9 @@ def test_splats_inside_the_robot_are_its_own_and_the_table_under_it_is_not() -> 
 
 
 def test_robot_splats_move_with_their_link() -> None:
-    before, after = posture(0.0), posture(0.05)
     points = np.float32([[0.0, 0.0, 0.32], [0.12, 0.0, 0.2]])
-    assert np.allclose(carried(points, before, after), points + np.float32([0.05, 0.0, 0.0]), atol=1e-6)
+    moved = carried(points, posture(0.0), posture(0.05))
+    assert np.allclose(moved, points + np.float32([0.05, 0.0, 0.0]), atol=1e-6)
 
 
 def test_voxels_smaller_than_the_largest_radius_are_refused() -> None:
@@ -198,12 +198,11 @@ def test_rates_fall_as_they_are_told() -> None:
 
 
 def test_a_splat_that_drifts_into_the_air_is_gone_after_the_next_step() -> None:
+    """Within one voxel of the floor: only the image can tell."""
     target = fitter()
     target.step([frame(0)])
-    lifted = np.flatnonzero(target.buffer.is_alive)[:20]
-    target.buffer.centers[lifted, 2] = 0.019  # within one voxel of the floor: only the image can tell
-    row = target.step([frame(1)])
-    assert row.removed["seen_through"] >= 10
+    target.buffer.centers[np.flatnonzero(target.buffer.is_alive)[:20], 2] = 0.019
+    assert target.step([frame(1)]).removed["seen_through"] >= 10
     assert target.splats().centers[:, 2].max() < 0.019
 
 

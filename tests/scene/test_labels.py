@@ -99,8 +99,7 @@ TOP, BELOW_TOP, FLOOR = (0.0, 0.0, 0.21), (0.0, 0.0, 0.19), (0.3, 0.2, 0.0)
 
 
 def test_splats_in_human_voxels_are_human_and_stay_so_beside_them() -> None:
-    grid = grid_of(masked(frame(block=0.205)))
-    slots = splats_at(TOP, BELOW_TOP, FLOOR)
+    grid, slots = grid_of(masked(frame(block=0.205))), splats_at(TOP, BELOW_TOP, FLOOR)
     assert human_splats(slots, grid).tolist() == [True, False, False, False, False]
     slots.labels[1] = Label.HUMAN
     assert human_splats(slots, grid).tolist() == [True, True, False, False, False]
@@ -116,8 +115,7 @@ def test_what_was_human_and_is_object_is_a_trail() -> None:
 
 def test_a_splat_in_the_robot_is_the_robots_whatever_the_mask_says() -> None:
     slots = splats_at(TOP, FLOOR)
-    robot = RobotPosture(centers=np.array([[0.0, 0.0, 0.2]]), radii=np.array([0.05]), T_world_link=np.eye(4)[None])
-    relabel(slots, grid_of(masked(frame(block=0.205))), robot)
+    relabel(slots, grid_of(masked(frame(block=0.205))), replace(ball(0.2, 0.05), surface=None, T_world_surface={}))
     assert slots.labels.tolist() == [Label.ROBOT, Label.OBJECT, 0, 0]
 
 
@@ -208,15 +206,13 @@ def test_a_splat_is_what_the_pixel_shows_whose_depth_it_explains(
     )
 
 
-@pytest.mark.parametrize("is_first", [True, False])
-def test_of_two_cameras_the_one_that_explains_a_splat_best_says_what_it_is(is_first: bool) -> None:
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_cameras_the_one_that_explains_a_splat_best_says_what_it_is(order: int) -> None:
     """The pixel of the robot explains it to 1 mm, that of an object in the other image to 15 mm."""
-    config, shape = OccupancyConfig(), frame().depth.shape
-    ours, other = (replace(frame(), depth=np.full(shape, depth, np.float32)) for depth in (1.001, 1.015))
-    robot = replace(object_mask(ours), kinds=np.full(shape, PixelKind.ROBOT, np.uint8))
-    seen = [(ours, robot), (other, object_mask(other))]
-    kinds = shown_kinds(np.float32([[0.0, 0.0, 0.0]]), seen if is_first else seen[::-1], config)
-    assert kinds.tolist() == [PixelKind.ROBOT]
+    ours, other = (replace(frame(), depth=np.full((60, 80), depth, np.float32)) for depth in (1.001, 1.015))
+    robot = replace(object_mask(ours), kinds=np.full((60, 80), PixelKind.ROBOT, np.uint8))
+    seen = [(ours, robot), (other, object_mask(other))][::order]
+    assert shown_kinds(np.float32([[0.0, 0.0, 0.0]]), seen, OccupancyConfig()).tolist() == [PixelKind.ROBOT]
 
 
 def test_what_the_robot_hides_keeps_its_label_and_what_it_shows_is_its_own() -> None:
@@ -256,7 +252,7 @@ def bits(grid: OccupancyMap, *points: tuple[float, float, float]) -> list[int]:
 def test_the_voxels_of_the_robots_pixels_are_its_own_and_those_of_objects_are_solid() -> None:
     grid, robot = grid_of(), ball(0.3)
     labelled(grid, robot, seen_with(robot))
-    (top, floor) = bits(grid, (0.0, 0.0, 0.4), (0.3, 0.2, 0.0))
+    top, floor = bits(grid, (0.0, 0.0, 0.4), (0.3, 0.2, 0.0))
     assert top & Label.ROBOT and top & SWEPT and not top & SOLID
     assert floor & SOLID and not floor & Label.ROBOT
 

