@@ -156,21 +156,17 @@ def test_no_more_ways_are_planned_than_allowed(ways: int) -> None:
 
 def test_the_goal_on_the_way_waits_for_an_arm_that_is_behind() -> None:
     detour = folded_way(BEFORE_WALL)
-    detour.advance(0.1, np.array([0.06, 0, 0, 0, 0, 0]))
-    assert detour.clock == 0
-    detour.advance(0.1, np.array([0.04, 0, 0, 0.5, 0, 0]))
-    assert detour.clock == pytest.approx(0.1)
+    for seconds, error, clock in ((0.1, [0.06, 0, 0, 0, 0, 0], 0.0), (0.1, [0.04, 0, 0, 0.5, 0, 0], 0.1)):
+        detour.advance(seconds, np.array(error))
+        assert detour.clock == pytest.approx(clock)
     detour.advance(1e3, np.zeros(6))
     assert detour.is_over
 
 
 def test_the_goal_on_the_way_moves_as_the_path_does() -> None:
-    detour, dt = folded_way(BEFORE_WALL), 1e-6
-    detour.clock = 0.3
-    pose, guide = detour.goal(ARM, "tip")
+    detour, later, dt = folded_way(BEFORE_WALL), folded_way(BEFORE_WALL), 1e-6
+    detour.clock, later.clock = 0.3, 0.3 + dt
+    (pose, guide), (pose_later, guide_later) = detour.goal(ARM, "tip"), later.goal(ARM, "tip")
     np.testing.assert_allclose(guide.posture, detour.path.at(0.3)[0][0])
-    later = folded_way(BEFORE_WALL)
-    later.clock = 0.3 + dt
-    moved = (later.goal(ARM, "tip")[0][:3, 3] - pose[:3, 3]) / dt
-    np.testing.assert_allclose(guide.twist[:3], moved, atol=1e-5)
-    np.testing.assert_allclose(guide.velocity, (later.path.at(0.3 + dt)[0][0] - guide.posture) / dt, atol=1e-5)
+    np.testing.assert_allclose(guide.twist[:3], (pose_later - pose)[:3, 3] / dt, atol=1e-5)
+    np.testing.assert_allclose(guide.velocity, (guide_later.posture - guide.posture) / dt, atol=1e-5)

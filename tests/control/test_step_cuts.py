@@ -46,20 +46,17 @@ def test_an_arm_pressed_against_a_row_of_balls_keeps_its_margin(
 
 
 def test_a_cut_is_the_row_of_what_is_met_after_a_period() -> None:
-    q, velocity = np.array([0.7, 0.5]), np.array([0.9, -0.4])
-    state, later = state_at(q), q + CONFIG.period * velocity
-    builder = RowBuilder(ARM, CONFIG, BEAM)
+    q, velocity, builder = np.array([0.7, 0.5]), np.array([0.9, -0.4]), RowBuilder(ARM, CONFIG, BEAM)
+    state, later, step = state_at(q), q + CONFIG.period * velocity, 1e-6 * np.eye(2)
     rows = builder.cut(builder.at(state), state, velocity, np.array([3]))
     assert rows.cuts is not None and list(rows.cuts.index) == [3]
 
     def clearance(posture: np.ndarray) -> float:
         return float(BEAM.query(ARM.sphere_centers(posture)[[TIP]])[0][0] - ARM.sphere_set.radii[TIP])
 
-    step = 1e-6 * np.eye(2)
-    slope = [(clearance(later + d) - clearance(later - d)) / 2e-6 for d in step]
-    np.testing.assert_allclose(rows.cuts.G[0], -np.array(slope), rtol=1e-6)
-    linear = clearance(later) - CONFIG.period * np.dot(slope, velocity)
-    now = max(linear, rows.external.distance[3])
+    slope = np.array([(clearance(later + d) - clearance(later - d)) / 2e-6 for d in step])
+    np.testing.assert_allclose(rows.cuts.G[0], -slope, rtol=1e-6)
+    now = max(clearance(later) - CONFIG.period * slope @ velocity, rows.external.distance[3])
     np.testing.assert_allclose(rows.cuts.distance[0], now, rtol=1e-9)
     np.testing.assert_allclose(rows.cuts.h[0], CONFIG.barrier_gain * (now - CONFIG.margin), rtol=1e-9)
 
