@@ -5,6 +5,7 @@ import re
 from dataclasses import fields, replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -14,19 +15,16 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
 
-def test_nothing_given_is_the_defaults() -> None:
-    assert load_config(None, []) == Config()
-
-
 def test_assignments_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
+    """Values may pass each other on the way, and a word that TOML takes for a number is a word."""
+    assert load_config(None, []) == Config()
     path = tmp_path / "my.toml"
-    path.write_text("[scene]\nmax_splats = 7\nlambda_depth = 2\n[control]\nmargin = 0.03\n")
-    config = load_config(path, ["scene.max_splats=9", "occupancy.rule=literal"])
-    assert config.scene.max_splats == 9
-    assert config.scene.lambda_depth == 2.0
-    assert isinstance(config.scene.lambda_depth, float)
-    assert config.control.margin == 0.03
-    assert config.occupancy.rule == "literal"
+    path.write_text("[scene]\nmax_splats = 7\nmin_radius = 0.03\nlambda_depth = 2\n[control]\nmargin = 0.03\n")
+    given = ["scene.max_splats=9", "occupancy.rule=literal", "scene.max_radius=0.05", "occupancy.voxel=0.05"]
+    config = load_config(path, [*given, "field.unknown=nan"])
+    assert (config.scene.max_splats, config.scene.min_radius, config.scene.max_radius) == (9, 0.03, 0.05)
+    assert config.scene.lambda_depth == 2.0 and isinstance(config.scene.lambda_depth, float)
+    assert (config.control.margin, config.occupancy.rule, config.field.unknown) == (0.03, "literal", "nan")
 
 
 @pytest.mark.parametrize(
@@ -66,6 +64,10 @@ def test_assignments_win_over_the_file_and_the_file_over_the_defaults(tmp_path: 
         ),
         ("control.self_slack_cost=10", "control.self_slack_cost: expected at least control.slack_cost = 1000"),
         ("control.period=0.1 control.max_time=0.05", "control.max_time: expected at least"),
+        (
+            "control.max_acceleration=[1,'x']",
+            "expected float or list of float, 0 or 0.01 to 1000 rad/s^2, got [1, 'x']",
+        ),
         ("planner.shortest=2", "planner.shortest: expected at most planner.reach = 1.5 rad, got 2.0"),
     ],
 )
@@ -75,33 +77,27 @@ def test_what_cannot_be_or_contradicts_is_named(assignments: str, words: str) ->
     assert words in str(refused.value)
 
 
-def test_a_word_that_toml_takes_for_a_number_is_a_word() -> None:
-    assert load_config(None, ["field.unknown=nan"]).field.unknown == "nan"
-
-
 def test_an_unknown_key_that_is_near_none_is_told_a_few_of_the_known() -> None:
-    with pytest.raises(UsageError) as refused:
+    with pytest.raises(UsageError, match=r"\.\.\. \(splatctrl help config has all\)$") as refused:
         load_config(None, ["scene.zzz=9"])
     assert str(refused.value).count(",") == 8
-    assert str(refused.value).endswith("... (splatctrl help config has all)")
 
 
-def test_files_that_are_missing_or_no_toml_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none.toml: no such file"):
-        load_config(tmp_path / "none.toml", [])
-    (tmp_path / "bad.toml").write_text("[scene\n")
-    with pytest.raises(UsageError, match=r"bad.toml: not valid TOML"):
-        load_config(tmp_path / "bad.toml", [])
-    (tmp_path / "flat.toml").write_text("scene = 3\n")
-    with pytest.raises(UsageError, match="scene: expected a table, got 3"):
-        load_config(tmp_path / "flat.toml", [])
-
-
-def test_values_may_pass_each_other_on_the_way(tmp_path: Path) -> None:
-    path = tmp_path / "wide.toml"
-    path.write_text("[scene]\nmin_radius = 0.03\n")
-    config = load_config(path, ["scene.max_radius=0.05", "occupancy.voxel=0.05"])
-    assert (config.scene.min_radius, config.scene.max_radius) == (0.03, 0.05)
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        (None, InputError, r"my.toml: no such file"),
+        ("[scene\n", UsageError, r"my.toml: not valid TOML"),
+        ("scene = 3\n", UsageError, "scene: expected a table, got 3"),
+    ],
+)
+def test_files_that_are_missing_or_no_toml_are_named(
+    tmp_path: Path, text: str | None, error: type[Exception], words: str
+) -> None:
+    if text is not None:
+        (tmp_path / "my.toml").write_text(text)
+    with pytest.raises(error, match=words):
+        load_config(tmp_path / "my.toml", [])
 
 
 @pytest.mark.parametrize(
@@ -114,27 +110,27 @@ def test_a_file_and_an_assignment_are_refused_alike(tmp_path: Path, text: str) -
             load_config(path, assignments)
 
 
-def test_a_section_is_checked_however_it_is_made() -> None:
-    with pytest.raises(UsageError, match=r"control.max_linear_speed: expected 0.0001 to 20 m/s, got -1"):
-        replace(Config().control, max_linear_speed=-1.0)
-    with pytest.raises(UsageError, match=r"occupancy.rule: expected observed or literal, got 'bogus'"):
-        replace(Config().occupancy, rule="bogus")
+@pytest.mark.parametrize(
+    ("section", "changes", "words"),
+    [
+        ("control", {"max_linear_speed": -1.0}, r"control.max_linear_speed: expected 0.0001 to 20 m/s, got -1"),
+        ("occupancy", {"rule": "bogus"}, r"occupancy.rule: expected observed or literal, got 'bogus'"),
+    ],
+)
+def test_a_section_is_checked_however_it_is_made(section: str, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        replace(getattr(Config(), section), **changes)
 
 
-def test_every_key_is_declared_with_a_reason_and_a_range_around_its_default() -> None:
-    for section in fields(Config):
-        values = getattr(Config(), section.name)
-        assert values.section == section.name
-        for key, declared in values.declared.items():
-            assert declared.reason, key
-            assert declared.holds(getattr(values, key)), key
-            assert not any(declared.holds(bad) for bad in (float("nan"), float("inf"), 1e308, -1e308)), key
-
-
-def test_every_number_is_of_one_plain_type() -> None:
-    for section in fields(Config):
-        for key, value in Config().as_dict()[section.name].items():
-            assert isinstance(value, int | float | str), key
+@pytest.mark.parametrize("name", [section.name for section in fields(Config)])
+def test_every_key_is_declared_with_a_reason_and_a_range_around_its_default(name: str) -> None:
+    """And every number is of one plain type."""
+    values = getattr(Config(), name)
+    assert values.section == name
+    assert all(isinstance(value, int | float | str) for value in Config().as_dict()[name].values())
+    for key, declared in values.declared.items():
+        assert declared.reason and declared.holds(getattr(values, key)), key
+        assert not any(declared.holds(bad) for bad in (float("nan"), float("inf"), 1e308, -1e308)), key
 
 
 @pytest.mark.parametrize("module", [fixed, limits])
@@ -156,32 +152,31 @@ def file(tmp_path: Path) -> Path:
 
 def test_each_value_says_where_it_comes_from(file: Path) -> None:
     found = {setting.name: (setting.value, setting.source) for setting in resolved_settings(file, GIVEN)}
-    assert found["scene.max_splats"] == (9, "--set")
-    assert found["scene.fill"] == (0.5, str(file))
-    assert found["control.barrier_gain"] == (4.0, str(file))
-    assert found["control.program"] == ("printed", "--preset paper")
-    assert found["control.margin"] == (Config().control.margin, "default")
-    num_keys = sum(len(section) for section in Config().as_dict().values())
-    assert len(found) == num_keys
+    expected = {
+        "scene.max_splats": (9, "--set"),
+        "scene.fill": (0.5, str(file)),
+        "control.barrier_gain": (4.0, str(file)),
+        "control.program": ("printed", "--preset paper"),
+        "control.margin": (Config().control.margin, "default"),
+    }
+    assert {name: found[name] for name in expected} == expected
+    assert len(found) == sum(len(section) for section in Config().as_dict().values())
 
 
 def test_what_is_printed_is_a_file_with_the_same_settings(file: Path, tmp_path: Path) -> None:
-    again = tmp_path / "again.toml"
-    again.write_text("\n".join(toml_of(resolved_settings(file, GIVEN))))
+    again, lines = tmp_path / "again.toml", [*toml_of(resolved_settings(file, GIVEN))]
+    again.write_text("\n".join(lines))
     assert load_config(again, []) == load_config(file, GIVEN)
-    assert f"fill = 0.5  # {file} (default: 0.85)" in again.read_text()
+    assert f"fill = 0.5  # {file} (default: 0.85)" in lines
 
 
 def test_a_template_sets_nothing_and_uncommented_the_defaults(tmp_path: Path) -> None:
+    """It has no value that is given."""
     path, lines = tmp_path / "template.toml", [*template_of(resolved_settings(None, []))]
-    path.write_text("\n".join(lines))
-    assert load_config(path, []) == Config()
+    assert [*template_of(resolved_settings(None, GIVEN))] == lines
     keys = [line.removeprefix("# ") for line in lines if line.startswith("[") or " = " in line.split(";")[0]]
-    path.write_text("\n".join(keys))
-    assert load_config(path, []) == Config()
+    for text in (lines, keys):
+        path.write_text("\n".join(text))
+        assert load_config(path, []) == Config()
     assert "# budget of splats (IV-C); ten million take 2 GB; 1 to 10000000" in lines
     assert "# max_splats = 5000" in lines
-
-
-def test_a_template_has_no_value_that_is_given() -> None:
-    assert [*template_of(resolved_settings(None, GIVEN))] == [*template_of(resolved_settings(None, []))]

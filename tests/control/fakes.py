@@ -2,14 +2,18 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import ReplayTrace
+from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.robot.model import RobotModel
 
 
 class PlanarArm:
@@ -36,10 +40,7 @@ class PlanarArm:
         self.pairs = np.array([[0, 3], [0, 4]])
 
     def sphere_centers(self, q: Float64) -> Float64:
-        elbow = self.lengths[0] * _unit(q[0])
-        local = self.sphere_set.centers[:, 0]
-        rows = [np.zeros(3), *[x * _unit(q[0]) for x in local[1:3]], *[elbow + x * _unit(q.sum()) for x in local[3:]]]
-        return np.array(rows)
+        return self.sphere_centers_batch(q[None])[0]
 
     def lever_arms(self) -> Float64:
         x = self.sphere_set.centers[:, 0]
@@ -117,9 +118,35 @@ class Plane:
         return distance, np.broadcast_to(self.scale * self.normal, points.shape)
 
 
+class Nowhere:
+    """A field without a distance anywhere."""
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        return np.full(len(points), np.nan), np.zeros_like(points)
+
+
 def far_away() -> Balls:
     """A field with nothing near the arm."""
     return Balls([[50.0, 0, 0]], [1.0])
+
+
+def sample_arm(plain_arm: Path) -> RobotModel:
+    """The seven joints of the sample data."""
+    folder = plain_arm / "tabletop"
+    return RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
+
+
+def steps_towards(
+    controller: QpIkController, q: Float64, T_goal: Float64, num: int
+) -> tuple[list[ControlStep], list[Float64]]:
+    """So many steps from rest, and the postures before and after each."""
+    steps: list[ControlStep] = []
+    postures, velocity = [q], np.zeros(len(q))
+    for _ in range(num):
+        steps.append(controller.step(postures[-1], T_goal, last_velocity=velocity))
+        velocity = steps[-1].velocity
+        postures.append(postures[-1] + ControlConfig().period * velocity)
+    return steps, postures
 
 
 class ThinArm(PlanarArm):

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -38,59 +40,65 @@ def off_the_tip(arm: PlanarArm, away: float) -> Float64:
     return arm.sphere_centers(LATER)[-1] + np.array([0.0, 0.0, arm.sphere_set.radii[-1] + away])
 
 
+def stamped(stamps_at: Callable[[int], NDArray[np.int64]]) -> Seen:
+    """All is free, and was seen at these stamps."""
+    return Seen(look=lambda points: (stamps_at(len(points)), np.zeros(len(points), np.uint8)))
+
+
+def above(height: float) -> Seen:
+    """A sheet seen from above alone: what is under it was never seen."""
+    free, never = np.uint8(EvidenceClass.FREE), np.uint8(EvidenceClass.OUT_OF_VIEW)
+    return seen_by(lambda points: np.where(points[:, 2] > height, free, never))
+
+
+@cache
+def beside_the_arm(margin: float) -> list[tuple[Float64, float, int]]:
+    return list(points_beside(PlanarArm(), LATER, margin, NEAR_LATTICE))
+
+
 def test_the_account_is_that_of_the_reference() -> None:
-    arm = PlanarArm()
-    found = NearSpace(arm, 0.03).look(0, LATER, seen_by(half_seen))
-    beside = points_beside(arm, LATER, 0.03, NEAR_LATTICE)
-    hidden = [gap for point, gap, _ in beside if point[2] < 0]
+    hidden = EvidenceClass.HIDDEN_BY_ARM
+    found = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(half_seen))
+    beside, wide = beside_the_arm(0.03), beside_the_arm(0.03 + NEAR_LATTICE / 2)
     assert len(beside) > 100
     assert found.shares.sum() == pytest.approx(1.0)
-    assert found.shares[EvidenceClass.HIDDEN_BY_ARM] == pytest.approx(len(hidden) / len(beside))
-    wide = points_beside(arm, LATER, 0.03 + NEAR_LATTICE / 2, NEAR_LATTICE)
-    assert found.assumed == pytest.approx(sum(point[2] < 0 for point, *_ in wide) / len(wide))
+    assert found.shares[hidden] == pytest.approx(np.mean([point[2] < 0 for point, *_ in beside]))
+    assert found.assumed == pytest.approx(np.mean([point[2] < 0 for point, *_ in wide]))
     nearest = min(gap for point, gap, _ in wide if point[2] < 0)
-    assert found.nearest[EvidenceClass.HIDDEN_BY_ARM] == pytest.approx(max(nearest - NEAR_LATTICE / 2, 0.0))
-    assert found.places[EvidenceClass.HIDDEN_BY_ARM][2] < 0
-    assert found.nearest[EvidenceClass.CONTRADICTED] == np.inf
+    assert found.nearest[hidden] == pytest.approx(max(nearest - NEAR_LATTICE / 2, 0.0))
+    assert found.places[hidden][2] < 0 and found.nearest[EvidenceClass.CONTRADICTED] == np.inf
 
 
-def test_every_point_has_one_class_at_its_own_distance() -> None:
-    """One voxel of each class in turn, off the tip of the arm."""
-    arm = PlanarArm()
+@pytest.mark.parametrize(
+    "kind", [EvidenceClass.CONTRADICTED, EvidenceClass.UNANSWERED, EvidenceClass.OUTSIDE, EvidenceClass.SWEPT]
+)
+def test_every_point_has_one_class_at_its_own_distance(kind: EvidenceClass) -> None:
+    """One voxel of a class, off the tip of the arm."""
+    arm, free = PlanarArm(), np.uint8(EvidenceClass.FREE)
     place = NEAR_LATTICE * np.round(off_the_tip(arm, 0.04) / NEAR_LATTICE)
     gap = min(np.linalg.norm(place - arm.sphere_centers(LATER), axis=1) - arm.sphere_set.radii) - NEAR_LATTICE / 2
-    for kind in (EvidenceClass.CONTRADICTED, EvidenceClass.UNANSWERED, EvidenceClass.OUTSIDE, EvidenceClass.SWEPT):
-
-        def around(points: Float64, kind: EvidenceClass = kind) -> UInt8:
-            is_there = np.linalg.norm(points - place, axis=1) < 1e-6
-            return np.where(is_there, np.uint8(kind), np.uint8(EvidenceClass.FREE))
-
-        found = NearSpace(arm, 0.06).look(0, LATER, seen_by(around))
-        assert (found.nearest[kind], found.places[kind].tolist()) == (pytest.approx(gap), place.tolist())
-        assert found.shares[kind] > 0 and found.assumed > 0
+    seen = seen_by(lambda points: np.where(np.linalg.norm(points - place, axis=1) < 1e-6, np.uint8(kind), free))
+    found = NearSpace(arm, 0.06).look(0, LATER, seen)
+    assert (found.nearest[kind], found.places[kind].tolist()) == (pytest.approx(gap), place.tolist())
+    assert found.shares[kind] > 0 and found.assumed > 0
 
 
-def test_what_was_seen_too_long_ago_is_stale() -> None:
-    space = NearSpace(PlanarArm(), 0.03, max_age=1.0)
-    fresh, old = (space.look(stamp, LATER, seen_by(EvidenceClass.FREE)) for stamp in (SECOND, 2 * SECOND))
-    assert (fresh.shares[EvidenceClass.FREE], old.shares[EvidenceClass.STALE]) == (1.0, 1.0)
-    assert (fresh.assumed, old.assumed, old.age) == (0.0, 1.0, pytest.approx(2.0))
+@pytest.mark.parametrize(
+    ("stamp", "kind", "assumed"), [(SECOND, EvidenceClass.FREE, 0.0), (2 * SECOND, EvidenceClass.STALE, 1.0)]
+)
+def test_what_was_seen_too_long_ago_is_stale(stamp: int, kind: EvidenceClass, assumed: float) -> None:
+    found = NearSpace(PlanarArm(), 0.03, max_age=1.0).look(stamp, LATER, seen_by(EvidenceClass.FREE))
+    assert (found.shares[kind], found.assumed, found.age) == (1.0, assumed, pytest.approx(stamp / SECOND))
 
 
 def test_seen_after_the_state_is_ahead_of_it() -> None:
-    found = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(EvidenceClass.FREE, SECOND))
+    space = NearSpace(PlanarArm(), 0.03)
+    found = space.look(0, LATER, seen_by(EvidenceClass.FREE, SECOND))
     assert (found.ahead, found.age) == (pytest.approx(1.0), pytest.approx(-1.0))
-    never = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(EvidenceClass.OUT_OF_VIEW))
+    never = space.look(0, LATER, seen_by(EvidenceClass.OUT_OF_VIEW))
     assert np.isnan(never.ahead) and np.isnan(never.age)
-
-
-def test_some_of_it_seen_after_the_state_is_ahead_too() -> None:
-    def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
-        return np.where(np.arange(len(points)) % 9 > 0, np.int64(0), np.int64(SECOND)), np.zeros(
-            len(points), np.uint8
-        )
-
-    assert NearSpace(PlanarArm(), 0.03).look(0, LATER, Seen(look=look)).ahead == pytest.approx(1.0)
+    some = space.look(0, LATER, stamped(lambda num: np.where(np.arange(num) % 9 > 0, 0, SECOND)))
+    assert some.ahead == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("turn", [0.05, 0.2])
@@ -99,21 +107,15 @@ def test_on_the_way_no_sphere_moves_by_a_centimetre_from_one_posture_to_the_next
     way = NearSpace(arm, 0.03).on_the_way(FIRST, last)
     centers = np.array([arm.sphere_centers(q) for q in (FIRST, *way, last)])
     moved = np.linalg.norm(np.diff(centers, axis=0), axis=2).max(axis=1)
-    assert (
-        moved.max() <= NEAR_MOVED and moved.min() > 0.8 * moved.max() and len(way) == np.ceil(0.9 * turn / 0.01) - 1
-    )
+    assert moved.max() <= NEAR_MOVED and moved.min() > 0.8 * moved.max()
+    assert len(way) == np.ceil(0.9 * turn / 0.01) - 1
 
 
 @pytest.mark.parametrize(("old", "age"), [(0.2, 1.0), (0.3, 9.0)])
 def test_the_age_is_that_of_three_in_four(old: float, age: float) -> None:
     """A few points that nobody looks at any more say nothing, more of them do."""
-
-    def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
-        stamps = np.full(len(points), 9 * SECOND, np.int64)
-        stamps[: round(old * len(points))] = SECOND
-        return stamps, np.zeros(len(points), np.uint8)
-
-    assert NearSpace(PlanarArm(), 0.03).look(10 * SECOND, FIRST, Seen(look=look)).age == pytest.approx(age)
+    seen = stamped(lambda num: np.where(np.arange(num) < round(old * num), SECOND, 9 * SECOND))
+    assert NearSpace(PlanarArm(), 0.03).look(10 * SECOND, FIRST, seen).age == pytest.approx(age)
 
 
 def test_the_space_beside_a_link_with_triangles_is_that_beside_its_surface() -> None:
@@ -122,11 +124,11 @@ def test_the_space_beside_a_link_with_triangles_is_that_beside_its_surface() -> 
     arm = ThinArm()
     arm.sphere_set.radii[:] = [0.06, 0.04, 0.04, 0.14, 0.14]  # the two of `fore` hold each other's surface
 
-    def remember(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
+    def remembered(points: Float64) -> UInt8:
         asked.append(points)
-        return np.zeros(len(points), np.int64), np.zeros(len(points), np.uint8)
+        return np.zeros(len(points), np.uint8)
 
-    NearSpace(arm, 0.03).look(0, LATER, Seen(look=remember))
+    NearSpace(arm, 0.03).look(0, LATER, seen_by(remembered))
     gaps = np.linalg.norm(asked[0][:, None] - arm.sphere_centers(LATER), axis=2) - arm.sphere_set.radii
     nearest = (gaps[:, 1:] + 0.02).min(axis=1)
     assert nearest.min() > -1e-3 and nearest.max() < 0.031 + NEAR_LATTICE / 2 and len(nearest) > 500
@@ -134,8 +136,7 @@ def test_the_space_beside_a_link_with_triangles_is_that_beside_its_surface() -> 
 
 
 def test_states_are_thinned_by_time_across_blocks() -> None:
-    space = NearSpace(PlanarArm(), 0.03)
-    stamps = np.arange(0, 800, 40, dtype=np.int64) * 1_000_000  # 25 Hz
+    space, stamps = NearSpace(PlanarArm(), 0.03), np.arange(0, 800, 40, dtype=np.int64) * 1_000_000  # 25 Hz
     assert NEAR_EVERY_NS == 200_000_000
     still = np.repeat(PlanarArm().sphere_centers(LATER)[None], len(stamps), axis=0)
     assert space.due(stamps[:12], still[:12]) == {0: True, 5: True, 10: True}
@@ -146,18 +147,15 @@ def test_states_are_thinned_by_time_across_blocks() -> None:
 def test_no_sphere_of_a_fast_arm_moves_a_centimetre_between_two_looks() -> None:
     arm, space = PlanarArm(), NearSpace(PlanarArm(), 0.03)
     joints = FIRST + np.linspace(0.0, 0.1, 50)[:, None]  # in 100 ms
-    centers = np.stack([arm.sphere_centers(q) for q in joints])
-    stamps = np.arange(50, dtype=np.int64) * 2_000_000
+    centers, stamps = arm.sphere_centers_batch(joints), np.arange(50, dtype=np.int64) * 2_000_000
     first, rest = (space.due(stamps[part], centers[part]) for part in (slice(20), slice(20, None)))
     assert [at for at, is_timed in first.items() if is_timed] == [0] and not any(rest.values())
     chosen = [*first, *(20 + at for at in rest)]
     assert 3 < len(chosen) < 50
     step = np.linalg.norm(np.diff(centers, axis=0), axis=2).max()
-    for first, last in zip(chosen, [*chosen[1:], 50], strict=True):
-        moved = np.linalg.norm(centers[first:last] - centers[first], axis=2).max()
-        assert moved < NEAR_MOVED
-        if last < 50:
-            assert np.linalg.norm(centers[last] - centers[first], axis=1).max() < NEAR_MOVED + step
+    for begin, end in pairwise([*chosen, 50]):
+        moved = np.linalg.norm(centers[begin : end + 1] - centers[begin], axis=2).max(axis=1)
+        assert moved[: end - begin].max() < NEAR_MOVED and moved.max() < NEAR_MOVED + step
 
 
 def test_a_robot_within_its_own_base_has_nothing_beside_it() -> None:
@@ -181,51 +179,33 @@ def test_a_lost_edge_is_as_near_as_its_ball() -> None:
 
 @pytest.mark.parametrize("away", [0.02, 0.05, 0.09])
 def test_an_unseen_pocket_anywhere_within_a_wide_margin_is_found(away: float) -> None:
-    arm = PlanarArm()
+    arm, free, hidden = PlanarArm(), np.uint8(EvidenceClass.FREE), np.uint8(EvidenceClass.HIDDEN_BY_THING)
     place = off_the_tip(arm, away)
-
-    def but_there(points: Float64) -> UInt8:
-        is_there = np.linalg.norm(points - place, axis=1) < 0.02
-        return np.where(is_there, np.uint8(EvidenceClass.HIDDEN_BY_THING), np.uint8(EvidenceClass.FREE))
-
-    found = NearSpace(arm, 0.1).look(0, LATER, seen_by(but_there), lambda points: np.full(len(points), 0.01))
+    seen = seen_by(lambda points: np.where(np.linalg.norm(points - place, axis=1) < 0.02, hidden, free))
+    found = NearSpace(arm, 0.1).look(0, LATER, seen, lambda points: np.full(len(points), 0.01))
     assert found.unseen_to_surface == 0.01 and np.linalg.norm(found.unseen_place - place) < 0.02
 
 
 @pytest.mark.parametrize("height", [-0.3, 0.0, 0.05, 0.4])
 def test_unseen_space_is_as_near_to_a_surface_as_by_the_reference(height: float) -> None:
-    """A sheet seen from above alone: what is under it was never seen."""
-    arm = PlanarArm()
-
-    def above(points: Float64) -> UInt8:
-        return np.where(points[:, 2] > height, np.uint8(EvidenceClass.FREE), np.uint8(EvidenceClass.OUT_OF_VIEW))
-
-    found = NearSpace(arm, 0.03).look(0, LATER, seen_by(above), lambda points: height - points[:, 2] + 1e-9)
-    never = [height - point[2] for point, *_ in points_beside(arm, LATER, 0.03, NEAR_LATTICE) if point[2] <= height]
+    found = NearSpace(PlanarArm(), 0.03).look(0, LATER, above(height), lambda points: height - points[:, 2] + 1e-9)
+    never = [height - point[2] for point, *_ in beside_the_arm(0.03) if point[2] <= height]
     assert found.unseen_to_surface == (pytest.approx(min(never), abs=1e-8) if never else np.inf)
     assert bool(never) == (height > -0.3)
 
 
 @pytest.mark.parametrize(("height", "is_blind"), [(0.0, False), (0.2, True)])
 def test_a_sphere_that_comes_to_the_unseen_alone_has_a_distance_of_its_own(height: float, is_blind: bool) -> None:
-    """Under a sheet that is seen from above alone: of 4 cm spheres most of the space about them, or all."""
-
-    def above(points: Float64) -> UInt8:
-        return np.where(points[:, 2] > height, np.uint8(EvidenceClass.FREE), np.uint8(EvidenceClass.OUT_OF_VIEW))
-
-    found = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(above), lambda points: height - points[:, 2] + 1e-9)
-    assert np.isfinite(found.unseen_to_surface) and found.blind_to_surface == (
-        found.unseen_to_surface if is_blind else np.inf
-    )
+    """Under the sheet: of 4 cm spheres most of the space about them, or all."""
+    found = NearSpace(PlanarArm(), 0.03).look(0, LATER, above(height), lambda points: height - points[:, 2] + 1e-9)
+    assert np.isfinite(found.unseen_to_surface)
+    assert found.blind_to_surface == (found.unseen_to_surface if is_blind else np.inf)
     assert not is_blind or found.blind_to_surface == pytest.approx(height - found.blind_place[2], abs=1e-8)
 
 
-def test_what_lies_within_a_surface_of_the_map_is_surface() -> None:
-    found = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(half_seen), lambda points: points[:, 2])
+def test_what_lies_within_a_surface_of_the_map_is_surface_and_a_map_without_an_answer_hides_nothing() -> None:
+    space, seen = NearSpace(PlanarArm(), 0.03), seen_by(half_seen)
+    found = space.look(0, LATER, seen, lambda points: points[:, 2])
     assert found.shares[EvidenceClass.HIDDEN_BY_ARM] == 0.0 and found.shares[EvidenceClass.SURFACE] > 0.3
-    assert found.unseen_to_surface == np.inf
-
-
-def test_a_map_that_answers_nowhere_hides_nothing() -> None:
-    found = NearSpace(PlanarArm(), 0.03).look(SECOND, LATER, seen_by(half_seen), lambda p: np.full(len(p), np.nan))
-    assert found.unseen_to_surface == np.inf
+    nowhere = space.look(SECOND, LATER, seen, lambda points: np.full(len(points), np.nan))
+    assert found.unseen_to_surface == nowhere.unseen_to_surface == np.inf

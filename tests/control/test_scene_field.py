@@ -15,8 +15,8 @@ from splatctrl_cli.control.replay import ReplayTask, SceneChange, closed_loop
 from splatctrl_cli.control.scene_field import PeopleGrown, SceneStep, distance_rate, guarded
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.records import Float64, SphereSet
-from tests.control.fakes import Balls, PlanarArm, Plane, ThinArm, scene_of
+from splatctrl_cli.records import Bool, Float64, SphereSet
+from tests.control.fakes import Balls, Nowhere, PlanarArm, Plane, ThinArm, scene_of, steps_towards
 
 THING, PERSON = (0.6, 0.5, 0.0), (0.9, -0.4, 0.0)
 POINTS = np.array([[0.0, 0.0, 0.0], [0.5, 0.2, 0.0]])
@@ -33,52 +33,33 @@ def moved(speed: float, seconds: float = 0.2) -> SceneStep:
     return SceneStep(newer=newer, older=older, seconds=seconds)
 
 
-def test_the_rate_of_a_wall_is_its_speed_towards_the_arm() -> None:
-    np.testing.assert_allclose(distance_rate(moved(0.3), POINTS, 1.6), -0.3)
-
-
-def test_a_wall_that_recedes_loosens_nothing_and_one_that_jumps_is_clipped() -> None:
-    np.testing.assert_array_equal(distance_rate(moved(-0.3), POINTS, 1.6), 0.0)
-    np.testing.assert_allclose(distance_rate(moved(5.0), POINTS, 1.6), -1.6)
-
-
-def test_there_is_no_rate_without_two_scenes_or_without_a_distance() -> None:
+@pytest.mark.parametrize(("speed", "rate"), [(0.3, -0.3), (-0.3, 0.0), (5.0, -1.6)])
+def test_a_wall_that_recedes_loosens_nothing_and_one_that_jumps_is_clipped(speed: float, rate: float) -> None:
+    """One that comes nearer has the rate of its speed; without two scenes and their distances there is none."""
+    np.testing.assert_allclose(distance_rate(moved(speed), POINTS, 1.6), rate)
+    np.testing.assert_array_equal(distance_rate(replace(moved(speed), older=Nowhere()), POINTS, 1.6), 0.0)
     assert distance_rate(None, POINTS, 1.6) == 0.0
-
-    class Nowhere:
-        def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return np.full(len(points), np.nan), np.zeros_like(points)
-
-    blind = SceneStep(newer=moved(0.3).newer, older=Nowhere(), seconds=0.2)
-    np.testing.assert_array_equal(distance_rate(blind, POINTS, 1.6), 0.0)
 
 
 @pytest.mark.parametrize("name", ["none", "snapshots"])
 def test_a_scene_that_comes_nearer_is_met_with_more_distance_where_its_rate_is_known(name: str) -> None:
-    arm, seconds = PlanarArm(), 0.1
-    start = np.array([0.6, 0.6])
+    """Each scene is 4 cm nearer than the last, which takes a static row by surprise."""
+    arm, start = PlanarArm(), np.array([0.6, 0.6])
     fields = [Balls([[0.95 - 0.04 * k, 0.655, 0.0]], [0.1]) for k in range(8)]
     asked: list[int] = []
 
-    def index(stamp_ns: int) -> int:
-        return min(stamp_ns // 100_000_000, 7)
-
     def step_at(stamp_ns: int) -> SceneStep | None:
         asked.append(stamp_ns)
-        k = index(stamp_ns)
-        return None if k == 0 else SceneStep(newer=fields[k], older=fields[k - 1], seconds=seconds)
+        k = stamp_ns // 100_000_000
+        return None if k == 0 else SceneStep(newer=fields[k], older=fields[k - 1], seconds=0.1)
 
     config = replace(ControlConfig(), distance_rate=name, max_time=0.8, goal_position=0.002)
     out_of_plane = arm.frame_pose(start, "tip")
     out_of_plane[2, 3] += 0.005  # where the arm is and stays, and yet no goal that it reaches
     task = ReplayTask(start=start, T_world_goal=out_of_plane, frame="tip")
-    trace = closed_loop(arm, config, task, lambda t: fields[index(t)], scene_step_at=step_at)
-    least = min(step.clearance for step in trace.steps)
-    assert bool(asked) is (name == "snapshots")
-    if name == "none":
-        assert least < 0.0  # each scene is 4 cm nearer than the last, which takes a static row by surprise
-    else:
-        assert least > 0.0 and max(asked) == trace.stamp_ns[-1]
+    trace = closed_loop(arm, config, task, lambda t: fields[t // 100_000_000], scene_step_at=step_at)
+    assert (min(step.clearance for step in trace.steps) > 0.0) is (name == "snapshots")
+    assert asked[-1:] == ([trace.stamp_ns[-1]] if name == "snapshots" else [])
 
 
 def test_people_reach_as_much_farther_and_things_do_not() -> None:
@@ -90,13 +71,10 @@ def test_people_reach_as_much_farther_and_things_do_not() -> None:
 
 
 def test_its_gradient_is_the_slope_of_its_distance() -> None:
-    field, step = PeopleGrown(balls(THING, PERSON), balls(PERSON), 0.1), 1e-6
+    field, steps = PeopleGrown(balls(THING, PERSON), balls(PERSON), 0.1), 1e-6 * np.eye(3)
     points = np.random.default_rng(1).uniform(-1, 1, (200, 3))
-    slope = np.stack(
-        [(field.query(points + step * e)[0] - field.query(points - step * e)[0]) / (2 * step) for e in np.eye(3)],
-        axis=1,
-    )
-    np.testing.assert_allclose(field.query(points)[1], slope, atol=1e-6)
+    slopes = [(field.query(points + step)[0] - field.query(points - step)[0]) / 2e-6 for step in steps]
+    np.testing.assert_allclose(field.query(points)[1], np.stack(slopes, axis=1), atol=1e-6)
 
 
 def test_without_people_or_a_larger_margin_the_scene_is_what_counts() -> None:
@@ -107,50 +85,38 @@ def test_without_people_or_a_larger_margin_the_scene_is_what_counts() -> None:
     assert guarded(scene, people, ControlConfig(human_margin=0.3)) is not scene
 
 
-def closest_way(margins: ControlConfig, who: str) -> float:
-    """How near the arm's surface comes to a ball at its goal, which is a person or a thing."""
-    arm, ball = PlanarArm(), balls((0.81, 0.39, 0.0))
-    people = ball if who == "person" else None
-    controller = QpIkController(arm, margins, guarded(ball, people, margins), frame="tip")
-    q, goal, least = np.array([-0.9, 0.3]), arm.frame_pose(np.array([0.4, 0.1]), "tip"), np.inf
-    for _ in range(400):
-        q = q + margins.period * controller.step(q, goal).velocity
-        least = min(least, float(np.min(ball.query(arm.sphere_centers(q)[1:])[0] - 0.04)))
-    return least
-
-
-def test_the_controller_stays_farther_from_a_person_than_from_a_thing() -> None:
-    margins = ControlConfig(human_margin=0.12)
-    assert abs(closest_way(margins, "thing") - 0.02) < 2e-3
-    assert abs(closest_way(margins, "person") - 0.12) < 2e-3
-    assert abs(closest_way(ControlConfig(), "person") - 0.02) < 2e-3
+@pytest.mark.parametrize(
+    ("human_margin", "is_person", "nearest"), [(0.12, False, 0.02), (0.12, True, 0.12), (0.0, True, 0.02)]
+)
+def test_the_controller_stays_farther_from_a_person_than_from_a_thing(
+    human_margin: float, is_person: bool, nearest: float
+) -> None:
+    """The goal is in a ball, which is a person or a thing."""
+    arm, ball, config = PlanarArm(), balls((0.81, 0.39, 0.0)), ControlConfig(human_margin=human_margin)
+    field = guarded(ball, ball if is_person else None, config)
+    controller = QpIkController(arm, config, field, frame="tip")
+    goal = arm.frame_pose(np.array([0.4, 0.1]), "tip")
+    _, postures = steps_towards(controller, np.array([-0.9, 0.3]), goal, 400)
+    gaps = [ball.query(arm.sphere_centers(q)[1:])[0].min() - 0.04 for q in postures]
+    assert abs(min(gaps) - nearest) < 2e-3
 
 
 Q = np.array([0.0, 0.0])
 
 
-class PartlyBlank:
-    """Balls whose distance is not known at x < 0.3, where the spheres that come first are."""
+def test_the_deepest_sphere_is_named_and_a_free_start_passes() -> None:
+    """A sphere without a distance hides none that collides, and the base is moved by no joint."""
+    arm, deep = PlanarArm(), Balls([[0.9, 0.0, 0.0], [0.25, 0.05, 0.0]], [0.1, 0.02])
 
-    def __init__(self, balls: Balls) -> None:
-        self._balls = balls
-
-    def query(self, points: Float64) -> tuple[Float64, Float64]:
-        distance, gradient = self._balls.query(points)
+    def partly_blank(points: Float64) -> tuple[Float64, Float64]:
+        distance, gradient = deep.query(points)
         return np.where(points[:, 0] < 0.3, np.nan, distance), gradient
 
-
-def test_a_sphere_without_a_distance_hides_no_sphere_that_collides() -> None:
-    with pytest.raises(NotEvaluableError, match=r"got sphere fore\[1\] 0\.0800 m deep"):
-        check_free(PlanarArm(), PartlyBlank(Balls([[0.9, 0.0, 0.0]], [0.04])), Q)
-
-
-def test_the_deepest_sphere_is_named_and_a_free_start_passes() -> None:
-    deep = Balls([[0.9, 0.0, 0.0], [0.25, 0.05, 0.0]], [0.1, 0.02])
-    with pytest.raises(NotEvaluableError, match=r"sphere fore\[1\] 0\.1400 m deep"):
-        check_free(PlanarArm(), deep, Q)
-    check_free(PlanarArm(), Balls([[0.9, 0.2, 0.0]], [0.1]), Q)
-    check_free(PlanarArm(), Balls([[0.0, 0.0, 0.0]], [0.1]), Q)  # in the base, which no joint moves
+    for field in (deep, SimpleNamespace(query=partly_blank)):
+        with pytest.raises(NotEvaluableError, match=r"got sphere fore\[1\] 0\.1400 m deep"):
+            check_free(arm, field, Q)
+    for center in ([0.9, 0.2, 0.0], [0.0, 0.0, 0.0]):
+        check_free(arm, Balls([center], [0.1]), Q)
 
 
 def test_only_spheres_that_no_joint_moves_are_static() -> None:
@@ -161,16 +127,14 @@ def test_only_spheres_that_no_joint_moves_are_static() -> None:
 
 
 def test_a_start_is_free_where_the_links_own_surface_is() -> None:
-    for radius, is_free in ((0.07, True), (0.09, False)):  # 1 cm deep in a sphere and in its surface
+    """A ball 1 cm deep in a sphere alone, and one as deep in the surface."""
+    for radius, depth in ((0.07, "0.0100"), (0.09, "0.0300")):
         centers, radii = [[0.9, 0.1, 0.0]], [radius]
-        balls, scene = Balls(centers, radii), scene_of(centers, radii)
-        with pytest.raises(NotEvaluableError, match=r"sphere fore\[1\] 0\.0[13]00 m deep"):
-            check_free(ThinArm(), balls, Q)
-        if is_free:
-            check_free(ThinArm(), balls, Q, scene)
-            continue
-        with pytest.raises(NotEvaluableError, match=r"sphere fore\[1\] 0\.0100 m deep"):
-            check_free(ThinArm(), balls, Q, scene)
+        with pytest.raises(NotEvaluableError, match=rf"sphere fore\[1\] {depth} m deep"):
+            check_free(ThinArm(), Balls(centers, radii), Q)
+    with pytest.raises(NotEvaluableError, match=r"sphere fore\[1\] 0\.0100 m deep"):
+        check_free(ThinArm(), Balls(centers, radii), Q, scene_of(centers, radii))
+    check_free(ThinArm(), Balls(centers, [0.07]), Q, scene_of(centers, [0.07]))
 
 
 @pytest.mark.parametrize(
@@ -181,36 +145,39 @@ def test_only_a_scene_that_newly_comes_into_the_arm_is_a_hit(before: float, afte
     assert SceneChange(stamp_ns=0, before=before, after=after).is_hit == is_hit
 
 
-def broken_rows(distance: list[float], later: list[float]) -> list[bool]:
+@pytest.mark.parametrize(
+    ("distance", "later", "broken"),
+    [
+        pytest.param([0.010, 0.000], [0.009, 0.015], [False, False], id="together they gain"),
+        pytest.param([0.010, 0.000], [0.001, 0.001], [True, False], id="together they lose"),
+        pytest.param([0.010, 0.100, 0.000], [0.009, 0.050, 0.015], [True, True, False], id="one is beyond"),
+        pytest.param([0.010, 0.050], [0.019, 0.0195], [False, True], id="one comes within"),
+        pytest.param([0.010, 0.100], [0.010, 0.100], [False, False], id="none moves"),
+        pytest.param([0.100], [np.nan], [True], id="no distance"),
+    ],
+)
+def test_rows_within_their_margins_may_lose_to_one_another_but_excuse_no_other_row(
+    distance: list[float], later: list[float], broken: list[bool]
+) -> None:
     """Of rows with a margin of 20 mm that promise not to lose anything."""
-    num = len(distance)
-    rows = SimpleNamespace(
-        distance=np.array(distance), margin=np.full(num, 0.02), h=np.zeros(num), spread=lambda slack: np.zeros(num)
-    )
+    none = np.zeros(len(distance))
+    rows: Any = SimpleNamespace(distance=np.array(distance), margin=none + 0.02, h=none, spread=lambda slack: slack)
     controller: Any = SimpleNamespace(_config=ControlConfig())
-    choice: Any = SimpleNamespace(slack=np.zeros(num))
-    return QpIkController._broken(controller, choice, rows, np.array(later)).tolist()  # type: ignore[arg-type]
-
-
-def test_rows_within_their_margins_may_lose_to_one_another_but_excuse_no_other_row() -> None:
-    assert broken_rows([0.010, 0.000], [0.009, 0.015]) == [False, False]  # together they gain
-    assert broken_rows([0.010, 0.000], [0.001, 0.001]) == [True, False]  # together they lose
-    assert broken_rows([0.010, 0.100, 0.000], [0.009, 0.050, 0.015]) == [
-        True,
-        True,
-        False,
-    ]  # one is beyond
-    assert broken_rows([0.010, 0.100], [0.010, 0.100]) == [False, False]
-    assert broken_rows([0.100], [float("nan")]) == [True]
+    choice: Any = SimpleNamespace(slack=none)
+    assert QpIkController._broken(controller, choice, rows, np.array(later)).tolist() == broken
 
 
 FREE = [0.0, 0.5, 0.0]  # a ball far from the base
 
 
+def everywhere(places: Float64) -> Bool:
+    return np.ones(len(places), bool)
+
+
 def looked(*scenes: DistanceFunction, arm: PlanarArm | None = None) -> dict[str, tuple[float, float]]:
     parts = FixedParts(arm or ThinArm(), 0.04)
     for scene in scenes:
-        parts.look(scene, Q, lambda places: np.ones(len(places), bool))
+        parts.look(scene, Q, everywhere)
     return parts.found
 
 
@@ -225,10 +192,8 @@ def beside(gap: float) -> DistanceFunction:
 )
 def test_what_moves_by_more_than_a_map_does_has_come(gap: float, later: float, has_come: bool) -> None:
     """By a centimetre, or by three beside a sphere at its mount. The surface is 2 cm within the sphere."""
-    found = looked(beside(gap), beside(later), beside(later))
-    first, least = found["base[0]"]
-    assert first == pytest.approx(gap)
-    assert least == pytest.approx(later + 0.02 if has_come else gap)
+    found = looked(beside(gap), beside(later), beside(later))["base[0]"]
+    assert found == pytest.approx((gap, later + 0.02 if has_come else gap))
 
 
 def test_spheres_say_how_near_a_link_without_triangles_is() -> None:
@@ -240,11 +205,10 @@ def test_spheres_say_how_near_a_link_without_triangles_is() -> None:
 
 
 def test_what_is_seen_for_the_first_time_did_not_come_and_stands_there_from_then_on() -> None:
-    parts, before, after = FixedParts(ThinArm(), 0.04), beside(0.4), beside(0.0)
-    parts.look(before, Q, None)
-    parts.look(after, Q, lambda places: places[:, 1] > 0.3)
-    for _ in range(2):
-        parts.look(after, Q, lambda places: np.ones(len(places), bool))
+    parts, after = FixedParts(ThinArm(), 0.04), beside(0.0)
+    parts.look(beside(0.4), Q, None)
+    for seen in (lambda places: places[:, 1] > 0.3, everywhere, everywhere):
+        parts.look(after, Q, seen)
     assert parts.found["base[0]"][1] == pytest.approx(0.4, abs=0.05)
 
 
@@ -257,22 +221,15 @@ def test_what_one_scene_alone_has_is_noise() -> None:
 
 def test_each_sphere_has_what_is_nearest_to_it() -> None:
     """The base with a second sphere 30 cm away: what comes to one says nothing of the other."""
-    arm, second = ThinArm(), [-0.3, 0.0, 0.0]
-    spheres, own = arm.sphere_set, arm.sphere_centers
+    arm = ThinArm()
+    spheres = arm.sphere_set
     arm.sphere_set = SphereSet(
         links=("base", *spheres.links),
-        centers=np.concatenate([[second], spheres.centers]),
+        centers=np.concatenate([[[-0.3, 0.0, 0.0]], spheres.centers]),
         radii=np.append(0.06, spheres.radii),
     )
     arm.moving_spheres = np.append(False, arm.moving_spheres)
-
-    def centers_at(q: Float64) -> Float64:
-        arm.sphere_set, both = spheres, arm.sphere_set
-        centers = np.concatenate([[second], own(q)])
-        arm.sphere_set = both
-        return centers
-
-    arm.sphere_centers = centers_at  # type: ignore[method-assign]
+    arm.sphere_centers = lambda q: np.concatenate([[[-0.3, 0.0, 0.0]], PlanarArm().sphere_centers(q)])  # type: ignore[method-assign]
     scene = scene_of([FREE, [0.0, 0.1, 0.0], [-0.3, 0.11, 0.0]], [0.01, 0.01, 0.01])
     found = looked(scene_of([FREE], [0.01]), scene, scene, arm=arm)
     assert [least for _, least in found.values()] == pytest.approx([0.06, 0.05])

@@ -9,15 +9,14 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.qp import Rung, descend
+from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.qp_rows import RowBuilder
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.control.step import QpIkController
-from splatctrl_cli.control.terms import State, stray_cost
+from splatctrl_cli.control.terms import State
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.records import Float64
-from splatctrl_cli.robot.model import RobotModel
-from tests.control.fakes import Balls, PlanarArm, far_away, num_on_rung, scene_of
+from tests.control.fakes import Balls, PlanarArm, far_away, num_on_rung, sample_arm, scene_of
 
 ARM = PlanarArm()
 CONFIG = ControlConfig(solver="daqp")
@@ -32,42 +31,32 @@ TASK = ReplayTask(
 )
 
 
-def seven_joints(plain_arm: Path) -> RobotModel:
-    folder = plain_arm / "tabletop"
-    return RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
-
-
 def state_at(q: np.ndarray, rate: float | np.ndarray = 0.0) -> State:
     return State(model=ARM, frame="tip", q=q, box=BOX, distance_rate=rate)
 
 
-def test_an_arm_pressed_against_a_row_of_balls_keeps_its_margin() -> None:
-    trace = closed_loop(ARM, CONFIG, TASK, lambda _: BEAM)
+@pytest.mark.parametrize("max_cuts", [0, CONFIG.max_cuts])
+def test_an_arm_pressed_against_a_row_of_balls_keeps_its_margin(
+    max_cuts: int,
+) -> None:
+    trace = closed_loop(ARM, replace(CONFIG, max_cuts=max_cuts), TASK, lambda _: BEAM)
     assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
-    assert all(step.scale == 1.0 and step.rung is Rung.SOLVED for step in trace.steps)
-
-
-def test_without_cuts_the_same_steps_have_to_be_scaled_back() -> None:
-    trace = closed_loop(ARM, replace(CONFIG, max_cuts=0), TASK, lambda _: BEAM)
-    assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
-    assert any(step.scale < 1.0 for step in trace.steps)
+    assert any(step.scale < 1.0 for step in trace.steps) is (max_cuts == 0)
+    assert not max_cuts or all(step.rung is Rung.SOLVED for step in trace.steps)
 
 
 def test_a_cut_is_the_row_of_what_is_met_after_a_period() -> None:
-    q, velocity = np.array([0.7, 0.5]), np.array([0.9, -0.4])
-    state, later = state_at(q), q + CONFIG.period * velocity
-    builder = RowBuilder(ARM, CONFIG, BEAM)
+    q, velocity, builder = np.array([0.7, 0.5]), np.array([0.9, -0.4]), RowBuilder(ARM, CONFIG, BEAM)
+    state, later, step = state_at(q), q + CONFIG.period * velocity, 1e-6 * np.eye(2)
     rows = builder.cut(builder.at(state), state, velocity, np.array([3]))
     assert rows.cuts is not None and list(rows.cuts.index) == [3]
 
     def clearance(posture: np.ndarray) -> float:
         return float(BEAM.query(ARM.sphere_centers(posture)[[TIP]])[0][0] - ARM.sphere_set.radii[TIP])
 
-    step = 1e-6 * np.eye(2)
-    slope = [(clearance(later + d) - clearance(later - d)) / 2e-6 for d in step]
-    np.testing.assert_allclose(rows.cuts.G[0], -np.array(slope), rtol=1e-6)
-    linear = clearance(later) - CONFIG.period * np.dot(slope, velocity)
-    now = max(linear, rows.external.distance[3])
+    slope = np.array([(clearance(later + d) - clearance(later - d)) / 2e-6 for d in step])
+    np.testing.assert_allclose(rows.cuts.G[0], -slope, rtol=1e-6)
+    now = max(clearance(later) - CONFIG.period * slope @ velocity, rows.external.distance[3])
     np.testing.assert_allclose(rows.cuts.distance[0], now, rtol=1e-9)
     np.testing.assert_allclose(rows.cuts.h[0], CONFIG.barrier_gain * (now - CONFIG.margin), rtol=1e-9)
 
@@ -75,22 +64,18 @@ def test_a_cut_is_the_row_of_what_is_met_after_a_period() -> None:
 def test_a_cut_counts_the_rate_of_its_own_sphere() -> None:
     builder, q, velocity = RowBuilder(ARM, CONFIG, BEAM), np.array([0.7, 0.5]), np.array([0.9, -0.4])
     rate = np.array([0.0, -0.1, -0.2, -0.3])
-    still, moving = (
-        builder.cut(builder.at(state), state, velocity, np.array([1, 3])).cuts
-        for state in (state_at(q), state_at(q, rate))
-    )
+    states = state_at(q), state_at(q, rate)
+    still, moving = (builder.cut(builder.at(state), state, velocity, np.array([1, 3])).cuts for state in states)
     assert still is not None and moving is not None
     np.testing.assert_allclose(moving.h - still.h, rate[[1, 3]])
 
 
 def test_cuts_add_up_and_give_their_slack_to_the_row_they_belong_to() -> None:
-    builder, q, velocity = RowBuilder(ARM, CONFIG, BEAM), np.array([0.7, 0.5]), np.array([0.9, -0.4])
-    state = state_at(q)
+    builder, state, velocity = RowBuilder(ARM, CONFIG, BEAM), state_at(np.array([0.7, 0.5])), np.array([0.9, -0.4])
     rows = builder.at(state)
-    num_rows = int(rows.in_qp.sum())
-    rows = builder.cut(builder.cut(rows, state, velocity, np.array([3])), state, velocity, np.array([2, 3]))
-    assert rows.cuts is not None and list(rows.cuts.index) == [3, 2, 3]
-    spread = rows.spread(np.concatenate([np.zeros(num_rows), [0.1, 0.2, 0.3]]))
+    cut = builder.cut(builder.cut(rows, state, velocity, np.array([3])), state, velocity, np.array([2, 3]))
+    assert cut.cuts is not None and list(cut.cuts.index) == [3, 2, 3]
+    spread = cut.spread(np.concatenate([np.zeros(int(rows.in_qp.sum())), [0.1, 0.2, 0.3]]))
     assert spread[2] == 0.2 and spread[3] == 0.3 and np.count_nonzero(spread) == 2
 
 
@@ -100,54 +85,30 @@ def test_far_from_everything_a_step_asks_the_field_twice() -> None:
     assert field.num_queries == 2
 
 
-@pytest.mark.parametrize("max_cuts", [1, 3])
-def test_a_corner_stops_an_arm_at_both_of_its_sides(max_cuts: int) -> None:
-    """The tip is driven into the gap between two balls, too narrow for it."""
-    q = np.array([0.6, 0.0])
-    tip = ARM.frame_pose(q, "tip")[:3, 3]
+def test_a_corner_stops_an_arm_at_both_of_its_sides() -> None:
+    """The tip is driven into the gap between two balls, too narrow for it; one cut a step has to do."""
+    q, end = np.array([0.6, 0.0]), np.array([1.2, 0.0])
     along, across = np.array([np.cos(0.6), np.sin(0.6), 0.0]), np.array([-np.sin(0.6), np.cos(0.6), 0.0])
+    tip = ARM.frame_pose(q, "tip")[:3, 3]
     gap = Balls([tip + 0.19 * across + 0.012 * s * along for s in (-6, 6)], [0.08, 0.08])
-    goal = ARM.frame_pose(np.array([1.2, 0.0]), "tip")
-    config = replace(CONFIG, max_cuts=max_cuts)
-    task = ReplayTask(start=q, T_world_goal=goal, frame="tip", home=np.array([1.2, 0.0]))
-    trace = closed_loop(ARM, config, task, lambda _: gap)
+    task = ReplayTask(start=q, T_world_goal=ARM.frame_pose(end, "tip"), frame="tip", home=end)
+    trace = closed_loop(ARM, replace(CONFIG, max_cuts=1), task, lambda _: gap)
     assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
 
 
 def test_an_arm_inside_a_shell_of_balls_gets_out(plain_arm: Path) -> None:
     """A cylinder of splats appears around the hand: every motion brings some sphere of it nearer to one of them."""
-    arm, q = seven_joints(plain_arm), np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
+    arm, q = sample_arm(plain_arm), np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
     T_world_goal = arm.frame_pose(np.array([0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 1.6]), "hand")
     turn, height = np.meshgrid(np.arange(0.0, 2 * np.pi, 0.5), np.arange(-0.12, 0.12, 0.03), indexing="ij")
     shell = np.stack([0.06 * np.cos(turn), 0.06 * np.sin(turn), height], axis=-1).reshape(-1, 3)
-    around_hand = arm.frame_pose(q, "hand")[:3, 3] + np.array([0.05, 0.03, 0.0])
-    cylinder = SphereField((shell + around_hand).astype(np.float32), np.full(len(shell), 0.02, np.float32))
-    nothing = SphereField(np.full((1, 3), 50.0, np.float32), np.full(1, 0.01, np.float32))
+    around_hand = shell + arm.frame_pose(q, "hand")[:3, 3] + np.array([0.05, 0.03, 0.0])
+    cylinder = SphereField(around_hand.astype(np.float32), np.full(len(shell), 0.02, np.float32))
     task = ReplayTask(start=q, T_world_goal=T_world_goal, frame="hand")
-    trace = closed_loop(arm, CONFIG, task, lambda t: cylinder if t >= 50_000_000 else nothing)
+    trace = closed_loop(arm, CONFIG, task, lambda t: cylinder if t >= 50_000_000 else far_away())
     clearance = np.array([step.clearance for step in trace.steps])
     assert clearance[5] < -0.05 and trace.outcome is Outcome.GOAL_REACHED
     assert np.all(clearance[60:] >= CONFIG.margin - CONFIG.promise_tolerance)
-
-
-def distances(q: np.ndarray, field: Balls) -> np.ndarray:
-    return field.query(ARM.sphere_centers(q)[1:])[0] - ARM.sphere_set.radii[1:]
-
-
-@pytest.mark.parametrize(("outside_later", "is_broken"), [(0.0475, False), (0.0195, True)])
-def test_a_sphere_outside_its_margin_does_not_give_way_to_those_within(outside_later: float, is_broken: bool) -> None:
-    """One sphere, 1 cm within its margin, gains 9 mm: all lack less even where another breaks its row."""
-    controller = QpIkController(ARM, CONFIG, BEAM, frame="tip")
-    rows = controller._builder.at(state_at(TASK.start))
-    distance = np.full(len(rows.external), 0.5)
-    distance[:2] = [0.01, 0.05]
-    external = replace(rows.external, distance=distance, h=CONFIG.barrier_gain * (distance - CONFIG.margin))
-    rows = replace(rows, barriers=(external, rows.own))
-    choice = descend(controller._solver, [stray_cost(np.zeros(2), 1.0)], BOX, rows.for_qp, CONFIG)
-    choice = replace(choice, slack=np.zeros(int(rows.in_qp.sum())))
-    later = rows.distance.copy()
-    later[:2] = [0.019, outside_later]
-    assert bool(np.any(controller._broken(choice, rows, later))) is is_broken
 
 
 DRIVEN = ControlConfig(goal_position=0.002, goal_rotation=0.002, max_time=8.0)
@@ -185,12 +146,19 @@ def half_space(axis: int, top: float) -> tuple[Balls, BallDistance]:
 
 
 def driven(
-    arm: PlanarArm, scene: tuple[Balls, BallDistance], end: Float64, *, by_surface: bool = True, **changes: object
+    arm: PlanarArm,
+    scene: tuple[Balls, BallDistance],
+    end: Float64,
+    *,
+    by_surface: bool = True,
+    seconds: float = 8.0,
+    since: int = 0,
 ) -> ReplayTrace:
+    """A closed loop from START, in a scene that is there from a stamp on."""
     task = ReplayTask(start=START, T_world_goal=arm.frame_pose(end, "tip"), frame="tip", home=end)
-    task = replace(task, **changes)  # type: ignore[arg-type]
-    balls = scene[1] if by_surface else None
-    return closed_loop(arm, DRIVEN, task, lambda _: scene[0], balls_at=lambda _: balls)
+    fields, balls = (far_away(), scene[0]), (None, scene[1] if by_surface else None)
+    config = replace(DRIVEN, max_time=seconds)
+    return closed_loop(arm, config, task, lambda t: fields[t >= since], balls_at=lambda t: balls[t >= since])
 
 
 def least_gaps(arm: BallArm, trace: ReplayTrace, scene: tuple[Balls, BallDistance]) -> dict[str, float]:
@@ -199,53 +167,44 @@ def least_gaps(arm: BallArm, trace: ReplayTrace, scene: tuple[Balls, BallDistanc
 
 
 def test_an_arm_starts_whose_spheres_alone_are_within_the_margin_of_its_table() -> None:
-    arm, table = (
-        BallArm(0.024),
-        half_space(2, 0.045),
-    )  # spheres 5 mm above it, surfaces 29 mm, and no joint lifts them
+    """Its spheres are 5 mm above it, its surfaces 29 mm, and no joint lifts them."""
+    arm, table = BallArm(0.024), half_space(2, 0.045)
     trace = driven(arm, table, ASIDE)
     assert trace.outcome is Outcome.GOAL_REACHED and num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
     assert trace.by_surface == EVERY
     assert min(step.clearance for step in trace.steps) == pytest.approx(0.029, abs=1e-3)
-    before = driven(arm, table, ASIDE, by_surface=False)
-    assert num_on_rung(before, Rung.RELAXED) and not before.by_surface
 
 
 def test_the_surface_keeps_the_margin_where_the_arm_is_driven_against_the_thing() -> None:
     arm, centers = BallArm(0.02), [[0.0, -50.05, 0.0], [0.0, 50.05, 0.0]]  # a gap that has no room for the spheres
-    gap = Balls(centers, [50.0, 50.0]), scene_of(centers, [50.0, 50.0])
-    trace = driven(arm, gap, np.array([-0.3, -0.2]))
+    gap, end = (Balls(centers, [50.0, 50.0]), scene_of(centers, [50.0, 50.0])), np.array([-0.3, -0.2])
+    trace = driven(arm, gap, end)
     assert num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
     assert min(least_gaps(arm, trace, gap).values()) == pytest.approx(MARGIN, abs=1e-3)
-    assert num_on_rung(driven(arm, gap, np.array([-0.3, -0.2]), by_surface=False), Rung.RELAXED)
+    assert num_on_rung(driven(arm, gap, end, by_surface=False, seconds=0.2), Rung.RELAXED)
 
 
 def test_a_surface_that_turns_towards_the_thing_within_its_sphere_keeps_the_margin() -> None:
     arm, wall = BallArm(0.03, left=0.03, radius=0.06), half_space(1, 0.065)
     arm.sphere_set.centers[3, 0] = 0.0  # about the elbow: turned in place, it sticks out by 6 cm, then by nothing
     arm.velocity_limit[0] = 1e-3
-    trace = driven(arm, wall, np.array([0.0, 2.5]))
+    trace = driven(arm, wall, np.array([0.0, 2.5]), seconds=5.0)
     assert num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
-    assert "fore[0]" in trace.by_surface
-    least = least_gaps(arm, trace, wall)
-    assert least["fore"] == pytest.approx(MARGIN, abs=1e-3)
-    assert trace.position[-1][1] > 1.5
+    assert "fore[0]" in trace.by_surface and trace.position[-1][1] > 1.5
+    assert least_gaps(arm, trace, wall)["fore"] == pytest.approx(MARGIN, abs=1e-3)
 
 
-def test_spheres_that_do_not_stick_out_keep_their_margin() -> None:
-    arm, table = BallArm(0.0), half_space(2, 0.045)
-    trace = driven(arm, table, ASIDE)
-    assert trace.by_surface == () and num_on_rung(trace, Rung.RELAXED)
-
-
-def test_a_surface_within_the_margin_is_what_a_row_lacks() -> None:
-    arm, table = BallArm(0.01), half_space(2, 0.045)  # 5 mm and 15 mm
-    for by_surface, clearance in ((True, 0.015), (False, 0.005)):
-        first = driven(arm, table, ASIDE, by_surface=by_surface).steps[0]
-        assert first.rung is Rung.RELAXED
-        assert first.clearance == pytest.approx(clearance, abs=1e-3)
-        asked = DRIVEN.barrier_gain * (MARGIN - clearance)
-        assert max(row.slack for row in first.relaxed) == pytest.approx(asked, abs=0.02)
+@pytest.mark.parametrize(
+    ("smaller", "by_surface", "clearance"),
+    [(0.01, True, 0.015), (0.01, False, 0.005), (0.0, True, 0.005)],  # of spheres that do not stick out
+)
+def test_a_surface_within_the_margin_is_what_a_row_lacks(smaller: float, by_surface: bool, clearance: float) -> None:
+    trace = driven(BallArm(smaller), half_space(2, 0.045), ASIDE, by_surface=by_surface, seconds=0.01)
+    (first,) = trace.steps
+    assert first.rung is Rung.RELAXED and bool(trace.by_surface) is (smaller > 0 and by_surface)
+    assert first.clearance == pytest.approx(clearance, abs=1e-3)
+    asked = DRIVEN.barrier_gain * (MARGIN - clearance)
+    assert max(row.slack for row in first.relaxed) == pytest.approx(asked, abs=0.02)
 
 
 def test_rows_by_surface_are_less_the_derivative_of_their_distance() -> None:
@@ -265,15 +224,6 @@ def test_rows_by_surface_are_less_the_derivative_of_their_distance() -> None:
 def test_spheres_that_can_keep_their_margin_from_a_newer_scene_do(
     axis: int, top: float, names: tuple[str, ...]
 ) -> None:
-    arm, scene = BallArm(0.024), half_space(axis, top)
-    fields, end = (far_away(), scene[0]), np.array([0.0, 0.4])
-    task = ReplayTask(start=START, T_world_goal=arm.frame_pose(end, "tip"), frame="tip", home=end)
-    trace = closed_loop(
-        arm,
-        DRIVEN,
-        task,
-        lambda t: fields[t >= 100_000_000],
-        balls_at=lambda t: scene[1] if t >= 100_000_000 else None,
-    )
+    trace = driven(BallArm(0.024), half_space(axis, top), np.array([0.0, 0.4]), since=100_000_000)
     assert set(trace.by_surface) == set(names)
     assert num_on_rung(trace, Rung.SOLVED) == len(trace.steps)

@@ -16,39 +16,38 @@ def plane(z: float, size: float = 0.1, step: float = 0.005) -> Float64:
     return np.column_stack([x, y, np.full(len(x), z)])
 
 
+SEEN = np.ones(400, np.bool_)
+
+
 def test_two_planes_are_as_far_apart_both_ways() -> None:
-    score = cloud_score(plane(0.003), plane(0.0), np.ones(400, np.bool_))
-    assert score["accuracy"] == score["completeness"] == score["completeness_seen"] == pytest.approx(0.003)
-    assert score["chamfer"] == pytest.approx(0.003)
+    """Where nothing was seen that figure does not exist."""
+    score = cloud_score(plane(0.003), plane(0.0), SEEN)
+    near = ("accuracy", "completeness", "completeness_seen", "chamfer")
+    assert [score[name] for name in near] == pytest.approx([0.003] * 4)
     assert score["accuracy_beyond"] == score["completeness_beyond"] == 0.0
+    assert math.isnan(cloud_score(plane(0.0), plane(0.0), ~SEEN)["completeness_seen"])
 
 
 def test_half_a_surface_is_accurate_and_incomplete() -> None:
+    """Columns 2 cm and farther away are beyond; of the other 11 one is 1 cm off."""
     reference = plane(0.0, size=0.2, step=0.01)
-    half = reference[reference[:, 0] < 0.095]
-    score = cloud_score(half, reference, reference[:, 0] < 0.095)
-    assert score["accuracy"] == 0.0
-    assert score["completeness_beyond"] == pytest.approx(9 / 20), "columns 2 cm and farther away"
-    assert score["completeness"] == pytest.approx(0.01 * 1 / 11), "of 11 columns one is 1 cm off, none other"
-    assert score["completeness_seen"] == 0.0
+    is_half = reference[:, 0] < 0.095
+    score = cloud_score(reference[is_half], reference, is_half)
+    assert score["accuracy"] == score["completeness_seen"] == 0.0
+    assert (score["completeness_beyond"], score["completeness"]) == pytest.approx((9 / 20, 0.01 * 1 / 11))
 
 
 def test_what_is_farther_than_the_maximum_counts_in_a_share_only() -> None:
     points = np.vstack([plane(0.001), plane(0.05)])
-    score = cloud_score(points, plane(0.0), np.ones(400, np.bool_), max_distance=0.02)
-    assert score["accuracy"] == pytest.approx(0.001)
-    assert score["accuracy_beyond"] == 0.5
-
-
-def test_where_nothing_was_seen_that_figure_does_not_exist() -> None:
-    assert math.isnan(cloud_score(plane(0.0), plane(0.0), np.zeros(400, np.bool_))["completeness_seen"])
+    score = cloud_score(points, plane(0.0), SEEN, max_distance=0.02)
+    assert (score["accuracy"], score["accuracy_beyond"]) == (pytest.approx(0.001), 0.5)
 
 
 def test_another_unit_or_frame_is_told_from_a_bad_surface() -> None:
     with pytest.raises(NotEvaluableError, match=r"points within 20 mm of the scene's surface, got none; it spans"):
-        cloud_score(plane(0.0), 1000 * plane(1.0), np.ones(400, np.bool_))
+        cloud_score(plane(0.0), 1000 * plane(1.0), SEEN)
     with pytest.raises(UsageError, match="--cloud-max: expected a distance above 0 m, got 0"):
-        cloud_score(plane(0.0), plane(0.0), np.ones(400, np.bool_), max_distance=0.0)
+        cloud_score(plane(0.0), plane(0.0), SEEN, max_distance=0.0)
 
 
 @pytest.mark.parametrize("factor", [1000.0, 0.001, 100.0])
@@ -61,34 +60,23 @@ def test_a_cloud_that_would_fit_in_another_unit_is_refused_with_that_unit(factor
 
 
 def test_points_that_do_not_count_enter_no_accuracy_but_complete_the_surface() -> None:
-    points = np.vstack([plane(0.003), plane(0.0)])
-    counts = np.repeat([True, False], 400)
-    score = cloud_score(points, plane(0.0), np.ones(400, np.bool_), counts=counts)
-    assert score["accuracy"] == pytest.approx(0.003)
-    assert score["completeness"] == 0.0
-    assert score["num_points"] == 400
+    points, counts = np.vstack([plane(0.003), plane(0.0)]), np.repeat([True, False], 400)
+    score = cloud_score(points, plane(0.0), SEEN, counts=counts)
+    figures = score["accuracy"], score["completeness"], score["num_points"]
+    assert figures == (pytest.approx(0.003), 0.0, 400)
     with pytest.raises(NotEvaluableError, match="the scene's surface: expected points to compare, got none"):
-        cloud_score(points, plane(0.0), np.ones(400, np.bool_), counts=counts & False)
-
-
-def test_thinning_in_parts_leaves_what_thinning_at_once_does() -> None:
-    points = np.random.default_rng(2).uniform(-0.01, 0.01, (2000, 3))
-    parts = np.vstack([thinned(points[:900], 0.003), thinned(points[900:], 0.003)])
-    assert np.array_equal(thinned(parts, 0.003), thinned(points, 0.003))
+        cloud_score(points, plane(0.0), SEEN, counts=counts & False)
 
 
 def test_spaced_points_are_what_taking_them_in_turn_leaves() -> None:
-    points = np.random.default_rng(3).uniform(0, 0.01, (800, 3))
-    spacing = 0.002
-    kept: list[Float64] = []
+    points, spacing, kept = np.random.default_rng(3).uniform(0, 0.01, (800, 3)), 0.002, np.empty((0, 3))
     some = thinned(points, spacing / 2)
     for point in some[np.random.default_rng(0).permutation(len(some))]:
-        if all(np.linalg.norm(point - other) > spacing for other in kept):
-            kept.append(point)
+        if np.all(np.linalg.norm(kept - point, axis=1) > spacing):
+            kept = np.vstack([kept, point])
     assert 50 < len(kept) < 0.6 * len(some)
     assert np.array_equal(spaced(points, spacing), kept)
-    again = spaced(np.array(kept), spacing)
-    assert sorted(again.tolist()) == sorted(np.array(kept).tolist()), "what is spaced stays as it is"
+    assert sorted(spaced(kept, spacing).tolist()) == sorted(kept.tolist()), "what is spaced stays as it is"
     assert len(spaced(np.empty((0, 3)), spacing)) == 0
 
 
@@ -97,15 +85,18 @@ def test_rigid_motion_changes_no_figure() -> None:
     points, reference = rng.uniform(0, 0.03, (200, 3)), rng.uniform(0, 0.03, (300, 3))
     Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     seen = rng.random(300) < 0.5
-    one = cloud_score(points, reference, seen)
     other = cloud_score(points @ Q.T + 0.4, reference @ Q.T + 0.4, seen)
-    assert one == pytest.approx(other, abs=1e-12)
+    assert cloud_score(points, reference, seen) == pytest.approx(other, abs=1e-12)
 
 
 def test_thinning_leaves_one_point_to_a_cube() -> None:
+    """In parts it leaves what it does at once."""
     points = np.array([[0.0, 0.0, 0.0], [0.0004, 0.0, 0.0], [0.0011, 0.0, 0.0], [0.0, 0.0, 0.0012]])
     np.testing.assert_array_equal(thinned(points, 0.001), points[[0, 2, 3]])
     assert len(thinned(np.empty((0, 3)), 0.001)) == 0
+    many = np.random.default_rng(2).uniform(-0.01, 0.01, (2000, 3))
+    parts = np.vstack([thinned(many[:900], 0.003), thinned(many[900:], 0.003)])
+    assert np.array_equal(thinned(parts, 0.003), thinned(many, 0.003))
 
 
 def test_points_on_a_mesh_lie_on_it_evenly() -> None:
@@ -114,6 +105,4 @@ def test_points_on_a_mesh_lie_on_it_evenly() -> None:
     points = points_on(mesh, 0.002)
     assert len(points) == pytest.approx(4 * 0.01 / 0.002**2, abs=1)
     np.testing.assert_allclose(points[:, 2], 0.5)
-    assert points[:, :2].min() >= 0
-    assert points[:, :2].max() <= 0.1
-    assert abs(points[:, 0].mean() - 0.05) < 0.002
+    assert points[:, :2].min() >= 0 and points[:, :2].max() <= 0.1 and abs(points[:, 0].mean() - 0.05) < 0.002

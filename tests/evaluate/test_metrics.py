@@ -1,5 +1,6 @@
 """How figures of states fold, the interval of a mean change, agreement with the truth, and the conformal bound."""
 
+from collections.abc import Callable
 from fractions import Fraction
 from itertools import pairwise
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from splatctrl_cli.evaluate import metrics as module
@@ -17,74 +19,85 @@ from splatctrl_cli.evaluate.conformal import (
     stretch_scores,
     stretches,
 )
-from splatctrl_cli.evaluate.metrics import FEWEST, clearance_agreement, largest, least, lowest, mark_seen, mean_change
+from splatctrl_cli.evaluate.metrics import (
+    FEWEST,
+    MeanChange,
+    clearance_agreement,
+    largest,
+    least,
+    lowest,
+    mark_seen,
+    mean_change,
+)
 from splatctrl_cli.records import Float64, Intrinsics
 from tests.plain import plain_frame
 from tests.properties import few
 from tests.reference import conformal as reference
 
 
-def test_a_residual_that_is_infinite_is_not_left_out_of_thelargest() -> None:
-    assert largest(np.array([1e-9, np.inf, np.nan])) is None
-    assert largest(np.array([1e-9, 2e-9, np.nan])) == 2e-9
-    assert largest(np.array([np.nan])) is None
-    assert lowest(np.array([np.nan, -np.inf, 1.0])) == -np.inf
+@pytest.mark.parametrize(
+    ("fold", "values", "expected"),
+    [
+        (largest, [1e-9, np.inf, np.nan], None),
+        (largest, [1e-9, 2e-9, np.nan], 2e-9),
+        (largest, [np.nan], None),
+        (lowest, [np.nan, -np.inf, 1.0], -np.inf),
+        (least, [np.nan, 2.0, np.inf, 1.0], 1.0),
+        (least, [np.nan], None),
+    ],
+)
+def test_a_residual_that_is_infinite_is_not_left_out_of_the_largest(
+    fold: Callable[[Float64], float | None], values: list[float], expected: float | None
+) -> None:
+    """Nor of the lowest; the least value ignores what is not finite."""
+    assert fold(np.array(values)) == expected
+
+
+def changed(values: ArrayLike) -> MeanChange:
+    found = mean_change(np.asarray(values, np.float64).tolist())
+    assert found is not None
+    return found
 
 
 def test_fewer_than_eight_pairs_have_no_interval() -> None:
     assert mean_change([1.0] * (FEWEST - 1)) is None
-    found = mean_change([1.0] * FEWEST)
-    assert found is not None
+    found = changed([1.0] * FEWEST)
     assert (found.mean, found.low, found.high, found.num_pairs) == (1.0, 1.0, 1.0, 8)
 
 
 def test_the_interval_is_that_of_scipy_and_the_same_every_time() -> None:
     values = np.random.default_rng(3).normal(0.4, 1.0, 20)
-    found = mean_change(list(values))
-    assert found is not None
     theirs = stats.bootstrap(
         (values,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(9)
-    )
-    assert found.mean == pytest.approx(values.mean())
-    assert found.low == pytest.approx(theirs.confidence_interval.low, abs=0.03)
-    assert found.high == pytest.approx(theirs.confidence_interval.high, abs=0.03)
-    assert mean_change(list(values)) == found
+    ).confidence_interval
+    found = changed(values)
+    assert found == changed(values) and found.mean == pytest.approx(values.mean())
+    assert (found.low, found.high) == pytest.approx((theirs.low, theirs.high), abs=0.03)
 
 
 def test_a_mean_of_zero_is_found_to_differ_about_as_often_as_is_promised() -> None:
     """Percentile intervals of twenty pairs are somewhat too short: 7 % instead of 5."""
-    rng, misses = np.random.default_rng(1), 0
-    for _ in range(200):
-        found = mean_change(list(rng.normal(0.0, 1.0, 20)))
-        assert found is not None
-        misses += not found.low <= 0 <= found.high
-    assert 4 <= misses <= 24
+    rng = np.random.default_rng(1)
+    found = [changed(rng.normal(0.0, 1.0, 20)) for _ in range(200)]
+    assert 4 <= sum(not each.low <= 0 <= each.high for each in found) <= 24
 
 
 STAMPS = np.arange(6, dtype=np.int64) * 10
 
 
+def agreement(clearance: list[float], truth: list[float], seen: list[bool]) -> list[float | None]:
+    found = clearance_agreement(np.array(clearance), np.array(truth), np.array(seen), 0.005)
+    names = "num_compared", "median", "largest", "largest_over", "tolerance", "share_within"
+    return [found[name] for name in names]
+
+
 def test_agreement_takes_near_and_seen_states_only() -> None:
-    truth = np.array([0.05, 0.05, 0.05, 0.05, 0.10, 0.09])
-    clearance = np.array([0.04, 0.07, 0.05, 0.9, 0.9, np.nan])
-    seen = np.array([True, True, True, False, True, True])
-    agreement = clearance_agreement(clearance, truth, seen, 0.005)
-    assert agreement["num_compared"] == 3
-    assert agreement["median"] == pytest.approx(0.01)
-    assert agreement["largest"] == pytest.approx(0.02)
-    assert agreement["largest_over"] == pytest.approx(0.02)
-    assert agreement["tolerance"] == pytest.approx(0.015)
-    assert agreement["share_within"] == pytest.approx(2 / 3)
-
-
-def test_an_under_estimate_is_no_over_estimate() -> None:
-    agreement = clearance_agreement(np.array([0.01]), np.array([0.05]), np.array([True]), 0.005)
-    assert agreement["largest_over"] == 0.0 and agreement["share_within"] == 0.0
-
-
-def test_without_a_state_to_compare_there_is_no_figure() -> None:
-    agreement = clearance_agreement(np.ones(2), np.ones(2), np.ones(2, bool), 0.005)
-    assert agreement["num_compared"] == 0 and agreement["median"] is None and agreement["share_within"] is None
+    """An under-estimate is no over-estimate, and without a state to compare there is no figure."""
+    truth, seen = [0.05, 0.05, 0.05, 0.05, 0.10, 0.09], [True, True, True, False, True, True]
+    found = agreement([0.04, 0.07, 0.05, 0.9, 0.9, np.nan], truth, seen)
+    assert found == pytest.approx([3, 0.01, 0.02, 0.02, 0.015, 2 / 3])
+    assert agreement([0.01], [0.05], [True])[3::2] == [0.0, 0.0]
+    assert agreement([1.0, 1.0], [1.0, 1.0], [True, True])[::5] == [0, None]
 
 
 @pytest.mark.parametrize("block", [1, 4, 6])
@@ -98,11 +111,6 @@ def test_a_frame_shows_a_surface_to_later_states_only(monkeypatch: pytest.Monkey
     assert seen.tolist() == [False, False, True, True, True, False]
     mark_seen(seen, points, STAMPS, frame, has_clock=False)
     assert seen.tolist() == [True] * 5 + [False]
-
-
-def test_the_least_value_ignores_what_is_not_finite() -> None:
-    assert least(np.array([np.nan, 2.0, np.inf, 1.0])) == 1.0
-    assert least(np.array([np.nan])) is None
 
 
 @few(200)
@@ -140,11 +148,8 @@ def test_stretches_are_apart_and_no_set_is_lost(num: int, length: int) -> None:
 
 
 def test_a_miss_between_two_stretches_counts() -> None:
-    misses = np.zeros(40)
-    misses[::2] = 0.001
-    slow = np.repeat(np.linspace(0.0, 0.004, 5), 8)
     for at in range(40):
-        series = misses + slow
+        series = 0.001 * (np.arange(40) % 2 == 0) + np.repeat(np.linspace(0.0, 0.004, 5), 8)
         series[at] = 0.5
         bound = conformal_bound(series, 0.99)
         assert bound is not None and (bound.bound, bound.at) == (0.5, at)
@@ -173,9 +178,8 @@ def test_what_is_not_there_takes_no_part() -> None:
     with_holes = np.where(rng.random(rows.shape) < 0.3, np.nan, rows)
     whole, part = (np.median([autocorrelation_time(row) for row in given]) for given in (rows, with_holes))
     assert abs(whole - part) <= 1
-    holes = with_holes[0]
-    bound = conformal_bound(holes, 0.9)
-    assert bound is not None and np.isfinite(bound.bound) and holes[bound.at] == bound.bound
+    bound = conformal_bound(with_holes[0], 0.9)
+    assert bound is not None and np.isfinite(bound.bound) and with_holes[0][bound.at] == bound.bound
     scores, deciding = stretch_scores(np.array([1.0, np.nan, 3.0, np.nan, np.nan, 2.0]), np.array([0, 0, 1, 2, 2, 3]))
     assert scores.tolist() == [1.0, 3.0, 2.0] and deciding.tolist() == [0, 2, 5]
 
@@ -184,18 +188,15 @@ def test_what_is_not_there_takes_no_part() -> None:
 @pytest.mark.parametrize("num", [5, 20, 120])
 @pytest.mark.parametrize("kind", ["normal", "heavy", "mixed"])
 def test_a_further_exchangeable_score_is_covered_as_promised(kind: str, num: int, confidence: float) -> None:
-    rng = np.random.default_rng([num, int(100 * confidence), len(kind)])
-    trials = 4000
-    scores = rng.standard_normal((trials, num + 1))
-    if kind == "heavy":
-        scores = rng.standard_cauchy((trials, num + 1))
-    if kind == "mixed":  # exchangeable but dependent: every row has its own place and width
+    """Mixed are exchangeable but dependent: every row has its own place and width."""
+    rng, trials = np.random.default_rng([num, int(100 * confidence), len(kind)]), 4000
+    scores = (rng.standard_cauchy if kind == "heavy" else rng.standard_normal)((trials, num + 1))
+    if kind == "mixed":
         scores = 3 * rng.standard_normal((trials, 1)) + rng.random((trials, 1)) * scores
     allowed = min(confidence, num / (num + 1))
     bound = np.sort(scores[:, :-1], axis=1)[:, conformal_rank(num, allowed) - 1]
-    covered = float(np.mean(scores[:, -1] <= bound))
     spread = 3.5 * np.sqrt(allowed * (1 - allowed) / trials)
-    assert allowed - spread <= covered <= allowed + 1 / (num + 1) + spread
+    assert allowed - spread <= np.mean(scores[:, -1] <= bound) <= allowed + 1 / (num + 1) + spread
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6, 0.85])
@@ -211,11 +212,10 @@ def test_a_further_stretch_of_a_slow_series_is_covered_as_promised(share: float)
     assert np.mean(covered) >= np.mean(promised) - 3.5 * np.sqrt(0.09 / 600)
 
 
-def test_one_stretch_bounds_nothing() -> None:
-    assert conformal_bound(np.array([0.01]), 0.99) is None
-    assert conformal_bound(np.full(7, np.nan), 0.99) is None
-    assert conformal_bound(np.zeros(0), 0.99) is None
-    assert conformal_bound(np.linspace(0.0, 1.0, 6), 0.99) is None  # all of it is one drift
+@pytest.mark.parametrize("series", [[0.01], [np.nan] * 7, [], np.linspace(0.0, 1.0, 6)])
+def test_one_stretch_bounds_nothing(series: ArrayLike) -> None:
+    """All of the last one is one drift."""
+    assert conformal_bound(np.asarray(series, np.float64), 0.99) is None
     two = conformal_bound(np.array([0.01, 0.03]), 0.99)
-    assert two is not None and (two.bound, two.num_stretches) == (0.03, 2)
-    assert two.confidence == pytest.approx(2 / 3)
+    assert two is not None
+    assert (two.bound, two.num_stretches, two.confidence) == (0.03, 2, pytest.approx(2 / 3))

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate import score_report
@@ -20,153 +21,107 @@ from splatctrl_cli.evaluate.score import (
 from splatctrl_cli.evaluate.score_report import Doubts
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, Label, RgbdFrame, SplatSet
-from splatctrl_cli.voxels import OccupancyGrid
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, Label, RgbdFrame
 from tests.plain import plain_frame, plain_grid, plain_splats
 
 H, W = 20, 30
 NONE = np.zeros((H, W), dtype=bool)
-
-
-def left_half() -> Bool:
-    mask = NONE.copy()
-    mask[:, : W // 2] = True
-    return mask
+LEFT = np.broadcast_to(np.arange(W) < W // 2, (H, W))
+ONES = np.ones((H, W), np.float32)
 
 
 def photo() -> RgbdFrame:
-    color = np.random.default_rng(0).integers(51, 153, (H, W, 3)).astype(np.uint8)
-    depth = np.full((H, W), 1.0, np.float32)
-    depth[:5] = 0.0
+    color = np.random.default_rng(0).integers(51, 153, (H, W, 3))
+    depth = np.broadcast_to((np.arange(H) >= 5)[:, None], (H, W))
     lens = Intrinsics(fx=30.0, fy=30.0, cx=14.5, cy=9.5, width=W, height=H)
     return plain_frame(depth, lens, stamp_ns=7, camera="cam3", color=color)
 
 
-def perfect() -> Float32:
-    return (photo().color / 255.0).astype(np.float32)
+def perfect(offset: float = 0.0) -> Float32:
+    return (photo().color / 255.0 + offset).astype(np.float32)
 
 
-def score(color: Float32, depth: Float32, seen: Bool) -> ViewScore:
-    return score_view(view="cam3-0000", color=color, depth=depth, frame=photo(), seen=seen)
+def score(color: Float32, depth: Float32 = ONES, seen: Bool = NONE, frame: RgbdFrame | None = None) -> ViewScore:
+    return score_view(view="cam3-0000", color=color, depth=depth, frame=frame or photo(), seen=seen)
 
 
 def masked_score() -> ViewScore:
     """Right under the mask (the left half), 0.1 off elsewhere."""
-    color = perfect()
-    color[left_half()] += 0.01
-    color[~left_half()] += 0.1
-    depth = np.ones((H, W), np.float32)
-    return score_view(
-        view="cam3-0000",
-        color=color,
-        depth=depth,
-        frame=photo(),
-        seen=NONE,
-        mask=left_half(),
-        fill=1.0,
-    )
+    color = np.where(LEFT[..., None], perfect(0.01), perfect(0.1))
+    return score_view(view="cam3-0000", color=color, depth=ONES, frame=photo(), seen=NONE, mask=LEFT, fill=1.0)
 
 
 def test_a_mask_is_a_region_of_its_own() -> None:
     figures = masked_score().figures()
     assert figures["psnr_masked"] == pytest.approx(40.0, abs=1e-3)
-    assert figures["mask_share"] == 0.5
-    assert figures["depth_pixels_masked"] == (H - 5) * W // 2
+    assert (figures["mask_share"], figures["depth_pixels_masked"]) == (0.5, (H - 5) * W // 2)
     assert figures["ssim_published"] > 0.99 > figures["ssim_all"]
-    assert "psnr_masked" not in score(perfect(), np.ones((H, W), np.float32), NONE).figures()
+    assert "psnr_masked" not in score(perfect()).figures()
 
 
 def test_what_the_lens_did_not_see_is_in_no_region() -> None:
-    valid = ~NONE
-    valid[:, :4] = False
-    frame = replace(photo(), valid=valid)
-    frame.color[~valid], frame.depth[~valid] = 0, 0.0
-    color = perfect()
-    color[~valid] = 1.0  # whatever the render shows there
-    depth = np.ones((H, W), np.float32)
-    result = score_view(view="v", color=color, depth=depth, frame=frame, seen=left_half(), mask=left_half())
+    """Whatever the render shows there."""
+    valid = np.broadcast_to(np.arange(W) >= 4, (H, W))
+    frame, color = replace(photo(), valid=valid), perfect()
+    frame.color[~valid], frame.depth[~valid], color[~valid] = 0, 0.0, 1.0
+    result = score_view(view="v", color=color, depth=ONES, frame=frame, seen=LEFT, mask=LEFT)
     assert min(result.all.psnr, result.seen.psnr) > 150.0
-    assert result.all.ssim == pytest.approx(1.0) and result.ssim_published == pytest.approx(1.0)
-    assert result.all.share == pytest.approx((W - 4) / W)
-    assert result.seen.share == pytest.approx((W // 2 - 4) / W)
+    assert (result.all.ssim, result.ssim_published) == pytest.approx((1.0, 1.0))
+    assert (result.all.share, result.seen.share) == pytest.approx(((W - 4) / W, (W // 2 - 4) / W))
 
 
 def test_regions_are_scored_apart_and_none_is_zero_filled() -> None:
-    color, depth = perfect(), np.full((H, W), 1.004, np.float32)
-    color[left_half()] += 0.1
-    color[~left_half()] += 0.2
-    depth[~left_half()] = 1.03
-    result = score(color, depth, left_half() & (photo().depth > 0))
+    color = np.where(LEFT[..., None], perfect(0.1), perfect(0.2))
+    depth = np.where(LEFT, np.float32(1.004), np.float32(1.03))
+    result = score(color, depth, LEFT & (photo().depth > 0))
     assert result.seen.psnr == pytest.approx(20.0, abs=1e-3)
     assert result.all.psnr == pytest.approx(-10 * math.log10((0.01 + 0.04) / 2), abs=1e-3)
-    assert result.seen.depth.median == pytest.approx(0.004, abs=1e-6)
-    assert result.all.depth.mean == pytest.approx(0.017, abs=1e-6)
+    assert (result.seen.depth.median, result.all.depth.mean) == pytest.approx((0.004, 0.017), abs=1e-6)
     assert result.all.depth.within_1cm == 0.5
-    assert result.valid_share == 0.75
-    assert result.seen.share == 0.375
-    assert result.all.share == 1.0
+    assert (result.valid_share, result.seen.share, result.all.share) == (0.75, 0.375, 1.0)
 
 
 def test_pixels_without_reference_depth_count_for_colour_but_not_for_depth() -> None:
-    color, depth = perfect(), np.full((H, W), 1.0, np.float32)
+    color, depth = perfect(), ONES.copy()
     color[:5] += 0.1
     depth[:5] = 9.0
-    result = score(color, depth, NONE)
-    assert result.all.psnr == pytest.approx(20.0 + 10 * math.log10(4), abs=1e-3)
-    assert result.all.depth.num_pixels == 15 * W
-    assert result.all.depth.median == 0.0
+    result = score(color, depth).all
+    assert result.psnr == pytest.approx(20.0 + 10 * math.log10(4), abs=1e-3)
+    assert (result.depth.num_pixels, result.depth.median) == (15 * W, 0.0)
 
 
 def test_holes_in_the_render_lower_the_depth_coverage_and_nothing_else_of_depth() -> None:
-    depth = np.full((H, W), 1.0, np.float32)
-    depth[:, :3] = 0.0
-    result = score(perfect(), depth, photo().depth > 0)
-    assert result.seen.depth_coverage == pytest.approx(0.9)
-    assert result.seen.depth.mean == 0.0
+    result = score(perfect(), ONES * (np.arange(W) >= 3), photo().depth > 0)
+    assert result.seen.depth_coverage == pytest.approx(0.9) and result.seen.depth.mean == 0.0
 
 
 def test_a_render_beyond_0_to_1_is_scored_as_a_screen_shows_it() -> None:
     white = replace(photo(), color=np.full((H, W, 3), 255, np.uint8))
-    color = np.full((H, W, 3), 1.5, np.float32)
-    result = score_view(view="v", color=color, depth=white.depth, frame=white, seen=NONE)
-    assert result.all.psnr == math.inf
-    assert result.all.ssim == pytest.approx(1.0)
+    result = score(np.full((H, W, 3), 1.5, np.float32), frame=white)
+    assert (result.all.psnr, result.all.ssim) == (math.inf, pytest.approx(1.0))
 
 
 def test_an_empty_region_has_no_figures_and_is_left_out_of_the_mean() -> None:
-    depth = np.full((H, W), 1.0, np.float32)
-    blind = score(perfect() + np.float32(0.1), depth, NONE)
-    sharp = score(perfect() + np.float32(0.1), depth, ~NONE)
-    assert math.isnan(blind.seen.psnr)
-    assert math.isnan(blind.seen.ssim)
+    blind, sharp = score(perfect(0.1)), score(perfect(0.1), seen=~NONE)
+    assert math.isnan(blind.seen.psnr) and math.isnan(blind.seen.ssim)
     totals = total_score([blind, sharp])
     assert totals["psnr_seen"] == pytest.approx(20.0, abs=1e-3)
-    assert totals["seen_share"] == 0.5
-    assert totals["num_views"] == 2
+    assert (totals["seen_share"], totals["num_views"]) == (0.5, 2)
 
 
 def test_totals_are_means_over_views() -> None:
-    depth = np.full((H, W), 1.0, np.float32)
-    views = [score(perfect() + np.float32(offset), depth + np.float32(offset / 10), ~NONE) for offset in (0.1, 0.01)]
-    totals = total_score(views)
+    totals = total_score([score(perfect(off), ONES + np.float32(off / 10), ~NONE) for off in (0.1, 0.01)])
     assert totals["psnr_all"] == pytest.approx((20.0 + 40.0) / 2, abs=1e-2)
     assert totals["depth_median_all"] == pytest.approx((0.01 + 0.001) / 2, abs=1e-6)
-
-
-def test_totals_of_no_view_cannot_be_evaluated() -> None:
     with pytest.raises(NotEvaluableError, match="no view was scored"):
         total_score([])
 
 
-def test_json_holds_none_for_what_is_no_number() -> None:
-    assert as_json({"a": math.nan, "b": math.inf, "c": 1.5}) == {"a": None, "b": None, "c": 1.5}
-
-
 def test_the_names_of_the_totals_are_known_beforehand() -> None:
-    total = total_score([score(perfect(), np.ones((H, W), np.float32), NONE)])
-    assert set(metric_names()) >= set(total)
     view = masked_score()
+    assert set(metric_names()) >= set(total_score([score(perfect())]))
     assert set(metric_names()) == set(total_score([replace(view, corrected=view)]))
+    assert as_json({"a": math.nan, "b": math.inf, "c": 1.5}) == {"a": None, "b": None, "c": 1.5}
 
 
 def test_a_figure_of_views_rests_on_the_views_that_have_it() -> None:
@@ -178,45 +133,32 @@ def test_a_figure_of_views_rests_on_the_views_that_have_it() -> None:
     assert score_report.counts_of(both)["in_front_seen"] == 2
 
 
-FREE, FULL = -2.0, 2.0
-
-
-def grid() -> OccupancyGrid:
-    """Three voxels of 10 cm along x, from 0 on: free, full, never seen."""
-    odds, updates = np.reshape([FREE, FULL, 0.0], (3, 1, 1)), np.reshape([4, 4, 0], (3, 1, 1))
-    return plain_grid((3, 1, 1), 0.1, 0.05, log_odds=odds, num_updates=updates)
-
-
-def splats(x: list[float], opacities: list[float], radii: list[float], labels: list[int] | None = None) -> SplatSet:
-    return plain_splats([[value, 0.05, 0.05] for value in x], radii, opacities=opacities, labels=labels or 0)
-
-
-def test_mass_is_opacity_times_radius_squared_of_what_stands_in_free_voxels() -> None:
-    scene = splats([0.02, 0.18, 0.25, 7.0], [0.5, 0.5, 1.0, 1.0], [0.02, 0.01, 0.01, 0.01])
-    assert free_mass(scene, grid(), 0.3) == pytest.approx(2.0 / (2.0 + 0.5 + 1.0 + 1.0))
-
-
-def test_what_was_never_seen_or_is_full_is_not_free() -> None:
-    assert free_mass(splats([0.15, 0.25], [0.9, 0.9], [0.01, 0.01]), grid(), 0.3) == 0.0
-
-
-def test_the_threshold_is_that_of_the_occupancy() -> None:
-    scene = splats([0.05], [0.9], [0.01])
-    assert free_mass(scene, grid(), 0.3) == 1.0
-    assert free_mass(scene, grid(), 0.1) == 0.0  # 1 / (1 + e^2) = 0.12
-
-
-def test_the_robot_has_no_mass_and_no_mass_has_no_share() -> None:
-    robot = splats([0.05, 0.15], [0.9, 0.9], [0.01, 0.01], [Label.ROBOT, Label.HUMAN])
-    assert free_mass(robot, grid(), 0.3) == 0.0
-    assert math.isnan(free_mass(splats([0.05], [0.9], [0.01], [Label.ROBOT]), grid(), 0.3))
+@pytest.mark.parametrize(
+    ("x", "opacities", "radii", "labels", "threshold", "expected"),
+    [
+        pytest.param(
+            [0.02, 0.18, 0.25, 7.0], [0.5, 0.5, 1.0, 1.0], [0.02, 0.01, 0.01, 0.01], 0, 0.3, 2.0 / 4.5, id="share"
+        ),
+        pytest.param([0.15, 0.25], 0.9, 0.01, 0, 0.3, 0.0, id="full or never seen"),
+        pytest.param([0.05], 0.9, 0.01, 0, 0.3, 1.0, id="free"),
+        pytest.param([0.05], 0.9, 0.01, 0, 0.1, 0.0, id="not below 1 / (1 + e^2) = 0.12"),
+        pytest.param([0.05, 0.15], 0.9, 0.01, [Label.ROBOT, Label.HUMAN], 0.3, 0.0, id="the robot has no mass"),
+        pytest.param([0.05], 0.9, 0.01, Label.ROBOT, 0.3, math.nan, id="no mass has no share"),
+    ],
+)
+def test_mass_is_opacity_times_radius_squared_of_what_stands_in_free_voxels(
+    x: list[float], opacities: ArrayLike, radii: ArrayLike, labels: ArrayLike, threshold: float, expected: float
+) -> None:
+    """Of three voxels of 10 cm along x, from 0 on: free, full, never seen."""
+    odds, updates = np.reshape([-2.0, 2.0, 0.0], (3, 1, 1)), np.reshape([4, 4, 0], (3, 1, 1))
+    grid = plain_grid((3, 1, 1), 0.1, 0.05, log_odds=odds, num_updates=updates)
+    scene = plain_splats([[value, 0.05, 0.05] for value in x], radii, opacities=opacities, labels=labels)
+    assert free_mass(scene, grid, threshold) == pytest.approx(expected, nan_ok=True)
 
 
 def test_in_front_counts_pixels_that_have_both_depths() -> None:
-    reference = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0])
-    depth = np.array([0.9, 0.98, 1.2, 0.0, 0.5, 0.5])
-    mask = np.array([True, True, True, True, True, False])
-    assert in_front(depth, reference, mask) == pytest.approx(1 / 3)
+    reference, depth = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0]), np.array([0.9, 0.98, 1.2, 0.0, 0.5, 0.5])
+    assert in_front(depth, reference, np.arange(6) < 5) == pytest.approx(1 / 3)
     assert math.isnan(in_front(depth, reference, np.zeros(6, bool)))
 
 
@@ -247,23 +189,23 @@ def disc() -> Bool:
     return np.asarray((u - 16) ** 2 + (v - 12) ** 2 < 60)
 
 
-def lines_of(doubts: Doubts, numbers: tuple[int, ...], mask: Bool | None = None) -> list[str]:
-    for number in numbers:
-        doubts.look(view(number), render(number), mask)
-    return doubts.lines()
-
-
-def test_nothing_speaks_against_views_that_are_as_they_should_be() -> None:
-    assert lines_of(Doubts(is_still=True, mask_rule="object mask"), (0, 1, 2), disc()) == []
+def lines_of(doubts: Doubts, numbers: tuple[int, ...], mask: Bool | None = None, shown: tuple[int, ...] = ()) -> str:
+    """What speaks against views, of which the renders may be those of others."""
+    for number, of in zip(numbers, shown or numbers, strict=True):
+        doubts.look(view(number), render(of), mask)
+    return "\n".join(doubts.lines())
 
 
 def test_a_mask_inside_out_is_told_by_the_border_of_the_image() -> None:
-    (line,) = lines_of(Doubts(is_still=True, mask_rule="object mask"), (0, 1), ~disc())
+    """Nothing speaks against views that are as they should be."""
+    masked = Doubts(is_still=True, mask_rule="object mask")
+    assert lines_of(masked, (0, 1, 2), disc()) == ""
+    line = lines_of(masked, (0, 1), ~disc())
     assert line.startswith(
         "holdout-0000 has its mask on 100% of the image's border and 76% of the image (and 1 more)"
     )
     assert "is the mask turned inside out? it has to be 255 on the object" in line
-    assert lines_of(Doubts(is_still=True, mask_rule="pixels with a reference depth"), (0, 1), ~disc()) == []
+    assert lines_of(Doubts(is_still=True, mask_rule="pixels with a reference depth"), (0, 1), ~disc()) == ""
 
 
 def test_a_mask_without_a_pixel_is_refused_with_the_view() -> None:
@@ -274,30 +216,21 @@ def test_a_mask_without_a_pixel_is_refused_with_the_view() -> None:
 
 
 def test_a_view_that_stands_where_one_trained_is_named_unless_that_is_meant() -> None:
-    (line,) = lines_of(Doubts(is_still=True), (0, 8))
+    line = lines_of(Doubts(is_still=True), (0, 8))
     assert line.startswith("holdout-0008 stands 0.0 mm and 0.00 degrees from a training view: a view that trained")
-    assert lines_of(Doubts(is_still=True, may_train=True), (0, 8)) == []
+    assert lines_of(Doubts(is_still=True, may_train=True), (0, 8)) == ""
 
 
 def test_a_hair_beside_a_training_view_is_another_view() -> None:
-    beside = replace(frame(8), T_world_camera=frame(8).T_world_camera.copy())
-    beside.T_world_camera[0, 3] += 0.0011
-    doubts = Doubts(is_still=True)
-    doubts.look(View(name="a", frame=beside, training=TRAINING), render(8), None)
+    T, doubts = frame(8).T_world_camera.copy(), Doubts(is_still=True)
+    T[0, 3] += 0.0011
+    doubts.look(View(name="a", frame=replace(frame(8), T_world_camera=T), training=TRAINING), render(8), None)
     assert doubts.lines() == []
 
 
 def test_photos_that_belong_to_other_cameras_are_found() -> None:
-    doubts = Doubts(is_still=True)
-    for number, shown in ((0, 1), (1, 0), (2, 2)):
-        doubts.look(view(number), render(shown), None)
-    (line,) = doubts.lines()
+    """Where things move a photo may resemble another time."""
+    line = lines_of(Doubts(is_still=True), (0, 1, 2), shown=(1, 0, 2))
     assert line.startswith("holdout-0000's photo is nearer the render of holdout-0001 (")
     assert line.endswith("(and 1 more): do the cameras belong to these images, and in this order?")
-
-
-def test_where_things_move_a_photo_may_resemble_another_time() -> None:
-    doubts = Doubts(is_still=False)
-    for number, shown in ((0, 1), (1, 0)):
-        doubts.look(view(number), render(shown), None)
-    assert doubts.lines() == []
+    assert lines_of(Doubts(is_still=False), (0, 1), shown=(1, 0)) == ""

@@ -1,5 +1,6 @@
 """Which views are scored and what is known at their time; PSNR, SSIM and depth errors against known answers."""
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -61,11 +62,14 @@ def known(has_clock: bool, training: tuple[str, ...] = ("a", "b")) -> list[tuple
 
 
 def test_with_a_clock_the_newest_frame_of_each_camera_up_to_that_very_stamp_counts() -> None:
+    """Of training cameras only, and nothing is scored where no frame is."""
     assert known(has_clock=True) == [
         ("held_out-0000", []),
         ("held_out-0001", [("a", 1), ("b", 1)]),
         ("held_out-0002", [("a", 2), ("b", 1)]),
     ]
+    assert known(has_clock=True, training=("b",))[2] == ("held_out-0002", [("b", 1)])
+    assert not [*views_to_score(FakeSource([]), scoring=["a"], training=["b"], has_clock=True)]
 
 
 def test_without_a_clock_every_training_frame_counts() -> None:
@@ -73,22 +77,16 @@ def test_without_a_clock_every_training_frame_counts() -> None:
     assert known(has_clock=False) == [("held_out-0000", every), ("held_out-0002", every), ("held_out-0005", every)]
 
 
-def test_only_training_cameras_count() -> None:
-    assert known(has_clock=True, training=("b",))[2] == ("held_out-0002", [("b", 1)])
-
-
-def test_nothing_is_scored_where_no_frame_is() -> None:
-    assert list(views_to_score(FakeSource([]), scoring=["a"], training=["b"], has_clock=True)) == []
-
-
 def test_a_log_is_scored_at_the_poses_that_its_scene_was_trained_at() -> None:
-    def corrected(frame: RgbdFrame) -> RgbdFrame:
-        return replace(frame, T_world_camera=2.0 * np.eye(4))
-
-    source = FakeSource(RECORDS)
-    views = [*views_to_score(source, scoring=["held/out"], training=["a"], has_clock=True, corrected=corrected)]
+    views = views_to_score(
+        FakeSource(RECORDS),
+        scoring=["held/out"],
+        training=["a"],
+        has_clock=True,
+        corrected=lambda frame: replace(frame, T_world_camera=2.0 * np.eye(4)),
+    )
     frames = [frame for view in views for frame in (view.frame, *view.training)]
-    assert len(frames) > len(views) > 0
+    assert len(frames) == 3 + 2
     assert all(np.array_equal(frame.T_world_camera, 2.0 * np.eye(4)) for frame in frames)
 
 
@@ -113,35 +111,33 @@ def points(values: ArrayLike) -> Float64:
     return np.asarray(values, dtype=np.float64).reshape(-1, 3)
 
 
-def test_a_point_on_a_measured_surface_is_seen_within_the_tolerance() -> None:
-    frame = wall_frame()
-    on_wall = points([[0.5, 0.0, 2.0], [0.5, 0.0, 2.019], [0.5, 0.0, 2.021], [0.5, 0.0, 1.979]])
-    assert seen_by(on_wall, [frame]).tolist() == [True, True, False, False]
-    assert seen_by(on_wall, [frame], tolerance=0.03).all()
+LAST = (63.5 - 31.5) / 50 * 2.0  # [m] right of the middle where the image of the wall ends
 
 
-def test_a_point_behind_a_surface_or_in_front_of_it_or_behind_the_camera_is_not_seen() -> None:
-    assert not seen_by(
-        points([[-0.5, 0.0, 2.0], [0.5, 0.0, 1.0], [0.5, 0.0, -2.0], [0.0, 0.0, 0.0]]), [wall_frame()]
-    ).any()
-
-
-def test_a_point_outside_the_image_or_at_a_pixel_without_depth_is_not_seen() -> None:
-    top_row = [0.5, (0 - 23.5) / 50 * 2.0, 2.0]
-    assert not seen_by(points([[5.0, 0.0, 2.0], [0.5, -3.0, 2.0], top_row]), [wall_frame()]).any()
-
-
-def test_a_pixel_reaches_half_a_pixel_around_its_centre() -> None:
-    last = (63 + 0.49 - 31.5) / 50 * 2.0
-    beyond = (63 + 0.51 - 31.5) / 50 * 2.0
-    assert seen_by(points([[last, 0.0, 2.0], [beyond, 0.0, 2.0]]), [wall_frame()]).tolist() == [True, False]
+@pytest.mark.parametrize(
+    ("point", "is_seen"),
+    [
+        *(([0.5, 0.0, 2.0], True), ([0.5, 0.0, 2.019], True), ([0.5, 0.0, 2.021], False), ([0.5, 0.0, 1.979], False)),
+        pytest.param([-0.5, 0.0, 2.0], False, id="behind a surface"),
+        pytest.param([0.5, 0.0, 1.0], False, id="in front of it"),
+        pytest.param([0.5, 0.0, -2.0], False, id="behind the camera"),
+        pytest.param([0.0, 0.0, 0.0], False, id="at the camera"),
+        pytest.param([5.0, 0.0, 2.0], False, id="beside the image"),
+        pytest.param([0.5, -3.0, 2.0], False, id="above the image"),
+        pytest.param([0.5, (0 - 23.5) / 50 * 2.0, 2.0], False, id="at a pixel without depth"),
+        pytest.param([LAST - 4e-4, 0.0, 2.0], True, id="within half of the last pixel"),
+        pytest.param([LAST + 4e-4, 0.0, 2.0], False, id="beyond half of the last pixel"),
+    ],
+)
+def test_a_point_on_a_measured_surface_is_seen_within_the_tolerance(point: list[float], is_seen: bool) -> None:
+    assert seen_by(points(point), [wall_frame()]).tolist() == [is_seen]
+    assert seen_by(points([[0.5, 0.0, 2.021], [0.5, 0.0, 1.979]]), [wall_frame()], tolerance=0.03).all()
 
 
 def test_a_frame_sees_all_its_own_surface_from_any_pose() -> None:
     frame = wall_frame(look_at([1.0, 2.0, 3.0], [0.0, 0.0, 0.5]))
     own, valid = surface_points(frame)
-    assert len(own) == 47 * 64 == valid.sum()
-    assert seen_by(own, [frame]).all()
+    assert len(own) == 47 * 64 == valid.sum() and seen_by(own, [frame]).all()
     assert np.array_equal(seen_pixels(frame, [frame]), valid)
 
 
@@ -149,16 +145,13 @@ def test_what_is_seen_does_not_hang_on_the_order_of_the_cameras() -> None:
     frame = wall_frame(look_at([0.5, -2.0, 0.4], [0.0, 0.0, 0.5]))
     others = [wall_frame(look_at([0.1 * n, -2.0, 0.4], [0.2, 0.0, 0.5])) for n in (4, 0, 6)]
     seen = seen_pixels(frame, others)
-    assert 0 < seen.sum() < seen.size
-    assert np.array_equal(seen, seen_pixels(frame, others[::-1]))
+    assert 0 < seen.sum() < seen.size and np.array_equal(seen, seen_pixels(frame, others[::-1]))
 
 
 def test_any_frame_suffices_and_no_frame_sees_nothing() -> None:
     away = wall_frame(look_at([0.0, 0.0, 0.0], [0.0, 0.0, -1.0], up=(0.0, 1.0, 0.0)))
-    target = points([[0.5, 0.0, 2.0]])
-    assert not seen_by(target, [away]).any()
-    assert seen_by(target, [away, wall_frame()]).all()
-    assert not seen_by(target, []).any()
+    for frames, is_seen in (([away], False), ([away, wall_frame()], True), ([], False)):
+        assert seen_by(points([[0.5, 0.0, 2.0]]), frames).tolist() == [is_seen]
     assert seen_by(points([]), [wall_frame()]).shape == (0,)
 
 
@@ -167,87 +160,58 @@ def noise(seed: int, shape: tuple[int, ...] = (24, 31, 3)) -> Float64:
 
 
 def test_psnr_of_a_constant_offset_of_a_tenth_is_20_db() -> None:
-    image = np.full((8, 9, 3), 0.5)
-    assert psnr(image + 0.1, image) == pytest.approx(20.0, abs=1e-9)
-
-
-def test_psnr_of_identical_images_is_infinite() -> None:
+    """Of identical images it is infinite, and of an empty mask not a number."""
+    assert psnr(0.5 * noise(0) + 0.1, 0.5 * noise(0)) == pytest.approx(20.0, abs=1e-9)
     assert psnr(noise(0), noise(0)) == math.inf
+    assert math.isnan(psnr(noise(0), noise(1), np.zeros((24, 31), dtype=bool)))
 
 
 def test_psnr_averages_only_masked_pixels() -> None:
-    image = np.full((10, 10, 3), 0.5)
-    other = image.copy()
-    mask = np.zeros((10, 10), dtype=bool)
-    mask[:, :1] = True
-    other[mask] += 0.1
-    other[~mask] = 0.0
+    image, mask = np.full((10, 10, 3), 0.5), np.broadcast_to(np.arange(10) < 1, (10, 10))
+    other = np.where(mask[..., None], image + 0.1, 0.0)
     assert psnr(other, image, mask) == pytest.approx(20.0, abs=1e-9)
     zero_filled = psnr(other * mask[..., None], image * mask[..., None])
     assert zero_filled == pytest.approx(30.0, abs=1e-9), "the mean over a zero-filled image would read 10 dB more"
 
 
-def test_psnr_of_an_empty_mask_is_not_a_number() -> None:
-    assert math.isnan(psnr(noise(0), noise(1), np.zeros((24, 31), dtype=bool)))
-
-
 def test_ssim_map_equals_the_reference_window_by_window_and_at_the_border() -> None:
     x, y = noise(3), np.clip(noise(3) + 0.2 * noise(4), 0, 1)
     similarity = ssim_map(x, y)
-    for row, column in [(0, 0), (0, 15), (12, 15), (23, 30), (5, 5), (22, 1)]:
-        for channel in range(3):
-            expected = ssim_at(x[..., channel], y[..., channel], row, column)
-            assert similarity[row, column, channel] == pytest.approx(expected, abs=1e-12)
+    for row, column, channel in itertools.product((0, 12, 23), (0, 15, 30), range(3)):
+        expected = ssim_at(x[..., channel], y[..., channel], row, column)
+        assert similarity[row, column, channel] == pytest.approx(expected, abs=1e-12)
 
 
 def test_depth_errors_count_only_pixels_where_both_have_depth() -> None:
     reference = np.array([[1.0, 1.0, 1.0, 0.0, 1.0]], dtype=np.float32)
-    depth = np.array([[1.005, 1.015, 1.1, 1.0, 0.0]], dtype=np.float32)
-    errors = depth_errors(depth, reference)
+    errors = depth_errors(np.array([[1.005, 1.015, 1.1, 1.0, 0.0]], dtype=np.float32), reference)
     assert errors.num_pixels == 3
-    assert errors.median == pytest.approx(0.015, abs=1e-6)
-    assert errors.mean == pytest.approx(0.04, abs=1e-6)
-    assert errors.p90 == pytest.approx(0.015 + 0.8 * 0.085, abs=1e-6)
-    assert errors.within_1cm == pytest.approx(1 / 3)
-    assert errors.within_2cm == pytest.approx(2 / 3)
-
-
-def test_depth_errors_without_a_common_pixel_are_not_numbers() -> None:
-    errors = depth_errors(np.zeros((3, 3), np.float32), np.ones((3, 3), np.float32))
-    assert errors.num_pixels == 0
-    assert math.isnan(errors.median)
-    assert math.isnan(errors.within_1cm)
+    assert (errors.median, errors.mean, errors.p90) == pytest.approx((0.015, 0.04, 0.015 + 0.8 * 0.085), abs=1e-6)
+    assert (errors.within_1cm, errors.within_2cm) == pytest.approx((1 / 3, 2 / 3))
+    none = depth_errors(np.zeros((3, 3), np.float32), np.ones((3, 3), np.float32))
+    assert none.num_pixels == 0 and math.isnan(none.median) and math.isnan(none.within_1cm)
 
 
 def test_zeros_beyond_the_border_make_it_look_alike() -> None:
-    rng = np.random.default_rng(5)
-    image, reference = rng.random((24, 30, 3)), rng.random((24, 30, 3))
+    image, reference = noise(5), noise(6)
     padded = [np.pad(x, ((5, 5), (5, 5), (0, 0))) for x in (image, reference)]
-    expected = ssim_map(*padded)[5:-5, 5:-5]
-    found = ssim_map(image, reference, is_zero_padded=True)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-    np.testing.assert_allclose(found[5:-5, 5:-5], ssim_map(image, reference)[5:-5, 5:-5], atol=1e-12)
-    assert found[0].mean() > ssim_map(image, reference)[0].mean() + 0.05
+    found, plain = ssim_map(image, reference, is_zero_padded=True), ssim_map(image, reference)
+    np.testing.assert_allclose(found, ssim_map(*padded)[5:-5, 5:-5], atol=1e-12)
+    np.testing.assert_allclose(found[5:-5, 5:-5], plain[5:-5, 5:-5], atol=1e-12)
+    assert found[0].mean() > plain[0].mean() + 0.05
 
 
 def test_published_ssim_is_the_box_window_of_scikit_image_on_filled_images() -> None:
     rng = np.random.default_rng(5)
     image, reference = rng.random((14, 17, 3)), rng.random((14, 17, 3))
-    mask = rng.random((14, 17)) < 0.7
+    mask, values = rng.random((14, 17)) < 0.7, []
     x, y = (np.where(mask[:, :, None], picture, 1.0) for picture in (image, reference))
-    values = []
-    for row in range(3, 11):
-        for column in range(3, 14):
-            for channel in range(3):
-                a = x[row - 3 : row + 4, column - 3 : column + 4, channel].ravel()
-                b = y[row - 3 : row + 4, column - 3 : column + 4, channel].ravel()
-                covariance = np.cov(a, b)
-                c1, c2 = 0.02**2, 0.06**2
-                values.append(
-                    (2 * a.mean() * b.mean() + c1)
-                    * (2 * covariance[0, 1] + c2)
-                    / ((a.mean() ** 2 + b.mean() ** 2 + c1) * (covariance[0, 0] + covariance[1, 1] + c2))
-                )
+    for row, column, channel in itertools.product(range(3, 11), range(3, 14), range(3)):
+        window = np.s_[row - 3 : row + 4, column - 3 : column + 4, channel]
+        a, b = x[window].ravel(), y[window].ravel()
+        covariance, c1, c2 = np.cov(a, b), 0.02**2, 0.06**2
+        alike = (2 * a.mean() * b.mean() + c1) * (2 * covariance[0, 1] + c2)
+        values.append(alike / ((a.mean() ** 2 + b.mean() ** 2 + c1) * (covariance[0, 0] + covariance[1, 1] + c2)))
     assert published_ssim(image, reference, mask, 1.0) == pytest.approx(np.mean(values), abs=1e-12)
     assert np.isnan(published_ssim(image, reference, mask & False, 1.0)), "not the 1 of two white images"
     assert math.isnan(published_ssim(image[:5], reference[:5], mask[:5], 1.0))

@@ -1,6 +1,7 @@
 """A replay's task planned: postures at a goal pose, margins that start and goal allow, proved edges, times."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     NO_POSTURE,
     START_BLOCKED,
+    PlannedPath,
     approach_to,
     effector_rates,
     goal_postures,
@@ -45,39 +47,41 @@ def ball(x: float, y: float, radius: float = 0.05) -> Solids:
     return Solids(solids=[Ball(center=np.array([x, y, 0.0]), radius=radius)])
 
 
+def planned(
+    scene: Solids, asked: ReplayTask | None = None, arm: PlanarArm = ARM, config: ControlConfig = CONFIG
+) -> PlannedPath:
+    return planned_path(arm, scene, asked or task(), PLANNER, config)
+
+
 def test_goal_postures_bring_the_frame_to_the_pose_and_keep_the_limits() -> None:
     random = np.random.default_rng(0)
-    for _ in range(20):
-        wanted = random.uniform(ARM.lower, ARM.upper)
+    for wanted in random.uniform(ARM.lower, ARM.upper, (20, 2)):
         T = ARM.frame_pose(wanted, "tip")
         guesses = np.vstack([wanted + random.normal(size=2) / 4, random.uniform(ARM.lower, ARM.upper, (12, 2))])
         found = goal_postures(ARM, "tip", T, guesses, CONFIG, at_most=5)
-        assert 1 <= len(found) <= 5
-        for q in found:
-            assert is_at_goal(10 * pose_error(ARM.frame_pose(q, "tip"), T), CONFIG)
-            assert np.all((q >= ARM.lower) & (q <= ARM.upper))
+        assert 1 <= len(found) <= 5 and np.all((found >= ARM.lower) & (found <= ARM.upper))
+        assert all(is_at_goal(10 * pose_error(ARM.frame_pose(q, "tip"), T), CONFIG) for q in found)
 
 
 def test_a_pose_out_of_reach_has_no_posture() -> None:
     T = pose_at([1.5, 0.0, 0.0])
     assert goal_postures(ARM, "tip", T, np.array([[0.1, 0.2], [1.0, 1.0]]), CONFIG, at_most=5).shape == (0, 2)
-    far = replace(task(), T_world_goal=T)
-    found = planned_path(ARM, one_wall(), far, PLANNER, CONFIG)
+    found = planned(one_wall(), replace(task(), T_world_goal=T))
     assert (found.outcome, found.path) == (NO_POSTURE, None)
 
 
 def test_a_planned_path_keeps_the_controllers_margin_and_speed() -> None:
-    found = planned_path(ARM, one_wall(), task(), PLANNER, CONFIG)
-    assert found.outcome == "solved" and found.path is not None
+    """And is the same every time."""
+    found, again = planned(one_wall()), planned(one_wall())
+    assert found.outcome == "solved" and found.path is not None and again.path is not None
+    np.testing.assert_array_equal(found.path.waypoints, again.path.waypoints)
     assert found.num_proved == found.num_edges == len(found.path.waypoints) - 1
     assert (found.margin, found.self_margin) == (CONFIG.margin, CONFIG.self_margin)
     assert least_clearance(found.clearance, found.path.waypoints).lower > -1e-3
     assert found.clearance.at(START[None])[0] < 0.5  # less its margin, of a wall that is there
     assert is_at_goal(pose_error(ARM.frame_pose(found.path.waypoints[-1], "tip"), task().T_world_goal), CONFIG)
-    positions, velocities = found.path.at(np.arange(0.0, found.path.duration, 0.01))
-    speeds = [
-        np.linalg.norm((ARM.frame_jacobian(q, "tip") @ v)[:3]) for q, v in zip(positions, velocities, strict=True)
-    ]
+    motion = zip(*found.path.at(np.arange(0.0, found.path.duration, 0.01)), strict=True)
+    speeds = [np.linalg.norm((ARM.frame_jacobian(q, "tip") @ v)[:3]) for q, v in motion]
     assert max(speeds) < CONFIG.max_linear_speed * 1.01
 
 
@@ -88,99 +92,70 @@ def test_a_hand_comes_straight_to_its_goal_as_far_as_that_is_free() -> None:
     pose = model.frame_pose(goal, "hand")
     asked = ReplayTask(start=start, T_world_goal=pose, frame="hand", home=goal)
 
-    def before(scene: Solids) -> Float64:
+    def before(scene: Solids) -> list[float]:
         path = planned_path(model, scene, asked, PLANNER, CONFIG, approach=0.12).path
         assert path is not None
         T_goal = np.linalg.inv(pose) @ [model.frame_pose(q, "hand") for q in path.waypoints]
         np.testing.assert_allclose(T_goal[-1], np.eye(4), atol=2e-3)
         is_on_axis = np.linalg.norm(T_goal[:, :2, 3], axis=1) < 1e-3
         is_turned = np.linalg.norm(T_goal[:, :3, :3] - np.eye(3), axis=(1, 2)) > 2e-3
-        return np.round(T_goal[is_on_axis & ~is_turned, 2, 3], 2)
+        return np.round(T_goal[is_on_axis & ~is_turned, 2, 3], 2).tolist()
 
-    np.testing.assert_allclose(before(ball(3.0, 3.0)), [-0.12, -0.08, -0.04, 0.0])
+    assert before(ball(3.0, 3.0)) == pytest.approx([-0.12, -0.08, -0.04, 0.0])
     whole = approach_to(Clearance.of(model, ball(3.0, 3.0)), "hand", goal, 0.12, PLANNER, CONFIG)
     centers, radii = model.sphere_centers_batch(whole), model.sphere_set.radii
-    away = np.linalg.norm(centers[0][:, None, None] - centers[None, 2:], axis=3) - radii
-    farthest = centers[0][np.argmax(away.min(axis=(1, 2)))]
-    assert away.min(axis=(1, 2)).max() > CONFIG.margin + 0.01
-    left = before(Solids(solids=[Ball(center=farthest, radius=0.005)]))
-    assert list(left) in ([-0.04, 0.0], [-0.08, -0.04, 0.0])
+    away = (np.linalg.norm(centers[0][:, None, None] - centers[None, 2:], axis=3) - radii).min(axis=(1, 2))
+    assert away.max() > CONFIG.margin + 0.01
+    left = before(Solids(solids=[Ball(center=centers[0][np.argmax(away)], radius=0.005)]))
+    assert left in ([-0.04, 0.0], [-0.08, -0.04, 0.0])
 
 
 def test_a_start_within_the_margin_is_planned_from_with_as_much_as_it_keeps() -> None:
-    tip = ARM.frame_pose(START, "tip")[:3, 3]
-    out = tip / np.linalg.norm(tip)
-    near = ball(*(tip + (0.04 + 0.05 + 0.012) * out)[:2])
-    found = planned_path(ARM, near, task(), PLANNER, CONFIG)
-    assert found.outcome == "solved"
-    assert found.margin == pytest.approx(0.012 - 0.001, abs=1e-6)
+    tip = ARM.frame_pose(START, "tip")[:2, 3]
+    found = planned(ball(*(tip * (1 + (0.04 + 0.05 + 0.012) / np.linalg.norm(tip)))))
+    assert (found.outcome, found.margin) == ("solved", pytest.approx(0.012 - 0.001, abs=1e-6))
 
 
-def test_a_start_and_a_goal_in_collision_are_named() -> None:
-    for posture, outcome in ((START, START_BLOCKED), (GOAL, GOAL_BLOCKED)):
-        found = planned_path(ARM, ball(*ARM.frame_pose(posture, "tip")[:2, 3]), task(), PLANNER, CONFIG)
-        assert (found.outcome, found.path, found.num_edges) == (outcome, None, 0)
+@pytest.mark.parametrize(("posture", "outcome"), [(START, START_BLOCKED), (GOAL, GOAL_BLOCKED)])
+def test_a_start_and_a_goal_in_collision_are_named(posture: Float64, outcome: str) -> None:
+    found = planned(ball(*ARM.frame_pose(posture, "tip")[:2, 3]))
+    assert (found.outcome, found.path, found.num_edges) == (outcome, None, 0)
 
 
 def test_a_path_leads_to_the_nearest_goal_though_a_farther_one_is_found_at_once() -> None:
-    room = Clearance.of(ARM, one_wall(), margin=CONFIG.margin)
-    beyond = np.array([2.3, 0.5])
+    """Where the nearest goal is not found another is."""
+    room, beyond = Clearance.of(ARM, one_wall(), margin=CONFIG.margin), np.array([2.3, 0.5])
+    goals, hopeless = np.array([beyond, GOAL]), replace(PLANNER, max_iterations=0)
     assert np.linalg.norm(beyond - START) > np.linalg.norm(GOAL - START)
-    at_once = plan(room, START, np.array([beyond, GOAL]), PLANNER)
-    assert at_once.goal == 0 and at_once.num_iterations == 0
-    found = path_to_nearest(room, START, np.array([beyond, GOAL]), PLANNER)
-    assert found.is_solved and found.num_iterations > 0
+    at_once, found = plan(room, START, goals, PLANNER), path_to_nearest(room, START, goals, PLANNER)
+    assert (at_once.goal, at_once.num_iterations) == (0, 0) and found.is_solved and found.num_iterations > 0
     np.testing.assert_array_equal(found.waypoints[-1], GOAL)
-
-
-def test_where_the_nearest_goal_is_not_found_another_is() -> None:
-    room = Clearance.of(ARM, one_wall(), margin=CONFIG.margin)
-    hopeless, beyond = replace(PLANNER, max_iterations=0), np.array([2.3, 0.5])
     assert not plan(room, START, GOAL[None], hopeless).is_solved
-    found = path_to_nearest(room, START, np.array([beyond, GOAL]), hopeless)
-    np.testing.assert_array_equal(found.waypoints[-1], beyond)
-
-
-def test_the_same_seed_plans_the_same_path() -> None:
-    one, again = (planned_path(ARM, one_wall(), task(), PLANNER, CONFIG) for _ in range(2))
-    assert one.path is not None and again.path is not None
-    np.testing.assert_array_equal(one.path.waypoints, again.path.waypoints)
+    np.testing.assert_array_equal(path_to_nearest(room, START, goals, hopeless).waypoints[-1], beyond)
 
 
 def test_what_the_spheres_leave_uncovered_is_kept_as_well_where_the_controller_keeps_it() -> None:
-    class Bare(PlanarArm):
-        def __init__(self) -> None:
-            super().__init__()
-            self.sphere_deficit = np.full(5, 0.03)
-
-    thin = planned_path(Bare(), one_wall(), task(), PLANNER, CONFIG)
-    kept = planned_path(Bare(), one_wall(), task(), PLANNER, replace(CONFIG, coverage="margin"))
+    bare = PlanarArm()
+    bare.sphere_deficit = np.full(5, 0.03)
+    thin, kept = (planned(one_wall(), arm=bare, config=replace(CONFIG, coverage=c)) for c in ("report", "margin"))
     assert thin.margin == kept.margin == CONFIG.margin
     np.testing.assert_allclose(thin.clearance.at(START[None]) - kept.clearance.at(START[None]), 0.03)
 
 
 def test_a_way_out_is_planned_in_the_scene_of_the_stall_and_waits_as_configured() -> None:
-    asked: list[int] = []
-
-    def scene_at(stamp_ns: int) -> Solids:
-        asked.append(stamp_ns)
-        return one_wall()
-
-    detours = planned_detours(ARM, scene_at, "tip", PLANNER, CONFIG)
-    given = task()
-    detour = detours(7, given.start, given.T_world_goal)
-    assert asked == [7] and detour is not None
-    np.testing.assert_array_equal(detour.path.waypoints[0], given.start)
-    assert detour.wait_distance == PLANNER.wait_distance and detour.clock == 0.0
+    scene_at = Mock(return_value=one_wall())
+    detour = planned_detours(ARM, scene_at, "tip", PLANNER, CONFIG)(7, START, task().T_world_goal)
+    scene_at.assert_called_once_with(7)
+    assert detour is not None and detour.wait_distance == PLANNER.wait_distance and detour.clock == 0.0
+    np.testing.assert_array_equal(detour.path.waypoints[0], START)
 
 
 def test_a_plan_is_made_with_the_margin_of_the_arm_to_itself() -> None:
-    found = planned_path(ARM, one_wall(), task(), PLANNER, replace(CONFIG, self_margin=0.07))
-    assert found.self_margin == 0.07
+    found = planned(one_wall(), config=replace(CONFIG, self_margin=0.07))
     centers, radii = ARM.sphere_centers(START), ARM.sphere_set.radii
     apart = [np.linalg.norm(centers[a] - centers[b]) - radii[a] - radii[b] for a, b in ARM.pairs]
     own = found.clearance.rows(START[None])[0, len(found.clearance.moving) :]
-    assert own == pytest.approx(np.array(apart) - 0.07)
+    assert found.self_margin == 0.07 and own == pytest.approx(np.array(apart) - 0.07)
 
 
 PATH = np.array([[0.7, 0.2], [0.9, 2.0], [-0.4, 1.5], [-0.42, 1.5]])
@@ -194,18 +169,18 @@ def test_resampling_keeps_waypoints_length_and_spacing() -> None:
 
 
 def test_a_timed_path_keeps_its_limits_and_its_edges() -> None:
+    """And uses them."""
     path = timed(PATH, ARM.velocity_limit, 3.0)
     clock = np.linspace(0, path.duration, 20_001)
     position, velocity = path.at(clock)
     assert np.all(np.abs(velocity) <= ARM.velocity_limit + 1e-12)
-    acceleration = np.diff(velocity, axis=0) / np.diff(clock)[:, None]
-    assert np.max(np.abs(acceleration)) <= 3.0 + 1e-6
+    assert np.max(np.abs(np.diff(velocity, axis=0) / np.diff(clock)[:, None])) <= 3.0 + 1e-6
     middle = (velocity[1:] + velocity[:-1]) / 2 * np.diff(clock)[:, None]
     np.testing.assert_allclose(np.diff(position, axis=0), middle, atol=1e-6)
     np.testing.assert_allclose(position[[0, -1]], PATH[[0, -1]], atol=1e-12)
     np.testing.assert_allclose(path.at(path.start_time)[0], PATH, atol=1e-12)
     assert joint_length(position) == pytest.approx(joint_length(PATH))
-    assert np.max(np.abs(velocity), axis=0) == pytest.approx(np.array([1.5, 1.5]), rel=0.2)  # and it uses them
+    assert np.max(np.abs(velocity), axis=0) == pytest.approx(np.array([1.5, 1.5]), rel=0.2)
 
 
 def test_a_path_of_one_place_or_without_limits_is_refused() -> None:
@@ -216,17 +191,13 @@ def test_a_path_of_one_place_or_without_limits_is_refused() -> None:
 
 
 def test_a_path_keeps_the_speed_of_a_frame_too() -> None:
+    """An edge that leaves a frame where it is has no rate."""
     rates = effector_rates(ARM, PATH, "tip", max_linear=0.2, max_angular=0.5)
     path = timed(PATH, ARM.velocity_limit, 7.5, max_rate=rates)
     assert path.duration > timed(PATH, ARM.velocity_limit, 7.5).duration
-    twists = np.array(
-        [ARM.frame_jacobian(q, "tip") @ v for q, v in zip(*path.at(np.arange(0, path.duration, 0.01)), strict=True)]
-    )
-    linear, angular = np.linalg.norm(twists[:, :3], axis=1), np.linalg.norm(twists[:, 3:], axis=1)
-    assert linear.max() < 0.2 * 1.001 and angular.max() < 0.5 * 1.001
-    assert linear.max() > 0.199 or angular.max() > 0.499
-
-
-def test_an_edge_that_leaves_a_frame_where_it_is_has_no_rate() -> None:
+    motion = zip(*path.at(np.arange(0, path.duration, 0.01)), strict=True)
+    twists = np.array([ARM.frame_jacobian(q, "tip") @ v for q, v in motion])
+    linear, angular = (np.linalg.norm(part, axis=1).max() for part in (twists[:, :3], twists[:, 3:]))
+    assert linear < 0.2 * 1.001 and angular < 0.5 * 1.001 and (linear > 0.199 or angular > 0.499)
     still = effector_rates(ARM, np.array([[0.1, 0.2], [0.1, 0.2]]), "tip", max_linear=0.2, max_angular=0.5)
     assert still == np.inf

@@ -50,6 +50,10 @@ def points_of(seen: RgbdFrame, robot: Float32 = NOBODY) -> Float64:
     return np.concatenate([np.empty((0, 3)), *unanswered_points(seen, robot, CONFIG)])
 
 
+def marked(grid: OccupancyMap) -> Bool:
+    return grid.last_seen == Unseen.UNANSWERED
+
+
 def unanswered(*frames: RgbdFrame) -> OccupancyMap:
     grid = OccupancyMap(WORKSPACE, CONFIG, 1)
     grid.take_in(frames)
@@ -77,14 +81,11 @@ def test_a_large_hole_is_taken_a_piece_at_a_time(monkeypatch: pytest.MonkeyPatch
     assert np.concatenate(pieces).tolist() == whole.tolist()
 
 
-def robot_beside() -> Float32:
-    shown = NOBODY.copy()
-    shown[25:35, 51:60] = 0.5
-    return shown
-
-
-def unseen_by_the_lens() -> Bool:
-    return np.asarray(np.mgrid[:60, :80][1] > 45)
+ROBOT_BESIDE = np.zeros_like(NOBODY)
+ROBOT_BESIDE[25:35, 51:60] = 0.5
+IN_THE_LENS = np.asarray(np.mgrid[:60, :80][1] <= 45)
+TWO_THINGS = (slice(5, 30), slice(20, 30)), (slice(5, 30), slice(36, 46))
+DARK_THING = slice(14, 45), slice(30, 50)
 
 
 @pytest.mark.parametrize(
@@ -93,17 +94,11 @@ def unseen_by_the_lens() -> Bool:
         pytest.param(frame(), NOBODY, id="no hole"),
         pytest.param(dark(columns=slice(60, 80)), NOBODY, id="at the border"),
         pytest.param(dark(columns=slice(30, 32)), NOBODY, id="narrower than two voxels"),
-        pytest.param(dark(columns=slice(44, 50)), robot_beside(), id="the robot's shadow"),
-        pytest.param(replace(dark(), valid=~unseen_by_the_lens()), NOBODY, id="not in the lens"),
+        pytest.param(dark(columns=slice(44, 50)), ROBOT_BESIDE, id="the robot's shadow"),
+        pytest.param(replace(dark(), valid=IN_THE_LENS), NOBODY, id="not in the lens"),
         pytest.param(before_a_far_background(), NOBODY, id="a background without depth"),
-        pytest.param(
-            before_a_far_background(things=((slice(5, 30), slice(20, 30)), (slice(5, 30), slice(36, 46)))),
-            NOBODY,
-            id="the background between two things",
-        ),
-        pytest.param(
-            before_a_far_background((slice(14, 45), slice(30, 50))), NOBODY, id="a thing before the background"
-        ),
+        pytest.param(before_a_far_background(things=TWO_THINGS), NOBODY, id="the background between two things"),
+        pytest.param(before_a_far_background(DARK_THING), NOBODY, id="a thing before the background"),
     ],
 )
 def test_other_gaps_are_no_holes(seen: RgbdFrame, robot: Float32) -> None:
@@ -111,45 +106,40 @@ def test_other_gaps_are_no_holes(seen: RgbdFrame, robot: Float32) -> None:
 
 
 def test_a_dark_block_is_where_all_cameras_look_in_vain() -> None:
+    """The others see through the space above it."""
     one, three = unanswered(dark_block(0.0)), unanswered(dark_block(0.0), dark_block(-0.15), dark_block(0.15))
-    top, above = (0.0, 0.0, BLOCK - 0.02), (0.0, 0.0, 0.5)
-    marked = [[is_marked(grid, at) for at in (top, above)] for grid in (one, three)]
-    assert marked == [[True, True], [True, False]]  # the others see through the space above it
-    assert 0 < (three.last_seen == Unseen.UNANSWERED).sum() < 0.75 * (one.last_seen == Unseen.UNANSWERED).sum()
-
-
-def is_marked(grid: OccupancyMap, point: tuple[float, float, float]) -> bool:
-    cell = np.round((np.array(point) - grid.origin) / grid.config.voxel).astype(int)
-    return bool(grid.last_seen[tuple(cell)] == Unseen.UNANSWERED)
+    for grid, expected in ((one, [True, True]), (three, [True, False])):
+        cells = np.round((np.array([[0.0, 0.0, BLOCK - 0.02], [0.0, 0.0, 0.5]]) - grid.origin) / CONFIG.voxel)
+        assert marked(grid)[tuple(cells.astype(int).T)].tolist() == expected
+    assert 0 < marked(three).sum() < 0.75 * marked(one).sum()
 
 
 def test_what_a_later_image_sees_is_answered() -> None:
     grid = unanswered(dark())
-    assert (grid.last_seen == Unseen.UNANSWERED).any()
+    assert marked(grid).any()
     grid.take_in([frame()])
-    assert not (grid.last_seen == Unseen.UNANSWERED).any()
+    assert not marked(grid).any()
     grid.mark_unseen(points_of(dark()), Unseen.UNANSWERED)
-    assert not (grid.last_seen == Unseen.UNANSWERED).any()  # what was seen once has an age instead
+    assert not marked(grid).any()  # what was seen once has an age instead
 
 
 def test_steps_that_are_thinned_leave_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("splatctrl_cli.scene.occupancy.MAX_STEPS", 1)
     grid = unanswered(dark())
-    marked = grid.last_seen == Unseen.UNANSWERED
+    before = marked(grid)
     grid.take_in([replace(dark(), stamp_ns=1)])
-    assert (grid.last_seen == Unseen.UNANSWERED).tolist() == marked.tolist()
+    assert before.any() and (marked(grid) == before).all()
 
 
 def test_a_fitted_scene_knows_it() -> None:
     fitter = SceneFitter(SceneConfig(max_splats=300, first_iterations=1, iterations_per_step=1), CONFIG, WORKSPACE)
     fitter.step([dark_block(0.0)])
-    known = fitter.known_voxels().seen
-    stamps_ns, classes = known.look(np.array([[0.0, 0.0, 0.5 * BLOCK], [0.0, 0.0, -0.5], [9.0, 0.0, 0.0]]))
+    points = np.array([[0.0, 0.0, 0.5 * BLOCK], [0.0, 0.0, -0.5], [9.0, 0.0, 0.0]])
+    stamps_ns, classes = fitter.known_voxels().seen.look(points)
     assert stamps_ns.tolist() == [-1, -1, -1]
     assert classes.tolist() == [EvidenceClass.UNANSWERED, EvidenceClass.OUTSIDE, EvidenceClass.OUTSIDE]
 
 
-CONFIG = OccupancyConfig()
 DEPTH = HEIGHT - 0.1  # [m] of the block, 0.2 m wide
 
 
@@ -173,39 +163,33 @@ def at_the_block(edges: LostEdges) -> np.ndarray:
 
 
 def test_the_lost_outline_of_a_block_is_as_wide_as_a_pixel_and_at_its_depth() -> None:
-    edges = edges_of(with_lost_edges())
+    """Where nothing is lost there is no edge, nor where there is nothing beside it, at the image's border, too."""
+    edges, pixel, nothing = edges_of(with_lost_edges()), DEPTH / INTRINSICS.fx, frame()
     mine = at_the_block(edges)
     assert mine.sum() > 40
-    pixel = DEPTH / INTRINSICS.fx
     np.testing.assert_allclose(edges.radii[mine], pixel, rtol=0.02)
     reach = np.abs(edges.centers[mine, :2]).max(axis=1) + edges.radii[mine]
-    assert np.all(reach >= 0.1)  # the block's true edge is inside the balls
-    assert np.all(reach < 0.1 + 2 * pixel)
-    assert len(edges_of(frame()).radii) == 0  # where nothing is lost there is no edge
-    nothing = frame()
+    assert np.all(reach >= 0.1) and np.all(reach < 0.1 + 2 * pixel)  # the block's true edge is inside the balls
     nothing.depth[:] = 0.0
-    assert len(edges_of(nothing).radii) == 0  # nor where there is nothing beside it, at the image's border, too
+    assert len(edges_of(frame()).radii) == len(edges_of(nothing).radii) == 0
 
 
 def test_a_pixel_lost_between_two_surfaces_may_be_of_the_nearer() -> None:
     """One column alone, with the block at its left and the floor at its right."""
     seen = frame(block=0.1)
-    edge = int(np.flatnonzero(np.diff(seen.depth[30]) > 0.05)[0])
-    seen.depth[20:40, edge] = 0.0
+    seen.depth[20:40, np.flatnonzero(np.diff(seen.depth[30]) > 0.05)[0]] = 0.0
     edges = edges_of(seen)
     assert len(edges.radii) == 20 and at_the_block(edges).all()
 
 
 def test_the_outline_is_not_where_another_camera_looks_past_it() -> None:
-    alone, beside = edges_of(with_lost_edges()), frame(x=0.15)  # a camera that sees no block at all
-    assert at_the_block(alone).any()
-    assert not at_the_block(edges_of(with_lost_edges(), beside)).any()
-    assert at_the_block(edges_of(with_lost_edges(), with_lost_edges(0.15))).any()  # one that sees it does not
+    """A camera that sees no block at all; one that sees it does not."""
+    for beside, has_outline in (([], True), ([frame(x=0.15)], False), ([with_lost_edges(0.15)], True)):
+        assert at_the_block(edges_of(with_lost_edges(), *beside)).any() == has_outline
 
 
 def test_the_outline_of_the_robot_is_its_own() -> None:
     seen = with_lost_edges()
-    kinds = object_mask(seen).kinds.copy()
-    kinds[np.abs(seen.depth - DEPTH) < 0.01] = PixelKind.ROBOT
-    edges = lost_edges([(seen, replace(object_mask(seen), kinds=kinds))], None, CONFIG)["cam0"]
-    assert not at_the_block(edges).any()
+    mask = object_mask(seen)
+    kinds = np.where(np.abs(seen.depth - DEPTH) < 0.01, np.uint8(PixelKind.ROBOT), mask.kinds)
+    assert not at_the_block(lost_edges([(seen, replace(mask, kinds=kinds))], None, CONFIG)["cam0"]).any()

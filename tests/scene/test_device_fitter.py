@@ -33,17 +33,13 @@ def run(target: SceneFitter, first: int, last: int) -> list[AuditRow]:
 
 
 def test_time_steps_on_a_device_equal_those_on_the_processor(new_device: Callable[[], Memory]) -> None:  # noqa: F811
-    on_device, on_processor = fitter(new_device()), fitter(None)
-    heard: list[int] = []
+    on_device, on_processor, heard = fitter(new_device()), fitter(None), []
     on_device.descent.heard = lambda: heard.append(on_device.descent.num_iterations)
-    got, want = run(on_device, 0, 2), run(on_processor, 0, 2)
-    assert heard == list(range(1, on_processor.descent.num_iterations + 1))
-    for mine, other in zip(got, want, strict=True):
+    for mine, other in zip(run(on_device, 0, 2), run(on_processor, 0, 2), strict=True):
         assert (mine.alive, mine.added, mine.removed) == (other.alive, other.added, other.removed)
-        assert mine.loss is not None and other.loss is not None
-        assert abs(mine.loss - other.loss) < 5e-4
-    difference = on_device.buffer.parameters - on_processor.buffer.parameters
-    assert np.median(np.abs(difference)) < 5e-5
+        assert mine.loss is not None and other.loss is not None and abs(mine.loss - other.loss) < 5e-4
+    assert heard == list(range(1, on_processor.descent.num_iterations + 1))
+    assert np.median(np.abs(on_device.buffer.parameters - on_processor.buffer.parameters)) < 5e-5
 
 
 def test_a_run_goes_on_on_the_other_device(new_device: Callable[[], Memory]) -> None:  # noqa: F811

@@ -8,19 +8,22 @@ import trimesh
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.geometry import back_project, pose_at, transform_points
-from splatctrl_cli.records import Label, RgbdFrame, SplatSet, UInt8
+from splatctrl_cli.records import Bool, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
-from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
+from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.labels import human_splats, relabel, robot_splats, shown_kinds
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.self_mask import PixelKind, object_mask, self_mask
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, object_mask, self_mask
 from splatctrl_cli.voxels import SOLID, SWEPT
-from tests.scene.wall import WORKSPACE, frame
+from tests.scene.wall import WORKSPACE, frame, plain_seeds
 
 VISITOR = 0.2  # [m] height of the block that stands for a person
+
+
+SCENE = SceneConfig(max_splats=1200, first_iterations=60, iterations_per_step=10)
 
 
 def masked(view: RgbdFrame) -> RgbdFrame:
@@ -33,8 +36,8 @@ def blind(view: RgbdFrame) -> RgbdFrame:
     return replace(view, human=np.zeros(view.depth.shape, np.uint8))
 
 
-def grid_of(*views: RgbdFrame) -> OccupancyMap:
-    grid = OccupancyMap(WORKSPACE, OccupancyConfig(), 1)
+def grid_of(*views: RgbdFrame, threads: int = 1) -> OccupancyMap:
+    grid = OccupancyMap(WORKSPACE, OccupancyConfig(), threads)
     for view in views:
         grid.take_in([view])
     return grid
@@ -49,63 +52,46 @@ def test_human_voxels_are_those_that_hold_the_point_of_a_human_pixel() -> None:
     grid = grid_of(view)
     points = transform_points(view.T_world_camera, back_project(view.intrinsics, view.depth.astype(np.float64)))
     assert view.human is not None
-    cells = np.floor((points[view.human > 0] - WORKSPACE.lower) / grid.config.voxel).astype(int)
     expected = np.zeros(grid.entity.shape, bool)
-    expected[tuple(cells.T)] = True
-    assert ((grid.entity & Label.HUMAN > 0) == expected).all()
-    assert 50 < expected.sum() < 200
+    expected[tuple(np.floor((points[view.human > 0] - WORKSPACE.lower) / grid.config.voxel).astype(int).T)] = True
+    assert ((grid.entity & Label.HUMAN > 0) == expected).all() and 50 < expected.sum() < 200
 
 
-def test_a_voxel_is_human_no_longer_when_other_pixels_hit_it() -> None:
-    view = frame(block=VISITOR)
-    assert humans(grid_of(masked(view))) > 50
-    assert humans(grid_of(masked(view), blind(view))) == 0
+DARK = replace(frame(), depth=np.zeros_like(frame().depth))
+PERSON, NOBODY = masked(frame(block=VISITOR)), blind(frame(block=VISITOR))
 
 
-def test_a_voxel_is_human_no_longer_when_a_ray_passes_it() -> None:
-    grid = grid_of(*[masked(frame(block=VISITOR))] * 5)
-    num_before = humans(grid)
-    assert num_before > 50
-    grid.take_in([blind(frame())])
-    assert humans(grid) == 0
-
-
-def test_a_person_who_enters_long_free_space_is_human_at_once() -> None:
-    view = masked(frame(block=VISITOR))
-    assert humans(grid_of(*[blind(frame())] * 8, view)) == humans(grid_of(view)) > 50
-
-
-def test_a_voxel_that_no_masked_image_sees_stays_human() -> None:
-    view = masked(frame(block=VISITOR))
-    assert humans(grid_of(view, frame(block=VISITOR))) == humans(grid_of(view))  # an image without a mask
-    dark = replace(blind(view), depth=np.zeros_like(view.depth))
-    assert humans(grid_of(view, dark)) == humans(grid_of(view))
+@pytest.mark.parametrize(
+    ("views", "is_human"),
+    [
+        pytest.param([PERSON, NOBODY], False, id="other pixels hit it"),
+        pytest.param([*[PERSON] * 5, blind(frame())], False, id="a ray passes it"),
+        pytest.param([*[blind(frame())] * 8, PERSON], True, id="a person enters long free space"),
+        pytest.param([PERSON, frame(block=VISITOR)], True, id="no masked image sees it"),
+        pytest.param([PERSON, blind(DARK)], True, id="no image with depth sees it"),
+    ],
+)
+def test_a_voxel_is_human_until_a_masked_image_sees_something_else(views: list[RgbdFrame], is_human: bool) -> None:
+    assert humans(grid_of(PERSON)) > 50
+    assert humans(grid_of(*views)) == (humans(grid_of(PERSON)) if is_human else 0)
 
 
 def test_of_one_time_step_any_camera_that_sees_a_person_counts_whatever_the_order() -> None:
-    view = frame(block=VISITOR)
-    for views in ([masked(view), blind(view)], [blind(view), masked(view)]):
-        grid = OccupancyMap(WORKSPACE, OccupancyConfig(), 1)
+    for views in ([PERSON, NOBODY], [NOBODY, PERSON]):
+        grid = grid_of()
         grid.take_in(views)
-        assert humans(grid) == humans(grid_of(masked(view)))
+        assert humans(grid) == humans(grid_of(PERSON))
 
 
 def test_thread_count_does_not_change_a_bit() -> None:
-    grids = [OccupancyMap(WORKSPACE, OccupancyConfig(), threads) for threads in (1, 3)]
-    for grid in grids:
-        for view in (masked(frame(block=VISITOR)), masked(frame(block=VISITOR, x=0.15))):
-            grid.take_in([view])
-    assert grids[0].entity.tobytes() == grids[1].entity.tobytes()
+    views = PERSON, masked(frame(block=VISITOR, x=0.15))
+    assert grid_of(*views).entity.tobytes() == grid_of(*views, threads=3).entity.tobytes()
 
 
 def splats_at(*centers: tuple[float, float, float]) -> SplatBuffer:
+    """Splats of 2 cm, and two slots that are free."""
     slots = SplatBuffer(len(centers) + 2)
-    seeds = Seeds(
-        centers=np.float32(centers),
-        radii=np.full(len(centers), 0.02, np.float32),
-        colors=np.zeros((len(centers), 3), np.float32),
-    )
-    slots.fill(seeds, 0.5)
+    slots.fill(plain_seeds(centers, 0.02), 0.5)
     return slots
 
 
@@ -113,8 +99,7 @@ TOP, BELOW_TOP, FLOOR = (0.0, 0.0, 0.21), (0.0, 0.0, 0.19), (0.3, 0.2, 0.0)
 
 
 def test_splats_in_human_voxels_are_human_and_stay_so_beside_them() -> None:
-    grid = grid_of(masked(frame(block=0.205)))
-    slots = splats_at(TOP, BELOW_TOP, FLOOR)
+    grid, slots = grid_of(masked(frame(block=0.205))), splats_at(TOP, BELOW_TOP, FLOOR)
     assert human_splats(slots, grid).tolist() == [True, False, False, False, False]
     slots.labels[1] = Label.HUMAN
     assert human_splats(slots, grid).tolist() == [True, True, False, False, False]
@@ -124,78 +109,58 @@ def test_what_was_human_and_is_object_is_a_trail() -> None:
     slots = splats_at(TOP, FLOOR)
     assert not relabel(slots, grid_of(masked(frame(block=0.205))), None).any()
     assert slots.labels.tolist() == [Label.HUMAN, Label.OBJECT, 0, 0]
-    is_trail = relabel(slots, grid_of(blind(frame(block=0.205))), None)
-    assert is_trail.tolist() == [True, False, False, False]
+    assert relabel(slots, grid_of(blind(frame(block=0.205))), None).tolist() == [True, False, False, False]
     assert not slots.labels.any()
 
 
 def test_a_splat_in_the_robot_is_the_robots_whatever_the_mask_says() -> None:
     slots = splats_at(TOP, FLOOR)
-    robot = RobotPosture(centers=np.array([[0.0, 0.0, 0.2]]), radii=np.array([0.05]), T_world_link=np.eye(4)[None])
-    relabel(slots, grid_of(masked(frame(block=0.205))), robot)
+    relabel(slots, grid_of(masked(frame(block=0.205))), replace(ball(0.2, 0.05), surface=None, T_world_surface={}))
     assert slots.labels.tolist() == [Label.ROBOT, Label.OBJECT, 0, 0]
 
 
 def test_every_splat_in_a_sphere_lies_in_a_voxel_that_the_sphere_marks() -> None:
-    rng = np.random.default_rng(3)
+    rng, grid = np.random.default_rng(3), grid_of()
     spheres, radii = rng.uniform(-0.2, 0.3, (12, 3)), rng.uniform(0.02, 0.1, 12)
-    grid = OccupancyMap(WORKSPACE, OccupancyConfig(), 1)
     grid.mark_robot(spheres, radii)
     points = np.float32(rng.uniform(WORKSPACE.lower, WORKSPACE.upper, (20_000, 3)))
     inside = (np.linalg.norm(points[:, None] - spheres, axis=2) <= radii).any(axis=1)
-    assert inside.sum() > 100
-    assert (grid.entity_at(points[inside]) & Label.ROBOT > 0).all()
+    assert inside.sum() > 100 and (grid.entity_at(points[inside]) & Label.ROBOT > 0).all()
 
 
-def steps(target: SceneFitter, views: list[tuple[RgbdFrame, UInt8 | None]]) -> SplatSet:
-    for k, (view, human) in enumerate(views):
-        target.step([replace(view, stamp_ns=(target.num_steps + k) * 100_000_000, human=human)])
-    return target.splats()
+def up_and_human(target: SceneFitter, *views: RgbdFrame) -> tuple[SplatSet, Bool, Bool]:
+    """The splats after these time steps, those above the floor and those of people."""
+    for view in views:
+        target.step([replace(view, stamp_ns=target.num_steps * 100_000_000)])
+    splats = target.splats()
+    return splats, splats.centers[:, 2] > 0.1, splats.labels == Label.HUMAN
 
 
 def test_a_visitor_is_human_while_there_and_leaves_nothing_behind() -> None:
-    target = SceneFitter(
-        SceneConfig(max_splats=1200, first_iterations=60, iterations_per_step=10),
-        OccupancyConfig(),
-        WORKSPACE,
-        threads=2,
-    )
-    here, gone = masked(frame(block=VISITOR)), blind(frame())
-    assert not (steps(target, [(gone, gone.human)] * 2).labels == Label.HUMAN).any()
-    splats = steps(target, [(here, here.human)] * 2)
-    is_up, is_human = splats.centers[:, 2] > 0.1, splats.labels == Label.HUMAN
-    assert is_up.sum() > 30
-    assert is_human[is_up].all()
+    target, gone = SceneFitter(SCENE, OccupancyConfig(), WORKSPACE, threads=2), blind(frame())
+    *_, is_human = up_and_human(target, gone, gone)
+    assert not is_human.any()
+    splats, is_up, is_human = up_and_human(target, PERSON, PERSON)
+    assert is_up.sum() > 30 and is_human[is_up].all()
     assert not is_human[splats.centers[:, 2] < 0.03].any()
-    splats = steps(target, [(gone, gone.human)])
-    assert not (splats.labels == Label.HUMAN).any()
-    assert not (splats.centers[:, 2] > 0.1).any()
+    _, is_up, is_human = up_and_human(target, gone)
+    assert not is_human.any() and not is_up.any()
 
 
 def test_a_person_whom_the_mask_loses_stays_in_the_map_as_an_object() -> None:
-    target = SceneFitter(
-        SceneConfig(max_splats=1200, first_iterations=60, iterations_per_step=10), OccupancyConfig(), WORKSPACE
-    )
-    here = masked(frame(block=VISITOR))
-    steps(target, [(here, here.human)] * 2)
-    splats = steps(target, [(here, np.zeros_like(here.color[..., 0]))] * 2)
-    assert (splats.centers[:, 2] > 0.1).sum() > 30
-    assert not splats.labels.any()
+    target = SceneFitter(SCENE, OccupancyConfig(), WORKSPACE)
+    splats, is_up, _ = up_and_human(target, PERSON, PERSON, NOBODY, NOBODY)
+    assert is_up.sum() > 30 and not splats.labels.any()
 
 
 def test_a_person_who_walks_leaves_no_trail() -> None:
-    target = SceneFitter(
-        SceneConfig(max_splats=1200, first_iterations=60, iterations_per_step=10), OccupancyConfig(), WORKSPACE
-    )
-    steps(target, [(frame(), np.zeros((60, 80), np.uint8))])
+    target = SceneFitter(SCENE, OccupancyConfig(), WORKSPACE)
+    up_and_human(target, blind(frame()))
     for place in (-0.2, -0.14, -0.08, -0.02, 0.04):
-        here = masked(frame(block=VISITOR, block_x=place))
-        splats = steps(target, [(here, here.human)])
-        is_up = splats.centers[:, 2] > 0.1
-        assert is_up.sum() > 20
-        assert (splats.labels[is_up] == Label.HUMAN).all()
+        splats, is_up, is_human = up_and_human(target, masked(frame(block=VISITOR, block_x=place)))
+        assert is_up.sum() > 20 and is_human[is_up].all()
         assert np.abs(splats.centers[is_up, 0] - place).max() < 0.13
-    assert not (steps(target, [(frame(), np.zeros((60, 80), np.uint8))]).centers[:, 2] > 0.1).any()
+    assert not up_and_human(target, blind(frame()))[1].any()
 
 
 def ball(z: float, radius: float = 0.1) -> RobotPosture:
@@ -220,56 +185,64 @@ def seen_with(robot: RobotPosture, block: float = 0.0, lift: float = 0.0, x: flo
     return replace(view, depth=np.where(nearer, shown - np.float32(lift), view.depth).astype(np.float32))
 
 
-def test_a_splat_is_what_the_pixel_shows_whose_depth_it_explains() -> None:
-    robot = ball(0.3)
-    view = seen_with(robot)
-    mask = self_mask(view, robot, OccupancyConfig())
-    points = np.float32([[0.0, 0.0, 0.4], [0.0, 0.0, 0.38], [0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [0.3, 0.2, 0.1]])
-    kinds = shown_kinds(points, [(view, mask)], OccupancyConfig())
-    assert kinds.tolist() == [PixelKind.ROBOT, *[PixelKind.NOTHING] * 2, PixelKind.OBJECT, PixelKind.NOTHING]
+@pytest.mark.parametrize(
+    ("lift", "points", "expected"),
+    [
+        (
+            0.0,
+            [[0.0, 0.0, 0.4], [0.0, 0.0, 0.38], [0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [0.3, 0.2, 0.1]],
+            [PixelKind.ROBOT, *[PixelKind.NOTHING] * 2, PixelKind.OBJECT, PixelKind.NOTHING],
+        ),
+        (0.012, [[0.0, 0.0, 0.4], [0.0, 0.0, 0.412]], [PixelKind.NOTHING, PixelKind.OBJECT]),
+    ],
+)
+def test_a_splat_is_what_the_pixel_shows_whose_depth_it_explains(
+    lift: float, points: list[list[float]], expected: list[PixelKind]
+) -> None:
+    """One on the robot just behind an object, nearer than `see_through`, is not taken for the object."""
+    assert (
+        shown_kinds(np.float32(points), [seen_and_masked(ball(0.3), lift=lift)], OccupancyConfig()).tolist()
+        == expected
+    )
 
 
-@pytest.mark.parametrize("is_first", [True, False])
-def test_of_two_cameras_the_one_that_explains_a_splat_best_says_what_it_is(is_first: bool) -> None:
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_cameras_the_one_that_explains_a_splat_best_says_what_it_is(order: int) -> None:
     """The pixel of the robot explains it to 1 mm, that of an object in the other image to 15 mm."""
-    config, shape = OccupancyConfig(), frame().depth.shape
-    ours, other = (replace(frame(), depth=np.full(shape, depth, np.float32)) for depth in (1.001, 1.015))
-    robot = replace(object_mask(ours), kinds=np.full(shape, PixelKind.ROBOT, np.uint8))
-    seen = [(ours, robot), (other, object_mask(other))]
-    kinds = shown_kinds(np.float32([[0.0, 0.0, 0.0]]), seen if is_first else seen[::-1], config)
-    assert kinds.tolist() == [PixelKind.ROBOT]
+    ours, other = (replace(frame(), depth=np.full((60, 80), depth, np.float32)) for depth in (1.001, 1.015))
+    robot = replace(object_mask(ours), kinds=np.full((60, 80), PixelKind.ROBOT, np.uint8))
+    seen = [(ours, robot), (other, object_mask(other))][::order]
+    assert shown_kinds(np.float32([[0.0, 0.0, 0.0]]), seen, OccupancyConfig()).tolist() == [PixelKind.ROBOT]
 
 
 def test_what_the_robot_hides_keeps_its_label_and_what_it_shows_is_its_own() -> None:
-    robot = ball(0.3)
-    view = seen_with(robot)
-    grid = grid_of(view)
-    slots = splats_at((0.0, 0.0, 0.4), (0.0, 0.0, 0.15), (0.3, 0.2, 0.0), (0.0, 0.0, 0.3))
-    is_trail = relabel(slots, grid, robot, [(view, self_mask(view, robot, OccupancyConfig()))])
-    assert not is_trail.any()
+    robot, slots = ball(0.3), splats_at((0.0, 0.0, 0.4), (0.0, 0.0, 0.15), (0.3, 0.2, 0.0), (0.0, 0.0, 0.3))
+    seen = seen_and_masked(robot)
+    assert not relabel(slots, grid_of(seen[0]), robot, [seen]).any()
     assert slots.labels[:4].tolist() == [Label.ROBOT, Label.OBJECT, Label.OBJECT, Label.ROBOT]
 
 
 def test_an_object_that_arrives_before_the_robot_takes_its_splats_with_measured_depth() -> None:
-    robot = ball(0.3)
-    view = seen_with(robot, lift=0.03)
-    slots = splats_at((0.0, 0.0, 0.43), (0.0, 0.0, 0.4))
+    robot, slots = ball(0.3), splats_at((0.0, 0.0, 0.43), (0.0, 0.0, 0.4))
     slots.labels[:2] = Label.ROBOT
-    slots.set_radius(np.arange(2), 0.02)
-    seen = [(view, self_mask(view, robot, OccupancyConfig()))]
-    is_trail = relabel(slots, grid_of(view), robot, seen, 0.005)
+    seen = seen_and_masked(robot, lift=0.03)
+    assert not relabel(slots, grid_of(seen[0]), robot, [seen], 0.005).any()
     assert slots.labels[:2].tolist() == [Label.OBJECT, Label.ROBOT]
-    assert not is_trail.any()
     np.testing.assert_allclose(slots.radii[:2], [0.005, 0.02], rtol=1e-6)
 
 
-def labelled(grid: OccupancyMap, robot: RobotPosture, view: RgbdFrame) -> None:
-    """One time step of the voxels' labels."""
-    mask = self_mask(view, robot, grid.config)
-    grid.take_in([view])
-    pixels = [(view, mask.kinds == PixelKind.ROBOT, mask.kinds == PixelKind.OBJECT)]
-    grid.label_robot(robot.centers, robot.radii, pixels)
-    grid.forget_hidden(robot.centers, robot.radii, robot.distance)
+def seen_and_masked(robot: RobotPosture, lift: float = 0.0, block: float = 0.0) -> tuple[RgbdFrame, SelfMask]:
+    view = seen_with(robot, block, lift)
+    return view, self_mask(view, robot, OccupancyConfig())
+
+
+def labelled(grid: OccupancyMap, robot: RobotPosture, view: RgbdFrame, times: int = 1) -> None:
+    """Time steps of the voxels' labels."""
+    kinds = self_mask(view, robot, grid.config).kinds
+    for _ in range(times):
+        grid.take_in([view])
+        grid.label_robot(robot.centers, robot.radii, [(view, kinds == PixelKind.ROBOT, kinds == PixelKind.OBJECT)])
+        grid.forget_hidden(robot.centers, robot.radii, robot.distance)
 
 
 def bits(grid: OccupancyMap, *points: tuple[float, float, float]) -> list[int]:
@@ -279,17 +252,15 @@ def bits(grid: OccupancyMap, *points: tuple[float, float, float]) -> list[int]:
 def test_the_voxels_of_the_robots_pixels_are_its_own_and_those_of_objects_are_solid() -> None:
     grid, robot = grid_of(), ball(0.3)
     labelled(grid, robot, seen_with(robot))
-    (top, floor) = bits(grid, (0.0, 0.0, 0.4), (0.3, 0.2, 0.0))
+    top, floor = bits(grid, (0.0, 0.0, 0.4), (0.3, 0.2, 0.0))
     assert top & Label.ROBOT and top & SWEPT and not top & SOLID
     assert floor & SOLID and not floor & Label.ROBOT
 
 
 def test_an_object_that_arrives_where_the_robot_was_is_occupied() -> None:
-    grid, robot, away = grid_of(), ball(0.2), ball(5.0)
+    grid, robot = grid_of(), ball(0.2)
     labelled(grid, robot, seen_with(robot))
-    block = frame(block=VISITOR)
-    for _ in range(4):
-        labelled(grid, away, block)
+    labelled(grid, ball(5.0), frame(block=VISITOR), times=4)
     centers = grid.occupied_centers()
     on_top = (np.abs(centers[:, :2]).max(axis=1) < 0.08) & (np.abs(centers[:, 2] - VISITOR) < 0.02)
     assert on_top.sum() > 30
@@ -297,46 +268,29 @@ def test_an_object_that_arrives_where_the_robot_was_is_occupied() -> None:
 
 
 def test_what_the_robots_pixels_added_to_a_voxel_is_no_evidence_of_an_object() -> None:
-    grid, robot, away = grid_of(), ball(0.3), ball(5.0)
-    for _ in range(3):
-        labelled(grid, robot, seen_with(robot))
-    top = np.float32([[0.0, 0.0, 0.4]])
-
-    def is_occupied() -> bool:
-        return bool((np.abs(grid.occupied_centers() - top).max(axis=1) < 0.5 * grid.config.voxel).any())
-
-    labelled(grid, away, frame(block=0.4))
-    assert bits(grid, (0.0, 0.0, 0.4))[0] & SOLID and not is_occupied()  # one hit of an object may be noise
-    labelled(grid, away, frame(block=0.4))
-    assert is_occupied()
+    """And one hit of an object may be noise."""
+    grid, robot = grid_of(), ball(0.3)
+    labelled(grid, robot, seen_with(robot), times=3)
+    for is_occupied in (False, True):
+        labelled(grid, ball(5.0), frame(block=0.4))
+        away = np.abs(grid.occupied_centers() - np.float32([0.0, 0.0, 0.4])).max(axis=1)
+        assert bits(grid, (0.0, 0.0, 0.4))[0] & SOLID and (away.min() < 0.5 * grid.config.voxel) == is_occupied
 
 
 def test_a_voxel_that_the_robot_left_is_not_occupied() -> None:
-    grid, robot, away = grid_of(), ball(0.3), ball(5.0)
-    for _ in range(3):
-        labelled(grid, robot, seen_with(robot))
-    dark = replace(frame(), depth=np.zeros_like(frame().depth))
-    labelled(grid, away, dark)
+    grid, robot = grid_of(), ball(0.3)
+    labelled(grid, robot, seen_with(robot), times=3)
+    labelled(grid, ball(5.0), DARK)
     assert not (np.linalg.norm(grid.occupied_centers() - [0.0, 0.0, 0.3], axis=1) < 0.15).any()
 
 
 def test_what_the_robot_hides_of_an_object_is_solid_as_long_as_the_rest_of_it_is_there() -> None:
-    grid, away, robot = grid_of(), ball(5.0), ball(0.22, 0.08)
-    for _ in range(3):
-        labelled(grid, away, frame(block=VISITOR))
-    hidden = (0.0, 0.0, VISITOR)
-    labelled(grid, robot, seen_with(robot, block=VISITOR))  # the ball stands in the block's top
-    assert bits(grid, hidden)[0] & SOLID
-    labelled(grid, robot, seen_with(robot))  # the block is gone
-    assert not bits(grid, hidden)[0] & SOLID
-
-
-def test_a_splat_on_the_robot_just_behind_an_object_is_not_taken_for_the_object() -> None:
-    robot = ball(0.3)
-    view = seen_with(robot, lift=0.012)  # nearer than `see_through`
-    mask = self_mask(view, robot, OccupancyConfig())
-    kinds = shown_kinds(np.float32([[0.0, 0.0, 0.4], [0.0, 0.0, 0.412]]), [(view, mask)], OccupancyConfig())
-    assert kinds.tolist() == [PixelKind.NOTHING, PixelKind.OBJECT]
+    """The ball stands in the block's top, and then the block is gone."""
+    grid, robot = grid_of(), ball(0.22, 0.08)
+    labelled(grid, ball(5.0), frame(block=VISITOR), times=3)
+    for block in (VISITOR, 0.0):
+        labelled(grid, robot, seen_with(robot, block=block))
+        assert bool(bits(grid, (0.0, 0.0, VISITOR))[0] & SOLID) is (block > 0)
 
 
 @pytest.mark.parametrize("is_drawn", [False, True])
@@ -344,14 +298,12 @@ def test_within_a_robot_of_which_all_is_drawn_no_splat_is_an_objects(is_drawn: b
     """A splat 4 cm within a ball, in a voxel that an object's pixel has hit; a box or a hull may be larger than what
     it stands for.
     """
-    robot, buffer, grid = ball(0.3), SplatBuffer(1), grid_of()
+    robot, buffer, grid = ball(0.3), splats_at((0.0, 0.0, 0.34)), grid_of()
     if is_drawn:
         triangles = trimesh.creation.icosphere(radius=0.1).triangles + np.array([0.0, 0.0, 0.3])
         drawn = RobotSurface.from_parts([], [("arm", triangles)])
         robot = replace(robot, surface=drawn, T_world_surface={0: np.eye(4)[None]})
-    center = np.float32([[0.0, 0.0, 0.34]])
-    buffer.fill(Seeds(centers=center, radii=np.float32([0.01]), colors=np.zeros((1, 3), np.float32)), 0.5)
     grid.entity[:] = SOLID
-    assert robot_splats(buffer, grid, robot, [])[0].tolist() == [is_drawn]
-    assert robot.holds(center, 0.03).tolist() == [is_drawn]
-    assert not robot.holds(center, 0.07).any()
+    assert robot_splats(buffer, grid, robot, [])[0].tolist() == [is_drawn, False, False]
+    center = np.float32([[0.0, 0.0, 0.34]])
+    assert robot.holds(center, 0.03).tolist() == [is_drawn] and not robot.holds(center, 0.07).any()

@@ -9,9 +9,10 @@ from scipy.ndimage import binary_erosion
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, transform_points
-from splatctrl_cli.records import Box, Intrinsics, Label, RgbdFrame
+from splatctrl_cli.records import Box, Float64, Intrinsics, Label, RgbdFrame
 from splatctrl_cli.scene.occupancy import MAX_STEPS, OccupancyMap
 from splatctrl_cli.voxels import SWEPT
+from tests.plain import plain_frame
 from tests.reference.occupancy import ray_walk
 from tests.scene.wall import WORKSPACE, frame
 
@@ -27,10 +28,8 @@ def tilted(*, rod: bool = False, holes: float = 0.0) -> RgbdFrame:
     depth = (-T[2, 3] / np.minimum(rays[..., 2], -1e-6)).astype(np.float32)
     if rod:
         depth[6:30, 20] = 0.6
-    is_hole = (depth > 2.5) | (np.random.default_rng(0).random(depth.shape) < holes)
-    depth[is_hole] = 0.0
-    color = np.zeros((*depth.shape, 3), np.uint8)
-    return RgbdFrame(stamp_ns=0, camera="cam0", color=color, depth=depth, intrinsics=k, T_world_camera=T)
+    depth[(depth > 2.5) | (np.random.default_rng(0).random(depth.shape) < holes)] = 0.0
+    return plain_frame(depth, k, T)
 
 
 def centers(grid: OccupancyMap) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
@@ -38,143 +37,113 @@ def centers(grid: OccupancyMap) -> np.ndarray[tuple[int, ...], np.dtype[np.float
     return grid.origin + grid.config.voxel * np.stack(np.indices(grid.log_odds.shape), -1)
 
 
-def seen(*, block: float = 0.0, times: int = 3, threads: int = 1) -> OccupancyMap:
-    grid = OccupancyMap(WORKSPACE, CONFIG, threads)
+def seen(*, block: float = 0.0, times: int = 3, config: OccupancyConfig = CONFIG) -> OccupancyMap:
+    grid = OccupancyMap(WORKSPACE, config, 1)
     for _ in range(times):
         grid.integrate(frame(block=block))
     return grid
 
 
+def by_the_tilted(view: RgbdFrame) -> tuple[OccupancyMap, Float64, Float64]:
+    """A grid that takes it in, the depths of its voxels and their columns in the image."""
+    grid = OccupancyMap(AROUND, CONFIG, 1)
+    grid.integrate(view)
+    points = transform_points(invert_transform(view.T_world_camera), centers(grid))
+    return grid, points[..., 2], points[..., 0] / points[..., 2] * view.intrinsics.fx + view.intrinsics.cx
+
+
 def test_air_is_free_floor_is_occupied_and_below_was_never_seen() -> None:
-    grid = seen(block=0.2)
+    """And free again where a block leaves."""
+    grid = seen(block=0.2, times=10)
     points = np.float32([[0.2, 0.2, 0.3], [0.2, 0.2, 0.0], [0.0, 0.0, 0.2], [0.0, 0.0, 0.08]])
     value, is_observed = grid.occupancy_around(points)
-    assert value[0] < 0.3
-    assert value[1] > 0.7
-    assert value[2] > 0.7
+    assert value[0] < 0.3 and value[1:3].min() > 0.7
     assert is_observed.tolist() == [True, True, True, False]
+    for _ in range(10):
+        grid.integrate(frame())
+    assert grid.occupancy_around(points)[0][2] < 0.3
 
 
 def test_a_hit_outweighs_the_misses_of_the_same_image() -> None:
     grid = seen(times=1)
-    hit = grid.log_odds == np.float32(CONFIG.log_odds_hit)
-    miss = grid.log_odds == np.float32(CONFIG.log_odds_miss)
-    assert (hit | miss | (grid.num_updates == 0)).all()
-    assert grid.num_updates.max() == 1
+    hit, miss = (grid.log_odds == np.float32(value) for value in (CONFIG.log_odds_hit, CONFIG.log_odds_miss))
+    assert (hit | miss | (grid.num_updates == 0)).all() and grid.num_updates.max() == 1
     assert 200 < hit.sum() < 600  # the visible floor is 0.9 x 0.7 m in 5 cm voxels
-
-
-def test_a_block_that_leaves_becomes_free_again() -> None:
-    grid = seen(block=0.2, times=10)
-    top = np.float32([[0.0, 0.0, 0.2]])
-    assert grid.occupancy_around(top)[0][0] > 0.7
-    for _ in range(10):
-        grid.integrate(frame())
-    assert grid.occupancy_around(top)[0][0] < 0.3
 
 
 @pytest.mark.parametrize(("rod", "holes", "share"), [(False, 0.0, 1.0), (True, 0.0, 0.95), (True, 0.3, 0.9)])
 def test_what_rays_pass_is_free_and_what_holds_a_point_is_hit(rod: bool, holes: float, share: float) -> None:
-    # Left out are voxels that rays pass only beside their centre: at the rim of the view, of holes, of a shadow.
-    grid = OccupancyMap(AROUND, OccupancyConfig(voxel=0.08), 2)
-    view = tilted(rod=rod, holes=holes)
+    """Left out are voxels that rays pass only beside their centre: at the rim of the view, of holes, of a shadow."""
+    grid, view = OccupancyMap(AROUND, OccupancyConfig(voxel=0.08), 2), tilted(rod=rod, holes=holes)
     grid.integrate(view)
     passed, hit = ray_walk(view, grid.origin, 0.08, grid.log_odds.shape)
     is_free = grid.log_odds < 0
-    assert ((grid.log_odds > 0) == hit).all()
-    assert not (is_free & ~passed).any()
+    assert ((grid.log_odds > 0) == hit).all() and not (is_free & ~passed).any()
     within = binary_erosion(passed | hit, np.ones((3, 3, 3))) & passed
-    assert within.sum() > 300
-    assert is_free[within].mean() >= share
+    assert within.sum() > 300 and is_free[within].mean() >= share
     assert ((grid.num_updates > 0) == (is_free | hit)).all()
 
 
 def test_what_stands_behind_a_thin_thing_is_not_free() -> None:
-    grid = OccupancyMap(AROUND, CONFIG, 1)
     view = tilted()
     view.depth[:, 16:24] = 0.6
-    grid.integrate(view)
-    points = transform_points(invert_transform(view.T_world_camera), centers(grid))
-    u = points[..., 0] / points[..., 2] * view.intrinsics.fx + view.intrinsics.cx
-    is_behind = (points[..., 2] > 0.6) & (u > 16) & (u < 23)
-    assert is_behind.sum() > 1000
-    assert not (grid.log_odds[is_behind] < 0).any()
+    grid, z, u = by_the_tilted(view)
+    is_behind = (z > 0.6) & (u > 16) & (u < 23)
+    assert is_behind.sum() > 1000 and not (grid.log_odds[is_behind] < 0).any()
 
 
 def test_pixels_without_depth_free_nothing_of_their_own() -> None:
-    grid = OccupancyMap(AROUND, CONFIG, 1)
     view = tilted()
     view.depth[:, 16:] = 0.0
-    grid.integrate(view)
-    points = transform_points(invert_transform(view.T_world_camera), centers(grid))
-    u = points[..., 0] / points[..., 2] * view.intrinsics.fx + view.intrinsics.cx
-    is_blind = (points[..., 2] > 0.05) & (u > 16 + view.intrinsics.fx * CONFIG.voxel / points[..., 2])
-    assert is_blind.sum() > 1000
-    assert not grid.num_updates[is_blind].any()
+    grid, z, u = by_the_tilted(view)
+    is_blind = (z > 0.05) & (u > 16 + view.intrinsics.fx * CONFIG.voxel / z)
+    assert is_blind.sum() > 1000 and not grid.num_updates[is_blind].any()
 
 
-@pytest.mark.parametrize("holes", [0.0, 0.3])
-def test_what_an_image_changes_is_last_seen_in_its_time_step(holes: float) -> None:
+@pytest.mark.parametrize(
+    "view", [tilted(), tilted(holes=0.3), replace(tilted(), depth=np.zeros((36, 48), np.float32))]
+)
+def test_what_an_image_changes_is_last_seen_in_its_time_step(view: RgbdFrame) -> None:
+    """An image without depth renews nothing."""
     grid = OccupancyMap(AROUND, OccupancyConfig(voxel=0.08), 2)
     grid.take_in([frame(stamp_ns=7)])
     first, counts = grid.last_seen.copy(), grid.num_updates.copy()
     assert ((first == 1) == (counts > 0)).all()
-    grid.take_in([replace(tilted(holes=holes), stamp_ns=9)])
+    grid.take_in([replace(view, stamp_ns=9)])
     is_seen = grid.num_updates > counts
-    assert (grid.last_seen == np.where(is_seen, 2, first)).all()
-    assert is_seen.any()
-    assert grid.step_stamps_ns == [7, 9]
-
-
-def test_an_image_without_depth_renews_nothing() -> None:
-    grid = OccupancyMap(AROUND, CONFIG, 1)
-    grid.take_in([frame(stamp_ns=7)])
-    before = grid.last_seen.copy()
-    blind = frame(stamp_ns=9)
-    grid.take_in([replace(blind, depth=np.zeros_like(blind.depth))])
-    assert (grid.last_seen == before).all()
+    assert (grid.last_seen == np.where(is_seen, 2, first)).all() and is_seen.any() == view.depth.any()
     assert grid.step_stamps_ns == [7, 9]
 
 
 def test_beyond_the_most_time_steps_the_evidence_is_never_said_to_be_younger_than_it_is() -> None:
-    grid = OccupancyMap(WORKSPACE, CONFIG, 1)
+    grid, blind = OccupancyMap(WORKSPACE, CONFIG, 1), frame(stamp_ns=65_535)
     grid.take_in([frame(stamp_ns=0)])
     assert MAX_STEPS == 65_519
     grid.step_stamps_ns = list(range(65_519))
-    steps = np.array([0, 1, 2, 3, 65_518, 65_519], np.uint16)
-    grid.last_seen.ravel()[-6:] = steps
-    blind = frame(stamp_ns=65_535)
+    grid.last_seen.ravel()[-6:] = [0, 1, 2, 3, 65_518, 65_519]
     grid.take_in([replace(blind, depth=np.zeros_like(blind.depth))])
     stamps_ns = np.concatenate([[-1], grid.step_stamps_ns])[grid.last_seen.ravel()[-6:]]
-    assert stamps_ns.tolist() == [-1, 0, 0, 2, 65_516, 65_518]
-    assert grid.step_stamps_ns[-1] == 65_535
+    assert stamps_ns.tolist() == [-1, 0, 0, 2, 65_516, 65_518] and grid.step_stamps_ns[-1] == 65_535
 
 
 def test_thread_count_does_not_change_a_bit() -> None:
-    grids = []
-    for threads in (1, 2, 5):
-        grid = OccupancyMap(AROUND, OccupancyConfig(voxel=0.02), threads)
+    one, *others = (OccupancyMap(AROUND, OccupancyConfig(voxel=0.02), threads) for threads in (1, 2, 5))
+    for grid in (one, *others):
         for view in (tilted(), tilted(holes=0.5), frame(block=0.1)):
             grid.take_in([view])
-        grids.append((grid.log_odds.tobytes(), grid.num_updates.tobytes(), grid.last_seen.tobytes()))
-    assert grids[0] == grids[1] == grids[2]
+        for name in ("log_odds", "num_updates", "last_seen"):
+            assert getattr(grid, name).tobytes() == getattr(one, name).tobytes()
 
 
 def test_depth_beyond_the_range_hits_nothing_and_frees_what_is_within() -> None:
-    grid = OccupancyMap(WORKSPACE, OccupancyConfig(voxel=0.05, max_range=0.9), 1)
-    grid.integrate(frame())
+    """And depth nearer than the range says nothing."""
+    grid = seen(times=1, config=replace(CONFIG, max_range=0.9))
     x, y, z = np.moveaxis(centers(grid), -1, 0)
-    depth = 1.0 - z
-    is_in_view = (np.abs(x) < 0.4 * depth) & (np.abs(y) < 0.3 * depth)
+    is_in_view = (np.abs(x) < 0.4 * (1.0 - z)) & (np.abs(y) < 0.3 * (1.0 - z))
     assert not (grid.log_odds > 0).any()
-    assert (grid.log_odds[is_in_view & (depth < 0.9)] < 0).all()
-    assert not grid.num_updates[depth > 0.9].any()
-
-
-def test_depth_nearer_than_the_range_says_nothing() -> None:
-    grid = OccupancyMap(WORKSPACE, OccupancyConfig(voxel=0.05, min_range=1.1), 1)
-    grid.integrate(frame())
-    assert not grid.num_updates.any()
+    assert (grid.log_odds[is_in_view & (1.0 - z < 0.9)] < 0).all()
+    assert not grid.num_updates[1.0 - z > 0.9].any()
+    assert not seen(times=1, config=replace(CONFIG, min_range=1.1)).num_updates.any()
 
 
 def test_counts_and_log_odds_stop_at_their_limits() -> None:
@@ -188,11 +157,10 @@ def test_counts_and_log_odds_stop_at_their_limits() -> None:
 
 def test_robot_bits_are_where_a_sphere_is_and_swept_bits_where_one_was() -> None:
     grid = OccupancyMap(WORKSPACE, CONFIG, 1)
-    grid.mark_robot(np.array([[0.3, 0.0, 0.3]]), np.array([0.1]))
-    grid.mark_robot(np.array([[0.0, 0.0, 0.3]]), np.array([0.1]))
+    for x in (0.3, 0.0):
+        grid.mark_robot(np.array([[x, 0.0, 0.3]]), np.array([0.1]))
     points = np.float32([[0.0, 0.0, 0.3], [0.09, 0.0, 0.3], [0.3, 0.0, 0.3], [5.0, 0.0, 0.0]])
-    robot = Label.ROBOT | SWEPT
-    assert (grid.entity_at(points) == [robot, robot, SWEPT, 0]).all()
+    assert (grid.entity_at(points) == [Label.ROBOT | SWEPT, Label.ROBOT | SWEPT, SWEPT, 0]).all()
 
 
 def test_a_workspace_too_large_for_its_voxels_is_refused() -> None:

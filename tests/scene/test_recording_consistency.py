@@ -27,30 +27,34 @@ def views(**offset: float) -> list[RgbdFrame]:
 
 def test_cameras_with_good_poses_agree() -> None:
     (pair,) = agreements(views(), *RANGE)
-    assert pair.cameras == ("cam0", "cam1")
-    assert pair.median < 1e-6
-    assert pair.holds
+    assert pair.cameras == ("cam0", "cam1") and pair.median < 1e-6 and pair.holds
 
 
 @pytest.mark.parametrize(("offset", "holds"), [(0.01, True), (0.025, True), (0.035, False), (-0.09, False)])
 def test_a_pose_that_is_off_shows_as_that_much(offset: float, holds: bool) -> None:
-    (pair,) = agreements(views(z=offset), *RANGE)
-    assert pair.median == pytest.approx(abs(offset), abs=1e-6)
-    assert pair.holds == holds
+    """Views of one camera are compared, too."""
+    for cameras in (("cam0", "cam1"), ("camera", "camera")):
+        named = [replace(view, camera=name) for view, name in zip(views(z=offset), cameras, strict=True)]
+        (pair,) = agreements(named, *RANGE)
+        assert (pair.cameras, pair.holds, pair.median) == (cameras, holds, pytest.approx(abs(offset), abs=1e-6))
 
 
-def test_what_only_some_pixels_disagree_on_is_no_wrong_pose() -> None:
-    values = {"cameras": ("a", "b"), "num_pixels": 900}
-    assert Agreement(median=0.1, quartile=0.01, depth=0.8, **values).holds
-    assert not Agreement(median=0.1, quartile=0.02, depth=0.8, **values).holds
-    assert not Agreement(median=1.01 * PAIR_LIMIT, quartile=PAIR_LIMIT, depth=0.8, **values).holds
-    assert Agreement(median=0.08, quartile=0.06, depth=3.0, **values).holds
+@pytest.mark.parametrize(
+    ("values", "holds"),
+    [
+        ({"median": 0.1, "quartile": 0.01}, True),
+        ({"median": 0.1, "quartile": 0.02}, False),
+        ({"median": 1.01 * PAIR_LIMIT, "quartile": PAIR_LIMIT}, False),
+        ({"median": 0.08, "quartile": 0.06, "depth": 3.0}, True),
+        ({"median": 0.1, "quartile": 0.1, "detour": 0.9 * PAIR_LIMIT}, True),
+        ({"median": 0.1, "quartile": 0.1, "detour": 1.1 * PAIR_LIMIT}, False),
+    ],
+)
+def test_what_only_some_pixels_disagree_on_is_no_wrong_pose(values: dict[str, float], holds: bool) -> None:
+    assert Agreement(**{"cameras": ("a", "b"), "num_pixels": 900, "depth": 0.8} | values).holds is holds  # type: ignore[arg-type]
 
 
 def test_cameras_that_agree_with_a_third_see_two_sides_of_things_of_each_other() -> None:
-    values = {"cameras": ("a", "b"), "num_pixels": 900, "depth": 0.8, "median": 0.1, "quartile": 0.1}
-    assert Agreement(detour=0.9 * PAIR_LIMIT, **values).holds
-    assert not Agreement(detour=1.1 * PAIR_LIMIT, **values).holds
     three = [*views(z=0.02), moved(frame(block=0.2, x=0.0, camera="cam2"), z=0.012)]
     detours = {pair.cameras: pair.detour for pair in agreements(three, *RANGE)}
     assert detours == {
@@ -62,16 +66,8 @@ def test_cameras_that_agree_with_a_third_see_two_sides_of_things_of_each_other()
 
 
 def test_too_few_common_pixels_say_nothing() -> None:
-    assert agreements(views(x=5.0, z=0.5), *RANGE) == []
-    assert agreements(views()[:1], *RANGE) == []
-    assert agreements([], *RANGE) == []
-
-
-def test_views_of_one_camera_are_compared_too() -> None:
-    still = [replace(view, camera="camera") for view in views(z=0.09)]
-    (pair,) = agreements(still, *RANGE)
-    assert pair.cameras == ("camera", "camera")
-    assert not pair.holds
+    for given in (views(x=5.0, z=0.5), views()[:1], []):
+        assert agreements(given, *RANGE) == []
 
 
 def test_neither_the_order_of_views_nor_a_common_motion_matters() -> None:
@@ -86,23 +82,18 @@ def test_neither_the_order_of_views_nor_a_common_motion_matters() -> None:
 def test_depth_that_is_missing_or_out_of_range_is_not_compared() -> None:
     a, b = views()
     blind = replace(b, depth=np.zeros_like(b.depth))
-    for one, other in ((a, blind), (blind, a)):
-        assert len(differences(one, other, *RANGE)) == 0
-    assert len(differences(a, b, 0.2, 0.7)) == 0
+    for one, other, most in ((a, blind, 3.0), (blind, a, 3.0), (a, b, 0.7)):
+        assert len(differences(one, other, 0.2, most)) == 0
 
 
 def poses(*xs: float, period_ns: int = 100_000_000, camera: str = "a") -> list[tuple[int, str, Float64]]:
-    found = []
-    for k, x in enumerate(xs):
-        found.append((k * period_ns, camera, pose_at([x, 0.0, 0.0])))
-    return found
+    return [(k * period_ns, camera, pose_at([x, 0.0, 0.0])) for k, x in enumerate(xs)]
 
 
 def test_the_largest_jump_of_a_camera_is_found() -> None:
     jump = largest_jump([*poses(0.0, 0.1, 3.1, 3.2), *poses(9.0, 9.1, camera="b")])
-    assert jump is not None
+    assert jump is not None and jump.distance == pytest.approx(3.0)
     assert (jump.camera, jump.before_ns, jump.after_ns) == ("a", 100_000_000, 200_000_000)
-    assert jump.distance == pytest.approx(3.0)
 
 
 def test_cameras_apart_and_frames_long_after_each_other_are_no_jump() -> None:

@@ -7,7 +7,8 @@ import pytest
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.kernels.points import Cubes
-from splatctrl_cli.records import Float32
+from splatctrl_cli.records import Bool, Float32, RgbdFrame
+from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seed_octree import cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.seeding import (
@@ -27,48 +28,56 @@ from tests.scene.wall import WORKSPACE, frame
 CONFIG = SceneConfig()
 
 
+NOTHING = np.zeros((0, 3), np.float32)
+
+
 def rendering(depth: Float32, opacity: float) -> Rendering:
     full = np.full_like(depth, opacity)
     return Rendering(color=np.zeros((*depth.shape, 3), np.float32), depth=depth * opacity, opacity=full)
 
 
+def asked(seen: RgbdFrame, shown: Float32, opacity: float, mappable: Bool | None = None) -> Bool:
+    everywhere = np.ones(seen.depth.shape, bool)
+    return add_mask(seen, rendering(shown, opacity), everywhere if mappable is None else mappable, CONFIG)
+
+
+def mappable_in(seen: RgbdFrame, *least: float) -> Bool:
+    return inside_workspace(seen, world_points(seen), WORKSPACE, *least)
+
+
+def seeds_of(edge: float, beside: Float32 = NOTHING, config: SceneConfig = CONFIG) -> Seeds:
+    """Of the floor in cubes of one size."""
+    source = candidates(frame(), np.ones((60, 80), bool))
+    return seeds_at([source], beside, SeedDensity(edge=edge, tolerance=1e9), config)
+
+
 def test_an_empty_map_asks_for_every_mappable_pixel() -> None:
     seen = frame()
-    mappable = inside_workspace(seen, world_points(seen), WORKSPACE)
-    mask = add_mask(seen, rendering(seen.depth, 0.0), mappable, CONFIG)
-    assert mappable.any()
-    assert np.array_equal(mask, mappable)
+    mappable = mappable_in(seen)
+    assert mappable.any() and np.array_equal(asked(seen, seen.depth, 0.0, mappable), mappable)
 
 
 def test_a_perfect_map_asks_for_nothing() -> None:
-    seen = frame()
-    everywhere = np.ones(seen.depth.shape, bool)
-    assert not add_mask(seen, rendering(seen.depth, 0.9), everywhere, CONFIG).any()
+    assert not asked(frame(), frame().depth, 0.9).any()
 
 
 def test_what_appears_in_front_is_asked_for_and_what_vanished_is_not() -> None:
     floor, block = frame(), frame(block=0.2)
-    everywhere = np.ones(floor.depth.shape, bool)
-    appeared = add_mask(block, rendering(floor.depth, 0.9), everywhere, CONFIG)
-    assert np.array_equal(appeared, block.depth < 0.9)
-    assert not add_mask(floor, rendering(block.depth, 0.9), everywhere, CONFIG).any()
+    assert np.array_equal(asked(block, floor.depth, 0.9), block.depth < 0.9)
+    assert not asked(floor, block.depth, 0.9).any()
 
 
 def test_invalid_depth_is_never_asked_for() -> None:
     seen = frame()
     seen.depth[:30] = 0.0
-    mappable = inside_workspace(seen, world_points(seen), WORKSPACE)
-    assert not mappable[:30].any()
-    assert not add_mask(seen, rendering(seen.depth, 0.0), mappable, CONFIG)[:30].any()
+    assert not mappable_in(seen)[:30].any()
+    assert not asked(seen, seen.depth, 0.0, mappable_in(seen))[:30].any()
 
 
 def test_what_is_nearer_than_the_least_range_is_not_mapped() -> None:
     seen = frame(block=0.4)
-    points = world_points(seen)
-    far = inside_workspace(seen, points, WORKSPACE, 0.7)
-    assert inside_workspace(seen, points, WORKSPACE)[seen.depth < 0.7].all()
-    assert not far[seen.depth < 0.7].any()
-    assert far.any()
+    is_near, far = seen.depth < 0.7, mappable_in(seen, 0.7)
+    assert mappable_in(seen)[is_near].all() and not far[is_near].any() and far.any()
 
 
 def test_points_lie_on_the_floor_they_were_seen_on() -> None:
@@ -85,21 +94,20 @@ def coloured(count: int = 20000) -> tuple[Float32, Float32]:
 
 
 def test_cubes_are_split_where_the_colour_varies_and_nowhere_else() -> None:
-    points, colors = coloured()
-    levels = cube_levels(points, colors, 0.1, 3)
+    levels = cube_levels(*coloured(), 0.1, 3)
     coarse, middle, fine = leaves(levels, tolerance=1.0)
-    assert all((levels[0].points[coarse] < 0.51).any(axis=1))
-    assert not middle.any()
-    assert all((levels[2].points[fine, :2] > 0.5).all(axis=1))
+    assert (levels[0].points[coarse] < 0.51).any(axis=1).all() and not middle.any()
+    assert (levels[2].points[fine, :2] > 0.5).all()
+    count = sum(int(mask.sum()) for mask in leaves(levels, tolerance_for(levels, 900)))
+    assert 700 < count <= 900  # the tolerance uses the budget
 
 
 def test_cubes_are_split_at_an_edge_in_space() -> None:
     points, _ = coloured()
-    grey = np.full_like(points, 0.5)
     bent = np.concatenate([points, points[:, [2, 1, 0]] * np.float32([1, 1, 0.2])])
-    levels = cube_levels(bent + np.float32(0.03), np.concatenate([grey, grey]), 0.1, 2)
-    assert leaves(levels, tolerance=0.5)[1].any()
-    assert not leaves(cube_levels(points + np.float32(0.03), grey, 0.1, 2), tolerance=0.5)[1].any()
+    for at, is_split in ((bent, True), (points, False)):
+        levels = cube_levels(at + np.float32(0.03), np.full_like(at, 0.5), 0.1, 2)
+        assert leaves(levels, tolerance=0.5)[1].any() == is_split
 
 
 def test_every_point_has_one_standing_cube() -> None:
@@ -118,86 +126,49 @@ def test_a_cube_stands_on_a_measured_point() -> None:
     points, colors = coloured(500)
     measured = {tuple(p) for p in points.tolist()}
     assert all(tuple(p) in measured for p in cube_levels(points, colors, 0.2, 1)[0].points.tolist())
-
-
-def test_the_tolerance_uses_the_budget() -> None:
-    points, colors = coloured()
-    levels = cube_levels(points, colors, 0.1, 3)
-    count = sum(int(mask.sum()) for mask in leaves(levels, tolerance_for(levels, 900)))
-    assert 700 < count <= 900
+    assert len(Cubes(NOTHING, 0.1, 2)) == 0
 
 
 def test_nothing_is_seeded_beside_a_live_splat() -> None:
-    seen = frame()
-    source = candidates(seen, np.ones(seen.depth.shape, bool))
-    density = SeedDensity(edge=0.05, tolerance=1e9)
-    nothing = np.zeros((0, 3), np.float32)
-    first = seeds_at([source], nothing, density, CONFIG).centers
-    second = seeds_at([source], first, density, CONFIG).centers
-    assert len(second) == 0
+    first = seeds_of(0.05).centers
+    for beside in (first, first + np.float32([0.015, 0.0, 0.0])):
+        assert len(seeds_of(0.05, beside)) == 0
     half = first[first[:, 0] < 0]
-    again = seeds_at([source], half, density, CONFIG).centers
+    again = seeds_of(0.05, half).centers
     assert len(again) > 0.4 * len(first)
     assert np.linalg.norm(again[:, None] - half[None], axis=2).min() >= 0.7 * 0.05 - 1e-6
-    beside = first + np.float32([0.015, 0.0, 0.0])
-    assert len(seeds_at([source], beside, density, CONFIG).centers) == 0
 
 
-def test_the_radius_is_that_of_the_cube_within_its_limits() -> None:
-    seen = frame()
-    source = candidates(seen, np.ones(seen.depth.shape, bool))
-    nothing = np.zeros((0, 3), np.float32)
-    wide = replace(CONFIG, max_radius=0.5)
-    fine = seeds_at([source], nothing, SeedDensity(edge=0.004, tolerance=1e9), wide)
-    coarse = seeds_at([source], nothing, SeedDensity(edge=0.1, tolerance=1e9), wide)
-    capped = seeds_at([source], nothing, SeedDensity(edge=0.1, tolerance=1e9), CONFIG)
-    assert np.allclose(fine.radii, 1.0 / 80.0)  # one pixel: D / f
-    assert np.allclose(coarse.radii, 0.045)
-    assert np.allclose(capped.radii, 0.02)
+@pytest.mark.parametrize(("edge", "most", "radius"), [(0.004, 0.5, 1.0 / 80.0), (0.1, 0.5, 0.045), (0.1, 0.02, 0.02)])
+def test_the_radius_is_that_of_the_cube_within_its_limits(edge: float, most: float, radius: float) -> None:
+    """The least is that of one pixel: D / f."""
+    assert np.allclose(seeds_of(edge, config=replace(CONFIG, max_radius=most)).radii, radius)
 
 
 def test_a_measured_surface_far_from_every_sphere_is_seeded() -> None:
-    seen = frame()
-    points = world_points(seen).reshape(-1, 3).astype(np.float32)
-    has_hole = points[np.linalg.norm(points[:, :2], axis=1) > 0.12]
-    splats = plain_splats(has_hole, 0.02)
-    views = [(seen, inside_workspace(seen, world_points(seen), WORKSPACE))]
-    nothing = np.zeros((0, 3), np.float32)
-    seeds = gap_seeds(views, nothing, 0.02, splats, CONFIG)
-    assert 5 < len(seeds) < 60
-    assert np.linalg.norm(seeds.centers[:, :2], axis=1).max() < 0.12
-    forgotten = np.float32([[0.3, 0.3, 0.4], [0.3, 0.3, 0.0]])
+    seen, forgotten = frame(), np.float32([[0.3, 0.3, 0.4], [0.3, 0.3, 0.0]])
+    points = world_points(seen).reshape(-1, 3)
+    splats = plain_splats(points[np.linalg.norm(points[:, :2], axis=1) > 0.12], 0.02)  # of all but a hole
+    seeds = gap_seeds([(seen, mappable_in(seen))], NOTHING, 0.02, splats, CONFIG)
+    assert 5 < len(seeds) < 60 and np.linalg.norm(seeds.centers[:, :2], axis=1).max() < 0.12
     assert gap_seeds([], forgotten, 0.02, splats, CONFIG).centers.tolist() == forgotten[:1].tolist()
 
 
-def test_the_two_halves_of_the_rows_are_looked_at_in_turn() -> None:
-    seen = frame()
-    occupied = np.float32([[0, 0, 0.3], [0.1, 0, 0.3], [0.2, 0, 0.3], [0.3, 0, 0.3]])
+@pytest.mark.parametrize("half", [0, 1])
+def test_the_two_halves_of_the_rows_are_looked_at_in_turn(half: int) -> None:
+    seen, occupied = frame(), np.float32([[0, 0, 0.3], [0.1, 0, 0.3], [0.2, 0, 0.3], [0.3, 0, 0.3]])
     bare = plain_splats([], 0.02)
-    for half in (0, 1):
-        centers = gap_seeds([(seen, seen.depth > 0)], occupied, 0.02, bare, CONFIG, half=half).centers
-        in_air = centers[:, 2] > 0.2
-        assert sorted(centers[in_air, 0].tolist()) == sorted(occupied[:, 0].tolist())
-        rows = np.round(-centers[~in_air, 1] * 80.0 + 29.5)  # of the floor, 1 m below the camera
-        assert len(rows) > 20
-        assert (rows % 3 == 0).all()
-        assert ((rows // 3) % 2 == half).all()
+    centers = gap_seeds([(seen, seen.depth > 0)], occupied, 0.02, bare, CONFIG, half=half).centers
+    in_air = centers[:, 2] > 0.2
+    assert sorted(centers[in_air, 0].tolist()) == sorted(occupied[:, 0].tolist())
+    rows = np.round(-centers[~in_air, 1] * 80.0 + 29.5)  # of the floor, 1 m below the camera
+    assert len(rows) > 20 and (rows % 6 == 3 * half).all()
 
 
 def test_more_pixels_than_are_looked_at_together_are_thinned_in_each_view(monkeypatch: pytest.MonkeyPatch) -> None:
     masks = [np.ones((60, 80), bool), np.zeros((60, 80), bool), np.eye(60, 80) > 0]
-    assert thinning(masks) == 1
-    assert thinned(masks[0], 1) is masks[0]
+    assert thinning(masks) == 1 and thinned(masks[0], 1) is masks[0]
     monkeypatch.setattr("splatctrl_cli.scene.seeding.SEED_MOST_PIXELS", 1000)
-    every = thinning(masks)
-    kept = [int(thinned(mask, every).sum()) for mask in masks]
-    assert every == 5
-    assert kept == [960, 0, 12]
-    assert not (thinned(masks[2], every) & ~masks[2]).any()
-
-
-def test_cubes_are_counted_as_they_are_made() -> None:
-    points = np.random.default_rng(0).uniform(-1, 1, (5000, 3)).astype(np.float32)
-    for edge in (0.05, 0.31, 3.0):
-        assert len(Cubes(points, edge, 2)) == len(cube_levels(points, points, edge, 1)[0].points)
-    assert len(Cubes(points[:0], 0.1, 2)) == 0
+    assert thinning(masks) == 5
+    assert [int(thinned(mask, 5).sum()) for mask in masks] == [960, 0, 12]
+    assert not (thinned(masks[2], 5) & ~masks[2]).any()

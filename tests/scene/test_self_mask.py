@@ -9,7 +9,7 @@ import trimesh
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame, UInt8
+from splatctrl_cli.records import Box, Float64, Intrinsics, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.posture import RobotPosture
@@ -40,8 +40,13 @@ def ball_depth(center: Float64 = CENTER, radius: float = RADIUS, k: Intrinsics =
     return np.where(root > 0, (b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
 
 
-def frame(depth: Float64) -> RgbdFrame:
-    return plain_frame(np.minimum(depth, FLOOR), K, stamp_ns=5)
+def frame(depth: Float64, k: Intrinsics = K) -> RgbdFrame:
+    return plain_frame(np.minimum(depth, FLOOR), k, stamp_ns=5)
+
+
+def masked(depth: Float64, posture: RobotPosture | None = None, k: Intrinsics = K) -> SelfMask:
+    """Of one frame alone."""
+    return self_mask(frame(depth, k), posture or robot(), CONFIG)
 
 
 def robot(*, by_spheres: bool = False, extra: float = 0.0) -> RobotPosture:
@@ -64,9 +69,8 @@ def kinds(
     config: OccupancyConfig = CONFIG,
 ) -> UInt8:
     """Settled by the depths of other frames."""
-    (view, mask), *beside = [
-        (view, self_mask(view, posture or robot(), config)) for view in (frame(each) for each in (depth, *others))
-    ]
+    views = [frame(each) for each in (depth, *others)]
+    (view, mask), *beside = [(view, self_mask(view, posture or robot(), config)) for view in views]
     return settled(view, mask, beside, config).kinds
 
 
@@ -74,16 +78,15 @@ SHOWN = np.isfinite(ball_depth())
 
 
 def test_the_robot_is_what_its_surface_explains_and_the_floor_is_not() -> None:
-    found = kinds(ball_depth())
-    assert (found[SHOWN] == PixelKind.ROBOT).all()
-    assert (found[~SHOWN] == PixelKind.OBJECT).all()
+    assert (kinds(ball_depth()) == np.where(SHOWN, PixelKind.ROBOT, PixelKind.OBJECT)).all()
+    behind = masked(np.full(SHOWN.shape, FLOOR))  # what is seen behind the robot is not inside it
+    assert behind.num_inside == {} and (behind.kinds == PixelKind.OBJECT).all()
 
 
-def test_noise_and_calibration_within_the_stated_tolerance_are_still_the_robot() -> None:
+@pytest.mark.parametrize("offset", [-0.9 * TOLERANCE, 0.9 * TOLERANCE])
+def test_noise_and_calibration_within_the_stated_tolerance_are_still_the_robot(offset: float) -> None:
     noise = np.random.default_rng(0).normal(0.0, CONFIG.depth_error, SHOWN.shape)
-    for offset in (-TOLERANCE, TOLERANCE):
-        found = kinds(ball_depth() + 0.9 * offset + noise)
-        assert (found[SHOWN] == PixelKind.ROBOT).mean() > 0.98
+    assert (kinds(ball_depth() + offset + noise)[SHOWN] == PixelKind.ROBOT).mean() > 0.98
 
 
 @pytest.mark.parametrize("gap", [0.012, 0.03, 0.2])
@@ -95,39 +98,33 @@ def test_what_stands_before_the_robot_is_an_object_however_near(gap: float) -> N
 
 def test_what_touches_the_robot_from_the_side_is_an_object() -> None:
     beside = ball_depth(CENTER + np.array([0.15, 0.0, 0.0]), 0.05)
-    found = kinds(np.minimum(ball_depth(), beside))
     is_beside = np.isfinite(beside) & ~SHOWN
-    assert is_beside.sum() > 150
-    assert (found[is_beside] == PixelKind.OBJECT).mean() > 0.9
+    found = kinds(np.minimum(ball_depth(), beside))[is_beside]
+    assert len(found) > 150 and (found == PixelKind.OBJECT).mean() > 0.9
 
 
 def test_an_outline_that_is_off_by_the_tolerance_leaves_no_rim_of_objects() -> None:
     shifted = ball_depth(CENTER + np.array([0.8 * TOLERANCE, 0.0, 0.0]))
-    found = kinds(shifted)
-    assert not (found[np.isfinite(shifted)] == PixelKind.OBJECT).any()
-    assert (found[np.isfinite(shifted)] == PixelKind.ROBOT).mean() > 0.98
+    found = kinds(shifted)[np.isfinite(shifted)]
+    assert not (found == PixelKind.OBJECT).any() and (found == PixelKind.ROBOT).mean() > 0.98
 
 
 def test_a_depth_between_the_robot_and_the_floor_at_its_outline_is_mixed_and_left_out() -> None:
-    depth = np.minimum(ball_depth(), FLOOR)
-    edge = SHOWN & ~np.roll(SHOWN, 1, axis=1)  # the left rim
+    depth, edge = np.minimum(ball_depth(), FLOOR), SHOWN & ~np.roll(SHOWN, 1, axis=1)  # the left rim
     depth[edge] = 1.08
-    view = frame(depth)
-    mask = self_mask(view, robot(), CONFIG)
+    mask = masked(depth)
     assert (mask.kinds[edge] == PixelKind.MIXED).all()
-    assert not without(view, mask, PixelKind.MIXED).depth[edge].any()
-    assert without(view, mask, PixelKind.MIXED).depth[~SHOWN].all()
+    left = without(frame(depth), mask, PixelKind.MIXED).depth
+    assert not left[edge].any() and left[~SHOWN].all()
 
 
 def test_an_outline_just_outside_of_the_image_has_its_fat_edge_inside() -> None:
     right = K.fx * RADIUS / np.sqrt(CENTER[2] ** 2 - RADIUS**2)  # pixels from the ball's centre to its outline
-    k = replace(K, cx=-1.5 - right)
+    k, depth = replace(K, cx=-1.5 - right), np.full(SHOWN.shape, FLOOR)
     assert not np.isfinite(ball_depth(k=k)).any()
-    depth = np.full((k.height, k.width), FLOOR)
     depth[57:63, :2] = CENTER[2]
-    found = self_mask(plain_frame(depth, k, stamp_ns=5), robot(), CONFIG).kinds
-    assert not (found[57:63, :2] == PixelKind.OBJECT).any()
-    assert (found[:, 4:] == PixelKind.OBJECT).all()
+    found = masked(depth, k=k).kinds
+    assert not (found[57:63, :2] == PixelKind.OBJECT).any() and (found[:, 4:] == PixelKind.OBJECT).all()
 
 
 @pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
@@ -143,50 +140,52 @@ def test_what_is_behind_the_outline_counts_where_it_shows_beyond_the_width_of_an
 
 def test_depths_that_lie_between_the_robot_and_what_is_behind_are_no_part_of_either() -> None:
     """As a laser returns them at an outline, each another one, beside a surface that goes on."""
-    depth = np.minimum(ball_depth(), FLOOR)
-    rim = SHOWN ^ np.isfinite(ball_depth(radius=RADIUS + 0.006))
+    depth, rim = np.minimum(ball_depth(), FLOOR), SHOWN ^ np.isfinite(ball_depth(radius=RADIUS + 0.006))
     depth[rim] = 0.93 + 0.22 * np.random.default_rng(0).random(rim.sum())
     found = kinds(depth)[rim]
     assert (found == PixelKind.MIXED).mean() > 0.8
-    is_kept = found == PixelKind.OBJECT
-    assert (depth[rim][is_kept] > FLOOR - 0.06).all()  # as near to the floor as neighbours of one surface may be
+    kept = depth[rim][found == PixelKind.OBJECT]
+    assert (kept > FLOOR - 0.06).all()  # as near to the floor as neighbours of one surface may be
+
+
+WIDE = Intrinsics(fx=640.0, fy=640.0, cx=319.5, cy=239.5, width=640, height=480)
+
+
+def before_a_wide_floor() -> tuple[Float64, int]:
+    """Depth (H, W) of the ball and the floor, and the ball's first column in its middle row."""
+    depth = np.minimum(ball_depth(k=WIDE), FLOOR)
+    return depth, int(np.argmax(depth[240] < FLOOR))
 
 
 @pytest.mark.parametrize("before", [0.02, 0.05])
 def test_a_rod_that_goes_on_beyond_the_outline_is_an_object_up_to_it(before: float) -> None:
     """6 mm thick, before a floor with the sensor's noise: the plane beside the outline takes none of it."""
-    wide = Intrinsics(fx=640.0, fy=640.0, cx=319.5, cy=239.5, width=640, height=480)
-    depth = np.minimum(ball_depth(k=wide), FLOOR)
-    left = int(np.argmax(depth[240] < FLOOR))
+    depth, left = before_a_wide_floor()
     depth[239:242, left - 60 : left] = FLOOR - before
     noise = np.random.default_rng(0).normal(0.0, CONFIG.depth_error, depth.shape)
-    mask = self_mask(plain_frame(depth + noise * depth**2, wide, stamp_ns=5), robot(), CONFIG)
+    mask = self_mask(plain_frame(depth + noise * depth**2, WIDE, stamp_ns=5), robot(), CONFIG)
     assert (mask.kinds[239:242, left - 60 : left - 1] == PixelKind.OBJECT).mean() > 0.97
 
 
 @pytest.mark.parametrize("lift", [0.017, 0.0])
 def test_pixels_on_the_outline_that_lead_from_the_robot_down_to_the_floor_are_no_part_of_it(lift: float) -> None:
-    wide = Intrinsics(fx=640.0, fy=640.0, cx=319.5, cy=239.5, width=640, height=480)
-    depth = np.minimum(ball_depth(k=wide), FLOOR)
-    left = int(np.argmax(depth[240] < FLOOR)) - 1
-    depth[239, left], depth[240, left] = FLOOR - 2.0 * lift, FLOOR - lift  # 17 mm from one to the next
-    view = plain_frame(depth, wide, stamp_ns=5)
-    mask = self_mask(view, robot(), CONFIG)
-    kind = PixelKind.MIXED if lift else PixelKind.OBJECT
-    assert mask.kinds[239:241, left].tolist() == [kind, kind]
-    assert (mask.kinds == PixelKind.MIXED).sum() == (2 if lift else 0)
+    """17 mm from one to the next."""
+    depth, first = before_a_wide_floor()
+    depth[239:241, first - 1] = FLOOR - 2.0 * lift, FLOOR - lift
+    found = masked(depth, k=WIDE).kinds
+    assert (found[239:241, first - 1] == (PixelKind.MIXED if lift else PixelKind.OBJECT)).all()
+    assert (found == PixelKind.MIXED).sum() == (2 if lift else 0)
 
 
 @pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
 def test_less_than_fifty_square_millimetres_before_the_robot_are_noise(columns: int, kind: PixelKind) -> None:
-    depth = ball_depth()
-    depth[60, 79 : 79 + columns] += [0.012, -0.012, -0.012][columns - 1]
-    found = kinds(depth)
-    assert (found[60, 79 : 79 + columns] == kind).all()
-    assert (found[SHOWN] == PixelKind.ROBOT).sum() == SHOWN.sum() - columns
-    depth = np.full(SHOWN.shape, FLOOR)
+    """Beside the robot it may be all that is seen of a thing."""
+    depth, piece = ball_depth(), np.s_[60, 79 : 79 + columns]
+    depth[piece] += [0.012, -0.012, -0.012][columns - 1]
     depth[20, 20] = 0.8
-    assert kinds(depth)[20, 20] == PixelKind.OBJECT  # beside the robot it may be all that is seen of a thing
+    found = kinds(depth)
+    assert (found[piece] == kind).all() and found[20, 20] == PixelKind.OBJECT
+    assert (found[SHOWN] == PixelKind.ROBOT).sum() == SHOWN.sum() - columns
 
 
 @pytest.mark.parametrize(("side", "gap", "earlier", "kind"), [
@@ -195,10 +194,9 @@ def test_less_than_fifty_square_millimetres_before_the_robot_are_noise(columns: 
 def test_a_little_before_the_robot_counts_where_another_frame_measured_it_too(
     side: int, gap: float, earlier: float, kind: PixelKind
 ) -> None:
-    now, before = ball_depth(), ball_depth()
-    now[60 : 60 + side, 79 : 79 + side] -= gap
-    before[60 : 60 + side, 79 : 79 + side] -= earlier
-    piece = slice(60, 60 + side), slice(79, 79 + side)
+    now, before, piece = ball_depth(), ball_depth(), np.s_[60 : 60 + side, 79 : 79 + side]
+    now[piece] -= gap
+    before[piece] -= earlier
     assert (kinds(now, others=[before])[piece] == kind).all()
     assert (kinds(now)[piece] == PixelKind.OBJECT).all()  # nothing that could have shown it
 
@@ -237,11 +235,10 @@ ROBOT, OBJECT = [PixelKind.ROBOT], [PixelKind.OBJECT]
 )
 def test_few_object_pixels_in_a_voxel_of_the_robot_are_outvoted(frames: list[list[int]], num_objects: int) -> None:
     seen = [shown(own) for own in frames]
-    found = voted(seen, np.array([0.0, 0.0, 1.0]), 0.1)
-    assert sum((mask.kinds == PixelKind.OBJECT).sum() for mask in found) == num_objects
-    lost = [(mask.kinds == PixelKind.MIXED) != ((own.kinds == PixelKind.OBJECT) & (num_objects == 0))
-            for mask, (_, own) in zip(found, seen, strict=True)]  # fmt: skip
-    assert not np.any(lost)
+    for mask, (_, own) in zip(voted(seen, np.array([0.0, 0.0, 1.0]), 0.1), seen, strict=True):
+        is_object = own.kinds == PixelKind.OBJECT
+        assert ((mask.kinds == PixelKind.OBJECT) == (is_object & (num_objects > 0))).all()
+        assert ((mask.kinds == PixelKind.MIXED) == (is_object & (num_objects == 0))).all()
 
 
 def test_the_robots_votes_count_in_their_own_voxel_alone() -> None:
@@ -256,13 +253,11 @@ def drawn() -> RobotPosture:
     return replace(robot(), surface=RobotSurface.from_parts([], [("arm", ball.triangles + CENTER)]))
 
 
-@pytest.mark.parametrize("posture", [robot(), drawn()])
-def test_what_is_seen_through_a_slit_is_robot_where_triangles_are_there(posture: RobotPosture) -> None:
+@pytest.mark.parametrize(("posture", "kind"), [(robot(), PixelKind.OBJECT), (drawn(), PixelKind.ROBOT)])
+def test_what_is_seen_through_a_slit_is_robot_where_triangles_are_there(posture: RobotPosture, kind: int) -> None:
     depth = ball_depth()
     depth[50:70, 79:82] = CENTER[2] + RADIUS - 0.01  # the inner side of the back
-    found = kinds(depth, posture)[52:68, 79:82]
-    has_triangles = posture.surface is not None and bool(posture.surface.trees)
-    assert (found == (PixelKind.ROBOT if has_triangles else PixelKind.OBJECT)).all()
+    assert (kinds(depth, posture)[52:68, 79:82] == kind).all()
 
 
 @pytest.mark.parametrize(("gap", "is_object"), [(0.012, False), (0.03, True)])
@@ -278,23 +273,14 @@ def test_before_a_mesh_what_noise_may_explain_is_evidence_of_nothing(gap: float,
 def test_points_inside_the_robot_are_counted_by_link_and_are_no_robot() -> None:
     depth = ball_depth()
     depth[55:65, 75:85] += 0.05
-    mask = self_mask(frame(depth), robot(), CONFIG)
-    assert (mask.kinds[55:65, 75:85] == PixelKind.OBJECT).all()
-    assert mask.num_inside == {"arm": 100}
-
-
-def test_what_is_seen_behind_the_robot_is_not_inside_it() -> None:
-    depth = np.full(SHOWN.shape, FLOOR)
-    mask = self_mask(frame(depth), robot(), CONFIG)
-    assert mask.num_inside == {}
-    assert (mask.kinds == PixelKind.OBJECT).all()
+    mask = masked(depth)
+    assert (mask.kinds[55:65, 75:85] == PixelKind.OBJECT).all() and mask.num_inside == {"arm": 100}
 
 
 @pytest.mark.parametrize("offset", [-0.02, -0.004, 0.004, 0.02])
 def test_the_residual_has_the_median_and_sign_of_the_offset(offset: float) -> None:
-    found = link_residuals([self_mask(frame(ball_depth() + offset), robot(), CONFIG)] * 2)["arm"]
-    assert found.median == pytest.approx(offset, abs=2e-4)
-    assert found.sign == np.sign(offset)
+    found = link_residuals([masked(ball_depth() + offset)] * 2)["arm"]
+    assert (found.median, found.sign) == (pytest.approx(offset, abs=2e-4), np.sign(offset))
     assert found.num_pixels > 2 * 500
 
 
@@ -302,61 +288,49 @@ def test_the_residual_has_the_median_and_sign_of_the_offset(offset: float) -> No
 def test_what_is_seen_far_before_or_behind_the_robot_says_nothing_of_its_residual(offset: float) -> None:
     depth = ball_depth()
     depth[:, :90] += offset  # most of the ball
-    found = link_residuals([self_mask(frame(depth), robot(), CONFIG)])["arm"]
-    assert found.median == pytest.approx(0.0, abs=2e-4)
+    assert link_residuals([masked(depth)])["arm"].median == pytest.approx(0.0, abs=2e-4)
 
 
 def test_a_link_is_told_apart_as_well_as_by_the_best_of_its_cameras() -> None:
     """Within 4 mm and two sigmas of the sensor's error at its depth, and nothing nearer."""
-    wide = replace(CONFIG, self_mask_tolerance=0.05)
-    masks = [self_mask(frame(ball_depth()), robot(), config) for config in (wide, CONFIG)]
+    coarse = replace(CONFIG, self_mask_tolerance=0.05)
+    masks = [self_mask(frame(ball_depth()), robot(), config) for config in (coarse, CONFIG)]
     depth = np.median(masks[0].robot_depth[masks[0].robot_depth > 0])
     want = CONFIG.self_mask_tolerance + 2 * CONFIG.depth_error * depth**2
-    assert masks[1].reach == pytest.approx(want, rel=0.01)
-    assert link_residuals(masks)["arm"].reach == masks[1].reach < masks[0].reach
+    assert masks[0].reach > link_residuals(masks)["arm"].reach == masks[1].reach == pytest.approx(want, rel=0.01)
     assert audited(masks)["self_mask"]["arm"]["reach_mm"] == pytest.approx(1e3 * want, rel=0.01)
 
 
-def test_spheres_that_stand_for_a_link_enclose_it() -> None:
+@pytest.mark.parametrize("extra", [0.0, 0.05])
+def test_spheres_that_stand_for_a_link_enclose_it(extra: float) -> None:
     """They may be larger than the link by any amount: what lies inside them is the robot."""
-    for extra in (0.0, 0.05):
-        found = kinds(ball_depth(), robot(by_spheres=True, extra=extra))
-        core = np.isfinite(ball_depth(radius=0.09))
-        assert (found[core] == PixelKind.ROBOT).all()
-    before = ball_depth()
+    before, posture = ball_depth(), robot(by_spheres=True, extra=extra)
+    assert (kinds(before, posture)[np.isfinite(ball_depth(radius=0.09))] == PixelKind.ROBOT).all()
     before[50:70, 70:90] -= 0.1
-    assert (kinds(before, robot(by_spheres=True))[50:70, 70:90] == PixelKind.OBJECT).all()
+    assert (kinds(before, posture)[50:70, 70:90] == PixelKind.OBJECT).all()
 
 
 def test_a_carried_box_is_the_robots() -> None:
-    depth: Float32 = np.minimum(ball_depth(), FLOOR).astype(np.float32)
+    """What it holds need not fill the box."""
+    depth, posture = np.minimum(ball_depth(), FLOOR), robot()
     depth[100:110, 70:90] = 1.0
-    posture = robot()
-    assert posture.surface is not None
-    assert (kinds(depth)[100:110, 70:90] == PixelKind.OBJECT).all()
-    held = Box(lower=np.array([-0.1, 0.2, 1.0]), upper=np.array([0.1, 0.4, 1.1]))
+    assert posture.surface is not None and (kinds(depth)[100:110, 70:90] == PixelKind.OBJECT).all()
     at_frame = {5: np.tile(np.eye(4), (2, 1, 1))}  # the link's pose, and the box's
-    holding = replace(posture, surface=posture.surface.with_boxes([("arm", held)]), T_world_surface=at_frame)
-    assert (kinds(depth, holding)[101:109, 71:89] == PixelKind.ROBOT).all()
-    larger = Box(lower=held.lower - [0.0, 0.0, 0.05], upper=held.upper)  # what it holds need not fill the box
-    holding = replace(holding, surface=posture.surface.with_boxes([("arm", larger)]))
-    assert (kinds(depth, holding)[101:109, 71:89] == PixelKind.ROBOT).all()
+    for near in (1.0, 0.95):
+        held = Box(lower=np.array([-0.1, 0.2, near]), upper=np.array([0.1, 0.4, 1.1]))
+        holding = replace(posture, surface=posture.surface.with_boxes([("arm", held)]), T_world_surface=at_frame)
+        assert (kinds(depth, holding)[101:109, 71:89] == PixelKind.ROBOT).all()
 
 
 def test_beside_a_nearer_link_depth_that_has_grown_over_a_link_is_not_its_residual() -> None:
     """Stereo gives the rim of what is behind the depth of what is before."""
     plates = (("near", (0.0, 0.0, 0.8)), ("far", (0.08, 0.0, 0.9)))
     solids = [Shape(link=link, kind="box", size=(0.1, 0.1, 0.01), T_link_shape=pose_at(at)) for link, at in plates]
-    posture = RobotPosture(
-        centers=CENTER[None],
-        radii=np.array([RADIUS]),
-        T_world_link=np.eye(4)[None],
-        surface=RobotSurface.from_parts(solids),
-        T_world_surface={5: np.tile(np.eye(4), (2, 1, 1))},
-    )
-    exact = self_mask(frame(np.full(SHOWN.shape, np.inf)), posture, CONFIG).robot_depth
+    at_frame = {5: np.tile(np.eye(4), (2, 1, 1))}
+    posture = replace(robot(), surface=RobotSurface.from_parts(solids), T_world_surface=at_frame)
+    exact = masked(np.full(SHOWN.shape, np.inf), posture).robot_depth
     depth = np.where(exact > 0, exact, FLOOR)
     left = int(np.flatnonzero((exact > 0.85).any(axis=0))[0])
     depth[:, left : left + 2] = np.where(exact[:, left : left + 2] > 0, 0.795, depth[:, left : left + 2])
-    found = self_mask(frame(depth), posture, CONFIG).residuals
+    found = masked(depth, posture).residuals
     assert len(found["far"]) > 20 and np.abs(found["far"]).max() < 1e-3

@@ -14,13 +14,10 @@ EVERY_NS = 100_000_000
 
 
 def frames(*depths: float, camera: str = "cam0") -> list[RgbdFrame]:
-    """Frames of one camera at 10 Hz. They differ in the depth [m] of one pixel, and all in colour."""
-    found = []
-    for number, depth in enumerate(depths):
-        seen = frame(stamp_ns=number * EVERY_NS, camera=camera)
-        seen.depth[0, 0] = depth
-        seen.color[:] = number  # live
-        found.append(seen)
+    """Frames of one camera at 10 Hz. They differ in the depth [m] of one pixel, and all in their live colour."""
+    found = [frame(stamp_ns=number * EVERY_NS, camera=camera) for number in range(len(depths))]
+    for number, seen in enumerate(found):
+        seen.depth[0, 0], seen.color[:] = depths[number], number
     return found
 
 

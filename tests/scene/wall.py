@@ -1,8 +1,10 @@
 """Frames with a known answer: cameras that look straight down at a textured floor, with an optional block on it."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.scene.buffer import Seeds
 from tests.plain import plain_frame
 
 INTRINSICS = Intrinsics(fx=80.0, fy=80.0, cx=39.0, cy=29.5, width=80, height=60)
@@ -42,3 +44,9 @@ def frame(
         color[is_block] = [0.9, 0.1, 0.1]
     T_world_camera, pixels = looking_down(x, y), (255 * color).round()
     return plain_frame(depth, INTRINSICS, T_world_camera, stamp_ns=stamp_ns, camera=camera, color=pixels)
+
+
+def plain_seeds(centers: ArrayLike, radius: float) -> Seeds:
+    """Black seeds of one radius."""
+    points = np.asarray(centers, np.float32).reshape(-1, 3)
+    return Seeds(centers=points, radii=np.full(len(points), radius, np.float32), colors=np.zeros_like(points))
