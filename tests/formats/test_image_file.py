@@ -16,6 +16,7 @@ from splatctrl_cli.formats import ply
 from splatctrl_cli.formats.image_file import ImageHead, decode_file, image_head, read_pfm
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.formats.ply import point_blocks
+from tests.refused import refused
 
 RNG = np.random.default_rng(3)
 COLOR = RNG.integers(0, 256, (7, 11, 3), dtype=np.uint8)
@@ -105,22 +106,17 @@ def test_pfm_of_either_byte_order_starts_at_the_bottom_row(tmp_path: Path, is_li
 )
 def test_damaged_pfm_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "a.pfm").write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        read_pfm(tmp_path / "a.pfm")
+    refused(message, read_pfm, tmp_path / "a.pfm")
 
 
 def test_files_that_are_no_mesh_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"gone.obj: expected a mesh, got no such file"):
-        load_mesh(tmp_path / "gone.obj")
+    refused(r"gone.obj: expected a mesh, got no such file", load_mesh, tmp_path / "gone.obj")
     (tmp_path / "words.stl").write_text("nothing of the kind")
-    with pytest.raises(InputError, match=r"words.stl: expected a mesh, got .*; give"):
-        load_mesh(tmp_path / "words.stl")
+    refused(r"words.stl: expected a mesh, got .*; give", load_mesh, tmp_path / "words.stl")
     (tmp_path / "cloud.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    with pytest.raises(InputError, match=r"cloud.obj: expected a mesh, got"):
-        load_mesh(tmp_path / "cloud.obj")
+    refused(r"cloud.obj: expected a mesh, got", load_mesh, tmp_path / "cloud.obj")
     (tmp_path / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    with pytest.raises(InputError, match=r"nan.obj: expected finite vertices"):
-        load_mesh(tmp_path / "nan.obj")
+    refused(r"nan.obj: expected finite vertices", load_mesh, tmp_path / "nan.obj")
 
 
 def points_in(text: str) -> list[list[float]]:
