@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pinocchio.rpy import rpyToMatrix
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.recording.log.registration import DepthToColor, Undistortion
 from splatctrl_cli.records import Intrinsics
+from tests.refused import refused
 
 SMALL = Intrinsics(fx=40, fy=40, cx=19.5, cy=14.5, width=40, height=30)
 LARGE = Intrinsics(fx=64, fy=64, cx=31.5, cy=23.5, width=64, height=48)
@@ -117,14 +117,24 @@ def test_where_a_polynomial_turns_back_nothing_is_shown_twice(
 
 
 def test_a_lens_that_saw_hardly_anything_is_refused() -> None:
-    with pytest.raises(InputError, match=r"the camera saw 0% of the pinhole's image, expected at least 25%"):
-        Undistortion(SMALL, "plumb_bob", np.array([-500.0, 0, 0, 0, 0]))
+    refused(
+        r"the camera saw 0% of the pinhole's image, expected at least 25%",
+        Undistortion,
+        SMALL,
+        "plumb_bob",
+        np.array([-500.0, 0, 0, 0, 0]),
+    )
 
 
 @pytest.mark.parametrize(("model", "counts"), [("plumb_bob", "4, 5, 8, 12, 14"), ("equidistant", "4")])
 def test_a_number_of_coefficients_that_no_model_has_is_refused(model: str, counts: str) -> None:
-    with pytest.raises(InputError, match=rf"{model}: expected {counts} coefficients, got 3; calibrate again"):
-        Undistortion(SMALL, model, np.array([0.01, 0, 0]))
+    refused(
+        rf"{model}: expected {counts} coefficients, got 3; calibrate again",
+        Undistortion,
+        SMALL,
+        model,
+        np.array([0.01, 0, 0]),
+    )
 
 
 def test_the_depth_cameras_own_lens_is_undone_before_its_depth_is_registered() -> None:
