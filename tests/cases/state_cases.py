@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
@@ -14,6 +14,7 @@ from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.cases.case import Case, Run
 from tests.recording.log.make_log import START_NS, T, encoded, header, write_raw
+from tests.refused import refused
 
 PERIOD_NS = 20_000_000
 State = tuple[int, str, Sequence[str], Float64, Float64]  # stamp [ns], topic, names, positions, velocities
@@ -85,8 +86,7 @@ def two_robots(folder: Path, out: Path, run: Run) -> None:
     topics = [f"/robot_{name}/joint_states" for name in "ab"]
     assert result.code == 1 and all(f"--joint-topic {topic}" in result.text for topic in topics)
     names = [f"joint{i}" for i in range(1, 8)]
-    with pytest.raises(InputError, match="both have joint1"):
-        open_states(path, SourceOptions(), names)
+    refused("both have joint1", open_states, path, SourceOptions(), names)
     a, b = (open_states(path, SourceOptions(joint_topic=topic), names).states for topic in topics)
     assert np.abs(a.position[:40] - b.position[:40]).max() > 0.1
 
@@ -168,8 +168,11 @@ def not_evaluable(folder: Path, out: Path, run: Run) -> None:
         "cannot start, or would be wrong: replay",
     )
     model = RobotModel.from_urdf(next(folder.glob("*.urdf")))
-    with pytest.raises(NotEvaluableError, match="two publishers take turns"):
-        open_states(next(folder.glob("*.mcap")), SourceOptions(), model.joint_names)
+    refused(
+        "two publishers take turns",
+        lambda: open_states(next(folder.glob("*.mcap")), SourceOptions(), model.joint_names),
+        error=NotEvaluableError,
+    )
 
 
 def mixed(*streams: Iterator[State]) -> Callable[[Path], None]:
@@ -198,8 +201,7 @@ def asks_for_urdf(folder: Path, out: Path, run: Run) -> None:
     """Two arms under prefixes fit one robot: nothing is guessed, and --lock is no remedy."""
     model = RobotModel.from_urdf(folder / "r.urdf")
     source = open_states(folder / "log.mcap", SourceOptions(), model.joint_names)
-    with pytest.raises(InputError, match=r"left_shoulder.*; give the URDF of the robot"):
-        model.joint_columns(source.joint_names)
+    refused(r"left_shoulder.*; give the URDF of the robot", model.joint_columns, source.joint_names)
 
 
 def swing(t: float) -> Sequence[float]:

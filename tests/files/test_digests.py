@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Parts, Stopwatch, part_digests, sha256, write_run
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.formats.splat.splats import read_ply, read_world_splats, write_ply
 from splatctrl_cli.jobs.replay.known_scene import from_grid
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
+from tests.refused import refused
 
 BOX = ("--box=-0.1,-0.1,-0.1,0.1,0.1,0.1", "--voxel", "0.02", "--no-report")
 
@@ -65,12 +65,10 @@ def test_a_file_that_was_changed_or_removed_is_refused_by_name(
 ) -> None:
     look(open_scene(scene))
     spoil(scene / name)
-    with pytest.raises(InputError, match=rf"{name}: was changed after it was written.*; make it again"):
-        look(open_scene(scene))
+    refused(rf"{name}: was changed after it was written.*; make it again", lambda: look(open_scene(scene)))
     if name != "splats.ply":  # without which it is no scene
         (scene / name).unlink()
-        with pytest.raises(InputError, match=f"{name}: missing; it was listed"):
-            look(open_scene(scene))
+        refused(f"{name}: missing; it was listed", lambda: look(open_scene(scene)))
 
 
 def test_only_what_is_opened_is_looked_at(scene: Path) -> None:
@@ -83,13 +81,14 @@ def test_a_table_emptied_or_reversed_is_refused_in_an_old_scene_too_where_it_can
     head, *rows = table.read_text().splitlines(keepends=True)
     for lines in ([head], [head, *rows[::-1]]):
         table.write_text("".join(lines))
-        with pytest.raises(InputError, match=r"snapshots.csv: was changed"):
-            open_scene(scene).snapshot_at(SECOND)
+        refused(r"snapshots.csv: was changed", lambda: open_scene(scene).snapshot_at(SECOND))
     run = json.loads((scene / "run.json").read_text())
     del run["parts"]
     (scene / "run.json").write_text(json.dumps(run))
-    with pytest.raises(InputError, match="stamp 1000000000 after 2000000000: expected stamps that ascend"):
-        open_scene(scene).snapshot_at(SECOND)
+    refused(
+        "stamp 1000000000 after 2000000000: expected stamps that ascend",
+        lambda: open_scene(scene).snapshot_at(SECOND),
+    )
 
 
 def test_a_scene_of_an_older_version_is_read_and_says_so(scene: Path) -> None:
@@ -105,14 +104,12 @@ def test_a_scene_of_an_older_version_is_read_and_says_so(scene: Path) -> None:
 def test_digests_that_are_none_are_named(scene: Path, parts: object) -> None:
     run = json.loads((scene / "run.json").read_text())
     (scene / "run.json").write_text(json.dumps({**run, "parts": parts}))
-    with pytest.raises(InputError, match=r"run.json: parts: expected digests"):
-        open_scene(scene).splats()
+    refused(r"run.json: parts: expected digests", lambda: open_scene(scene).splats())
 
 
 def test_a_file_that_run_json_does_not_know_is_no_part(scene: Path) -> None:
     (scene / "other.ply").write_bytes(b"x")
-    with pytest.raises(InputError, match=r"other.ply: not among the parts"):
-        Parts.beside(scene / "other.ply").checked(scene / "other.ply")
+    refused(r"other.ply: not among the parts", lambda: Parts.beside(scene / "other.ply").checked(scene / "other.ply"))
 
 
 def test_an_altered_field_is_refused_and_one_alone_is_read(scene: Path, tmp_path: Path) -> None:
@@ -127,8 +124,7 @@ def test_an_altered_field_is_refused_and_one_alone_is_read(scene: Path, tmp_path
     from_grid(field)
     spoil(field / "field.npz")
     for path in (field, field / "field.npz"):
-        with pytest.raises(InputError, match=r"field.npz: was changed"):
-            from_grid(path)
+        refused(r"field.npz: was changed", from_grid, path)
     assert main(["sdf-bake", str(scene), "--update", str(field), "-o", str(tmp_path / "new"), *BOX, "-q"]) == 4
 
 
@@ -144,9 +140,8 @@ def test_splats_in_other_units_or_another_frame_are_refused(
     for file in (folder / "splats.ply", folder / "snapshots" / "000000.ply"):
         file.write_bytes(path.read_bytes())
     as_written(folder)
-    for look in (SceneFolder.splats, lambda scene: scene.splats_at(0)):
-        with pytest.raises(InputError, match=f"comment '{key}: {value}'"):
-            look(open_scene(folder))
+    for look in (open_scene(folder).splats, lambda: open_scene(folder).splats_at(0)):
+        refused(f"comment '{key}: {value}'", look)
     assert read_ply(path)[1][key] == value  # who only copies or shows them may
 
 

@@ -13,6 +13,7 @@ import pytest
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.files import output
 from splatctrl_cli.files.output import check_can_be_written, output_path, partial_path, write_durably
+from tests.refused import refused
 
 
 def test_a_folder_appears_when_it_is_done(tmp_path: Path) -> None:
@@ -23,7 +24,7 @@ def test_a_folder_appears_when_it_is_done(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "a").read_text() == "1"
 
 
-def refused(path: Path, words: str, *, force: bool, is_folder: bool) -> None:
+def not_begun(path: Path, words: str, *, force: bool, is_folder: bool) -> None:
     """The output is not begun, and what is there stays as it is."""
     with pytest.raises(UsageError, match=words), output_path(path, force=force, is_folder=is_folder):
         pytest.fail("must not get here")
@@ -46,7 +47,7 @@ def test_what_must_not_be_replaced_is_refused_untouched(
     precious = tmp_path / there
     precious.parent.mkdir(parents=True, exist_ok=True)
     precious.write_text("mine")
-    refused(tmp_path / name, words, force=force, is_folder=is_folder)
+    not_begun(tmp_path / name, words, force=force, is_folder=is_folder)
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == [precious] and precious.read_text() == "mine"
 
 
@@ -70,7 +71,7 @@ def test_an_output_without_a_name_of_its_own_is_refused(
 ) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    refused(Path(name), "has no name of its own", force=force, is_folder=True)
+    not_begun(Path(name), "has no name of its own", force=force, is_folder=True)
     assert [p.name for p in tmp_path.rglob("*")] == ["here"]
 
 
@@ -279,8 +280,8 @@ def test_a_link_to_nothing_yet_leads_to_the_output(tmp_path: Path) -> None:
 
 def test_a_link_to_itself_and_a_place_of_a_disk_are_refused(tmp_path: Path) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    refused(tmp_path / "loop", "is a link to itself", force=True, is_folder=True)
-    refused(Path("/proc"), r"/proc: .*", force=True, is_folder=True)
+    not_begun(tmp_path / "loop", "is a link to itself", force=True, is_folder=True)
+    not_begun(Path("/proc"), r"/proc: .*", force=True, is_folder=True)
 
 
 def test_whether_an_output_can_be_written_is_known_without_trying(
@@ -288,9 +289,7 @@ def test_whether_an_output_can_be_written_is_known_without_trying(
 ) -> None:
     (tmp_path / "file").write_text("x")
     check_can_be_written(tmp_path / "a" / "b" / "c")
-    with pytest.raises(UsageError, match="file is no folder"):
-        check_can_be_written(tmp_path / "file" / "a" / "b")
+    refused("file is no folder", check_can_be_written, tmp_path / "file" / "a" / "b", error=UsageError)
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    with pytest.raises(UsageError, match="is read-only"):
-        check_can_be_written(tmp_path / "a" / "b" / "c")
+    refused("is read-only", check_can_be_written, tmp_path / "a" / "b" / "c", error=UsageError)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -16,6 +16,7 @@ from splatctrl_cli.records import Label
 from splatctrl_cli.voxels import SWEPT
 from tests.plain import known, plain_grid, plain_splats
 from tests.recording.log.make_log import LogRecipe, make_log
+from tests.refused import refused
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
@@ -160,14 +161,12 @@ def test_a_robot_without_joints_is_said_to_look_like_a_xacro(tmp_path: Path) -> 
 def test_a_urdf_that_declares_entities_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
     path.write_text('<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>')
-    with pytest.raises(InputError, match="not readable XML"):
-        describe(path)
+    refused("not readable XML", describe, path)
 
 
 @pytest.mark.parametrize("name", ["nothing.mcap", "none/"])
 def test_what_is_not_there_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="no such file or folder"):
-        describe(tmp_path / name)
+    refused("no such file or folder", describe, tmp_path / name)
 
 
 @pytest.mark.parametrize(

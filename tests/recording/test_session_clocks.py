@@ -17,6 +17,7 @@ from splatctrl_cli.records import JointState
 from tests.recording.container.test_log_formats import assert_same
 from tests.recording.log import make_log as maker
 from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, broken_log, camera_x, frames_of, make_log
+from tests.refused import refused
 
 Message = tuple[int, str, str, Any]
 
@@ -96,8 +97,7 @@ def test_files_of_the_same_name_have_digests_of_their_own(tmp_path: Path) -> Non
 def test_what_is_no_log_is_not_read_beside_one(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap")
     (tmp_path / "images.toml").write_text("")
-    with pytest.raises(InputError, match=r"images.toml: expected a log beside others, got none"):
-        open_session([log, tmp_path / "images.toml"])
+    refused(r"images.toml: expected a log beside others, got none", open_session, [log, tmp_path / "images.toml"])
 
 
 def test_sim_time_in_the_headers_pairs_and_poses_as_any_clock(tmp_path: Path) -> None:
@@ -127,8 +127,7 @@ def test_headers_without_stamps_ask_for_the_times_of_logging(tmp_path: Path) -> 
         return [message]
 
     log = make_part(tmp_path / "log.mcap", LogRecipe(), unset)
-    with pytest.raises(InputError, match=r"expected stamps, got 0 in all 5 headers; give --stamps log"):
-        open_source(log)
+    refused(r"expected stamps, got 0 in all 5 headers; give --stamps log", open_source, log)
     assert len(frames_of(open_source(log, SourceOptions(stamps="log")))) == 5
 
 
@@ -186,10 +185,7 @@ def test_images_that_are_video_do_not_decode_and_are_named(tmp_path: Path) -> No
         return [message]
 
     log = make_part(tmp_path / "log.mcap", LogRecipe(), as_video)
-    with pytest.raises(
-        InputError, match=r"no image of /cam0/.*/compressed can be decoded \(compressed image \(h264\)"
-    ):
-        open_source(log)
+    refused(r"no image of /cam0/.*/compressed can be decoded \(compressed image \(h264\)", open_source, log)
 
 
 def test_images_that_did_not_come_are_counted(tmp_path: Path) -> None:
@@ -234,7 +230,7 @@ def test_a_static_transform_that_changes_is_noted(tmp_path: Path) -> None:
     def moved(message: Message) -> list[Message]:
         if message[1] != "/tf_static":
             return [message]
-        other = maker._LogWriter._transform(START_NS, "cam0_link", "cam0_optical", (0.0, 0.0, 0.7))
+        other = maker.transform(START_NS, "cam0_link", "cam0_optical", (0.0, 0.0, 0.7))
         return [message, (message[0] + 1, message[1], message[2], maker.T[message[2]](transforms=[other]))]
 
     source = open_source(make_part(tmp_path / "log.mcap", LogRecipe(), moved))

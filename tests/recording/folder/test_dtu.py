@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, project
@@ -19,6 +19,7 @@ from splatctrl_cli.recording.folder.idr import decompose, projection, read_idr, 
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Intrinsics
 from tests.recording.log.make_log import frames_of
+from tests.refused import refused
 
 K = Intrinsics(fx=61.0, fy=62.0, cx=32.5, cy=23.0, width=64, height=48)
 IMAGES, DEPTHS = "Rectified/scan7_train", "Depths_raw/scan7"
@@ -82,14 +83,15 @@ def test_a_written_scan_reads_back(scan: Path, idr: Path, layout: str) -> None:
     assert (source.layout, source.has_clock, source.joint_names, source.cameras) == (layout, False, (), ("camera",))
     assert len(source.digests()) == (16 if layout == "MVSNet" else 13), "camera, image, depth, what it shows, or mask"
     assert read(root, "scan7").name == "scan7"
-    with pytest.raises(InputError, match="no scan 'scan9'; give --scan, one of: scan7"):
-        read(root, "scan9")
+    refused("no scan 'scan9'; give --scan, one of: scan7", read, root, "scan9")
 
 
 @pytest.mark.parametrize("layout", ["scan", "idr"])
 def test_a_scan_that_is_given_as_a_recording_names_its_option(request: pytest.FixtureRequest, layout: str) -> None:
-    with pytest.raises(InputError, match=r"a DTU data set, .*; give it as --dtu \(in a suite dtu = "):
-        open_source(request.getfixturevalue(layout))
+    refused(
+        r"a DTU data set, .*; give it as --dtu \(in a suite dtu = ",
+        lambda: open_source(request.getfixturevalue(layout)),
+    )
 
 
 def test_camera_files_hold_world_to_camera_in_millimetres_and_pairs_the_nearest_first(scan: Path) -> None:
@@ -195,8 +197,7 @@ def test_lengths_that_are_no_millimetres_are_told_by_the_depth_and_the_cameras(
     moved = np.array([*[[1.0, 1.0, 1.0, 1 / cameras]] * 3, [1.0] * 4])
     views = [replace(v, depth=v.depth / np.float32(depth), T_world_camera=v.T_world_camera * moved) for v in VIEWS]
     write_dtu(tmp_path, "scan7", views)
-    with pytest.raises(InputError, match=message):
-        read_dtu(tmp_path)
+    refused(message, read_dtu, tmp_path)
 
 
 def replaced(path: Path, old: str, new: str) -> None:
@@ -232,8 +233,7 @@ def replaced(path: Path, old: str, new: str) -> None:
 )
 def test_damage_of_a_scan_of_mvsnet_is_named(scan: Path, damage: Damage, message: str) -> None:
     damage(scan)
-    with pytest.raises(InputError, match=message):
-        read_dtu(scan)
+    refused(message, read_dtu, scan)
 
 
 def in_unit_sphere(folder: Path) -> None:
@@ -264,8 +264,7 @@ def in_unit_sphere(folder: Path) -> None:
 )
 def test_damage_of_a_scan_of_idr_is_named(idr: Path, damage: Damage, message: str) -> None:
     damage(idr)
-    with pytest.raises(InputError, match=message):
-        read_idr(idr.parent)
+    refused(message, read_idr, idr.parent)
 
 
 @pytest.mark.parametrize("scale", [1.0, -1.0, 0.37, -250.0])
@@ -274,8 +273,12 @@ def test_a_projection_of_any_scale_gives_the_camera_back(scale: float) -> None:
     np.testing.assert_allclose(matrix, [[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1]], atol=1e-9)
     np.testing.assert_allclose(T_world_camera, VIEWS[1].T_world_camera, atol=1e-12)
     assert np.linalg.det(T_world_camera[:3, :3]) == pytest.approx(1.0)
-    with pytest.raises(InputError, match=r"world_mat_2: expected a camera's projection, got a matrix that cannot be"):
-        decompose(np.ones((3, 4)), "world_mat_2")
+    refused(
+        r"world_mat_2: expected a camera's projection, got a matrix that cannot be",
+        decompose,
+        np.ones((3, 4)),
+        "world_mat_2",
+    )
 
 
 def test_a_missing_image_leaves_the_others_their_cameras_and_masks(idr: Path) -> None:
@@ -296,12 +299,9 @@ def test_without_depth_a_view_of_idr_stays_and_depth_maps_may_lie_elsewhere(tmp_
     assert len(frames_of(source)) == 4
     assert source.loss.notes[0] == "000000.png: without depth"
     assert DtuSource(tmp_path / "plain", depths=scan / DEPTHS).has_depth
-    with pytest.raises(InputError, match=r"nowhere: expected depth_map_0000.pfm"):
-        DtuSource(tmp_path / "plain", depths=tmp_path / "nowhere")
-    with pytest.raises(UsageError, match=r"--depths .*: MVSNet's layout has its own"):
-        DtuSource(scan, depths=tmp_path)
-    with pytest.raises(UsageError, match=r"--masks .*: IDR's layout has its own"):
-        DtuSource(tmp_path / "plain", masks=tmp_path)
+    refused(r"nowhere: expected depth_map_0000.pfm", DtuSource, tmp_path / "plain", depths=tmp_path / "nowhere")
+    refused(r"--depths .*: MVSNet's layout has its own", DtuSource, scan, depths=tmp_path, error=UsageError)
+    refused(r"--masks .*: IDR's layout has its own", DtuSource, tmp_path / "plain", masks=tmp_path, error=UsageError)
 
 
 def test_held_out_views_are_a_camera_of_their_own_and_stamps_are_view_numbers(scan: Path) -> None:
@@ -318,17 +318,13 @@ def test_a_view_of_mvsnet_without_depth_is_left_out_and_the_others_keep_their_nu
     assert places(source) == [("camera", 0), ("holdout", 2), ("camera", 3)]
     assert source.loss.unpaired_color == 1
     assert source.loss.notes == ["rect_002_3_r5000.png: without depth, left out"]
-    with pytest.raises(UsageError, match=r"--holdout 1: .* has no such view; views: 0, 2, 3"):
-        DtuSource(scan, None, [1])
+    refused(r"--holdout 1: .* has no such view; views: 0, 2, 3", DtuSource, scan, None, [1], error=UsageError)
 
 
 def test_a_split_that_cannot_be_is_refused(scan: Path) -> None:
-    with pytest.raises(UsageError, match=r"--holdout 4: .* has no such view; views: 0 to 3"):
-        DtuSource(scan, None, [0, 4])
-    with pytest.raises(UsageError, match=r"all 4 views of .* are held out"):
-        DtuSource(scan, None, range(4))
-    with pytest.raises(UsageError, match="expected view numbers such as 2,5, got 'two'"):
-        view_numbers(["2", "two"])
+    refused(r"--holdout 4: .* has no such view; views: 0 to 3", DtuSource, scan, None, [0, 4], error=UsageError)
+    refused(r"all 4 views of .* are held out", DtuSource, scan, None, range(4), error=UsageError)
+    refused("expected view numbers such as 2,5, got 'two'", view_numbers, ["2", "two"], error=UsageError)
 
 
 def test_a_view_made_smaller_sees_the_same_points_at_the_same_places() -> None:
@@ -344,8 +340,7 @@ def test_a_view_made_smaller_sees_the_same_points_at_the_same_places() -> None:
     point = np.column_stack([(center_of_patch - [K.cx, K.cy]) / [K.fx, K.fy], [1.0]])
     np.testing.assert_allclose(project(full.intrinsics, point), center_of_patch)
     np.testing.assert_allclose(project(small.intrinsics, point), [[5.0, 2.0]])
-    with pytest.raises(UsageError, match="--downscale 5: expected a whole factor of 64x48"):
-        shrunk(full, 5)
+    refused("--downscale 5: expected a whole factor of 64x48", shrunk, full, 5, error=UsageError)
 
 
 def test_a_protocol_makes_images_as_small_as_its_published_figures_are_of(tmp_path: Path) -> None:
