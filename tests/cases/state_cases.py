@@ -7,17 +7,20 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.recording.log.decoder import JOINT_STATE
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
-from tests.cases.case import Case, Run
-from tests.recording.log.make_log import START_NS, T, encoded, header, write_raw
+from tests.cases.case import Case, Run, told
+from tests.recording.log.make_log import START_NS, built, encoded, header, write_raw
 from tests.refused import refused
 
 PERIOD_NS = 20_000_000
+
 State = tuple[int, str, Sequence[str], Float64, Float64]  # stamp [ns], topic, names, positions, velocities
+
 ARM = ("shoulder", "elbow")
 
 
@@ -43,13 +46,10 @@ def log(states: Iterator[State], joints: Sequence[tuple[str, str, str]] = ()) ->
     def make(folder: Path) -> None:
         messages = []
         for stamp, topic, names, position, velocity in kept:
-            content = T["sensor_msgs/msg/JointState"](
-                header=header(stamp, ""), name=list(names), position=position, velocity=velocity, effort=np.zeros(0)
-            )
+            content = built(JOINT_STATE, header=header(stamp), name=names, position=position, velocity=velocity)
             messages.append(encoded(stamp, topic, content))
         write_raw(folder / "log.mcap", messages)
-        chain = joints or [(name, "revolute", "") for name in ARM]
-        (folder / "r.urdf").write_text(urdf(chain), encoding="utf-8")
+        (folder / "r.urdf").write_text(urdf(joints or [(name, "revolute", "") for name in ARM]), encoding="utf-8")
 
     return make
 
@@ -82,9 +82,8 @@ def checked(folder: Path, run: Run, *words: str) -> None:
 def two_robots(folder: Path, out: Path, run: Run) -> None:
     """Refused with both topics; each can be chosen, and gives other positions."""
     path = sorted(folder.glob("*a-and-b.mcap"))[-1]
-    result = run(["check", path])
     topics = [f"/robot_{name}/joint_states" for name in "ab"]
-    assert result.code == 1 and all(f"--joint-topic {topic}" in result.text for topic in topics)
+    told(run, ["check", path], *(f"--joint-topic {topic}" for topic in topics), code=1)
     names = [f"joint{i}" for i in range(1, 8)]
     refused("both have joint1", open_states, path, SourceOptions(), names)
     a, b = (open_states(path, SourceOptions(joint_topic=topic), names).states for topic in topics)
@@ -213,8 +212,11 @@ FINGERS = (
     ("finger_joint", "prismatic", ""),
     ("right_finger_joint", "prismatic", '<mimic joint="finger_joint" multiplier="-0.5" offset="0.01"/>'),
 )
+
 LEFT = (("left_shoulder", "revolute", ""), ("left_elbow", "revolute", ""))
+
 BOTH = ("left_shoulder", "left_elbow", "right_shoulder", "right_elbow")
+
 LEADER = ("shoulder", "finger_joint")
 
 CASES: tuple[Case, ...] = (
