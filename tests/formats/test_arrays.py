@@ -68,15 +68,15 @@ def test_a_zip_of_a_later_version_is_no_fault_of_the_program(tmp_path: Path, nam
     content = bytearray(path.read_bytes())
     content[content.index(b"PK\x01\x02") + 6] = 255
     path.write_bytes(content)
-    refused(r"x.npz: not a readable .npz: zip file version 25.5", describe, path)
+    refused("x.npz: not a readable .npz: zip file version 25.5", describe, path)
 
 
 def test_arrays_that_are_missing_too_large_or_not_whole_raise(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     savez(path, {"a": np.arange(100.0), "b": np.arange(100.0)})
+    assert len(read_arrays(path, most=1600)) == 2
     with pytest.raises(ValueError, match=r"b: 800 bytes, expected at most 799"):
         read_arrays(path, most=1599)
-    assert len(read_arrays(path, most=1600)) == 2
     with pytest.raises(KeyError):
         read_arrays(path, ["c"], most=1600)
     np.savez(path, a=np.array([{}], dtype=object))
