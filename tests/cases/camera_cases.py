@@ -14,15 +14,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
-from tests.cases.case import Case, Run
-from tests.recording.log.make_log import START_NS, T, encoded, header, write_raw
+from tests.cases.case import Case, Run, told
+from tests.recording.log.make_log import START_NS, camera_info, encoded, frames_of, image, write_raw
 
 WIDTH, HEIGHT = 64, 48
+
 BARREL = (-0.25, 0.06, 0.0, 0.0, 0.0)
-INFO = T["sensor_msgs/msg/CameraInfo"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,14 +37,8 @@ class Lens:
         return np.array([[self.focal, 0, 31.5], [0, self.focal, 23.5], [0, 0, 1]])
 
     def info(self, stamp: int) -> Any:
-        P = np.zeros((3, 4))
-        P[:, :3] = self.K
-        roi = T["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        return INFO(
-            header=header(stamp, "optical"), height=HEIGHT, width=WIDTH, distortion_model=self.model,
-            d=np.array(self.D, dtype=np.float64), k=self.K.ravel(), r=np.eye(3).ravel(), p=P.ravel(), binning_x=0,
-            binning_y=0, roi=roi,
-        )  # fmt: skip
+        said = {"distortion_model": self.model, "d": self.D, "p": self.K @ np.eye(3, 4)}
+        return camera_info(stamp, "optical", (WIDTH, HEIGHT), (self.focal, self.focal, 31.5, 23.5), **said)
 
     def slopes(self) -> Float64:
         """x / z of each pixel of the image's middle row."""
@@ -76,6 +68,7 @@ class Box:
 
 
 BESIDE = Box(left=-0.49, right=-0.40, near=0.9, wall=1.2)
+
 AT_EDGE = Box(left=0.5, right=0.65, near=0.45, wall=0.6)
 
 
@@ -92,33 +85,17 @@ class Drawn:
 
     def __call__(self, folder: Path) -> None:
         messages = []
+        images = [(self.color_topic, self.color, 0), (self.depth_topic, self.depth or self.color, 1)]
+        images += [(topic, lens, 0) for topic, lens in self.further.items()]
+        infos = {topic.rpartition("/")[0]: lens for topic, lens, _ in reversed(images)}
         for index in range(4):
             stamp = START_NS + index * 100_000_000
-            depth = self.depth or self.color
-            images = [(self.color_topic, self.color, 0), (self.depth_topic, depth, 1)]
-            images += [(topic, lens, 0) for topic, lens in self.further.items()]
-            infos = {topic.rpartition("/")[0]: lens for topic, lens, _ in reversed(images)}
             for topic, lens, kind in images:
                 pixels = self.box.seen(lens)[kind]
                 pixels[0, index % WIDTH] = 0
-                messages.append(encoded(stamp, topic, image(stamp, pixels)))
+                messages.append(encoded(stamp, topic, image(stamp, "optical", ("rgb8", "16UC1")[kind], pixels)))
             messages += [encoded(stamp, f"{at}/camera_info", lens.info(stamp)) for at, lens in infos.items()]
         write_raw(folder / "log.mcap", messages)
-
-
-def image(stamp: int, pixels: np.ndarray[Any, Any], encoding: str = "") -> Any:
-    """A sensor_msgs/Image of rgb8 or 16UC1 pixels."""
-    data = np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8)
-    kind = encoding or ("rgb8" if pixels.ndim == 3 else "16UC1")
-    return T["sensor_msgs/msg/Image"](
-        header=header(stamp, "optical"), height=pixels.shape[0], width=pixels.shape[1], encoding=kind, is_bigendian=0,
-        step=data.size // pixels.shape[0], data=data,
-    )  # fmt: skip
-
-
-def frame_of(path: Path) -> RgbdFrame:
-    """The first frame of a capture or folder."""
-    return next(r for r in open_source(path, SourceOptions()).records() if isinstance(r, RgbdFrame))
 
 
 def box_x(frame: RgbdFrame, near: float) -> tuple[float, float]:
@@ -134,9 +111,8 @@ def ingested(folder: Path, out: Path, run: Run, *options: str) -> RgbdFrame:
     """The first frame of the log in a folder, as `ingest` keeps it."""
     log = next(folder.glob("*.mcap"))
     poses = ["--camera-pose", "cam=identity"] if log.name == "log.mcap" else []
-    result = run(["ingest", log, "-o", out / "capture", "--force", *poses, *options])
-    assert result.code == 0, result.text
-    return frame_of(out / "capture")
+    told(run, ["ingest", log, "-o", out / "capture", "--force", *poses, *options])
+    return frames_of(out / "capture")[0]
 
 
 def at(left: float, right: float, near: float, within: float) -> Callable[[Path, Path, Run], None]:
@@ -162,12 +138,9 @@ def both_at_the_box(folder: Path, out: Path, run: Run) -> None:
 
 def one_or_the_other(folder: Path, out: Path, run: Run) -> None:
     """Name and distortion contradict: refused with both remedies, each of which gives what it says."""
-    log = next(folder.glob("*.mcap"))
-    for command in (["ingest", log, "-o", out / "no"], ["check", log]):
-        result = run([*command, "--camera-pose", "cam=identity"])
-        assert result.code != 0 and "says rectified" in result.text and "/cam/color/camera_info" in result.text
-    refused = run(["ingest", log, "-o", out / "no", "--camera-pose", "cam=identity"])
-    flat, bent = re.findall(r"--intrinsics (cam=[-\d.,e]+)", refused.text)
+    named("says rectified", "/cam/color/camera_info")(folder, out, run)
+    words = ["ingest", next(folder.glob("*.mcap")), "-o", out / "no", "--camera-pose", "cam=identity"]
+    flat, bent = re.findall(r"--intrinsics (cam=[-\d.,e]+)", run(words).text)
     plain = box_x(ingested(folder, out, run, "--intrinsics", flat.rstrip(",")), 0.9)
     undone = box_x(ingested(folder, out, run, "--intrinsics", bent), 0.9)
     assert plain[0] > undone[0] + 0.03 and abs(undone[0] + 0.49) < 0.02
@@ -208,24 +181,20 @@ def write_transforms(**lens: Any) -> Callable[[Path], None]:
 
 def folder_at_edge(folder: Path, out: Path, run: Run) -> None:
     """The box of a folder is where it stands."""
-    result = run(["ingest", folder, "-o", out / "capture"])
-    assert result.code == 0, result.text
-    low, high = box_x(frame_of(out / "capture"), 0.45)
+    told(run, ["ingest", folder, "-o", out / "capture"])
+    low, high = box_x(frames_of(out / "capture")[0], 0.45)
     assert abs(low - 0.5) < 0.03 and abs(high - 0.65) < 0.03
 
 
 def folder_refused(*words: str) -> Callable[[Path, Path, Run], None]:
     """Refused by name."""
-
-    def examine(folder: Path, out: Path, run: Run) -> None:
-        result = run(["ingest", folder, "-o", out / "capture"])
-        assert result.code == 4 and all(word in result.text for word in words), result.text
-
-    return examine
+    return lambda folder, out, run: told(run, ["ingest", folder, "-o", out / "capture"], *words, code=4)
 
 
 ANGLES = Lens(focal=30.0, model="equidistant", D=(0.0, 0.0, 0.0, 0.0), bends=("equidistant", ()))
+
 BENT = Lens(D=BARREL, bends=("plumb_bob", BARREL))
+
 FLAT = Lens()
 
 CASES: tuple[Case, ...] = (

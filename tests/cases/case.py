@@ -50,3 +50,11 @@ def runner(capsys: pytest.CaptureFixture[str]) -> Run:
         return Result(code=code, out=out, err=err)
 
     return run
+
+
+def told(run: Run, words: Sequence[str | Path], *parts: str, code: int = 0) -> Result:
+    """What a call gives that ends with this code and says all these parts."""
+    result = run(words)
+    assert result.code == code, result.text
+    assert all(part in result.text for part in parts), result.text
+    return result

@@ -6,17 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.recording.log.decoder import JOINT_STATE
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
-from tests.cases.case import Case, Run
-from tests.recording.log.make_log import START_NS, T, encoded, header, write_raw
+from tests.cases.case import Case, Run, told
+from tests.recording.log.make_log import START_NS, built, encoded, header, write_raw
+from tests.refused import refused
 
 PERIOD_NS = 20_000_000
+
 State = tuple[int, str, Sequence[str], Float64, Float64]  # stamp [ns], topic, names, positions, velocities
+
 ARM = ("shoulder", "elbow")
 
 
@@ -42,13 +46,10 @@ def log(states: Iterator[State], joints: Sequence[tuple[str, str, str]] = ()) ->
     def make(folder: Path) -> None:
         messages = []
         for stamp, topic, names, position, velocity in kept:
-            content = T["sensor_msgs/msg/JointState"](
-                header=header(stamp, ""), name=list(names), position=position, velocity=velocity, effort=np.zeros(0)
-            )
+            content = built(JOINT_STATE, header=header(stamp), name=names, position=position, velocity=velocity)
             messages.append(encoded(stamp, topic, content))
         write_raw(folder / "log.mcap", messages)
-        chain = joints or [(name, "revolute", "") for name in ARM]
-        (folder / "r.urdf").write_text(urdf(chain), encoding="utf-8")
+        (folder / "r.urdf").write_text(urdf(joints or [(name, "revolute", "") for name in ARM]), encoding="utf-8")
 
     return make
 
@@ -81,12 +82,10 @@ def checked(folder: Path, run: Run, *words: str) -> None:
 def two_robots(folder: Path, out: Path, run: Run) -> None:
     """Refused with both topics; each can be chosen, and gives other positions."""
     path = sorted(folder.glob("*a-and-b.mcap"))[-1]
-    result = run(["check", path])
     topics = [f"/robot_{name}/joint_states" for name in "ab"]
-    assert result.code == 1 and all(f"--joint-topic {topic}" in result.text for topic in topics)
+    told(run, ["check", path], *(f"--joint-topic {topic}" for topic in topics), code=1)
     names = [f"joint{i}" for i in range(1, 8)]
-    with pytest.raises(InputError, match="both have joint1"):
-        open_states(path, SourceOptions(), names)
+    refused("both have joint1", open_states, path, SourceOptions(), names)
     a, b = (open_states(path, SourceOptions(joint_topic=topic), names).states for topic in topics)
     assert np.abs(a.position[:40] - b.position[:40]).max() > 0.1
 
@@ -168,8 +167,11 @@ def not_evaluable(folder: Path, out: Path, run: Run) -> None:
         "cannot start, or would be wrong: replay",
     )
     model = RobotModel.from_urdf(next(folder.glob("*.urdf")))
-    with pytest.raises(NotEvaluableError, match="two publishers take turns"):
-        open_states(next(folder.glob("*.mcap")), SourceOptions(), model.joint_names)
+    refused(
+        "two publishers take turns",
+        lambda: open_states(next(folder.glob("*.mcap")), SourceOptions(), model.joint_names),
+        error=NotEvaluableError,
+    )
 
 
 def mixed(*streams: Iterator[State]) -> Callable[[Path], None]:
@@ -198,8 +200,7 @@ def asks_for_urdf(folder: Path, out: Path, run: Run) -> None:
     """Two arms under prefixes fit one robot: nothing is guessed, and --lock is no remedy."""
     model = RobotModel.from_urdf(folder / "r.urdf")
     source = open_states(folder / "log.mcap", SourceOptions(), model.joint_names)
-    with pytest.raises(InputError, match=r"left_shoulder.*; give the URDF of the robot"):
-        model.joint_columns(source.joint_names)
+    refused(r"left_shoulder.*; give the URDF of the robot", model.joint_columns, source.joint_names)
 
 
 def swing(t: float) -> Sequence[float]:
@@ -211,8 +212,11 @@ FINGERS = (
     ("finger_joint", "prismatic", ""),
     ("right_finger_joint", "prismatic", '<mimic joint="finger_joint" multiplier="-0.5" offset="0.01"/>'),
 )
+
 LEFT = (("left_shoulder", "revolute", ""), ("left_elbow", "revolute", ""))
+
 BOTH = ("left_shoulder", "left_elbow", "right_shoulder", "right_elbow")
+
 LEADER = ("shoulder", "finger_joint")
 
 CASES: tuple[Case, ...] = (

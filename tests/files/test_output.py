@@ -13,17 +13,12 @@ import pytest
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.files import output
 from splatctrl_cli.files.output import check_can_be_written, output_path, partial_path, write_durably
+from tests.refused import refused
+
+FULL = OSError(28, "No space left on device", "a")
 
 
-def test_a_folder_appears_when_it_is_done(tmp_path: Path) -> None:
-    with output_path(tmp_path / "out", force=False, is_folder=True) as partial:
-        (partial / "a").write_text("1")
-        assert not (tmp_path / "out").exists()
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-    assert (tmp_path / "out" / "a").read_text() == "1"
-
-
-def refused(path: Path, words: str, *, force: bool, is_folder: bool) -> None:
+def not_begun(path: Path, words: str, *, force: bool, is_folder: bool) -> None:
     """The output is not begun, and what is there stays as it is."""
     with pytest.raises(UsageError, match=words), output_path(path, force=force, is_folder=is_folder):
         pytest.fail("must not get here")
@@ -46,21 +41,20 @@ def test_what_must_not_be_replaced_is_refused_untouched(
     precious = tmp_path / there
     precious.parent.mkdir(parents=True, exist_ok=True)
     precious.write_text("mine")
-    refused(tmp_path / name, words, force=force, is_folder=is_folder)
+    not_begun(tmp_path / name, words, force=force, is_folder=is_folder)
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == [precious] and precious.read_text() == "mine"
 
 
 @pytest.mark.parametrize("name", ["run.json", "capture.json", None])
 def test_force_replaces_a_folder_of_a_command_or_an_empty_one_whole(tmp_path: Path, name: str | None) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out.old").mkdir()
+    for folder in ("out", "out.old"):
+        (tmp_path / folder).mkdir()
     if name:
         (tmp_path / "out" / name).write_text("{}")
     with output_path(tmp_path / "out", force=True, is_folder=True) as partial:
         (partial / "new").write_text("y")
-        assert [p.name for p in (tmp_path / "out").iterdir()] == ([name] if name else [])
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["new"]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "out.old"]
+        assert names(tmp_path / "out") == ([name] if name else [])
+    assert (names(tmp_path / "out"), names(tmp_path)) == (["new"], ["out", "out.old"])
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -70,11 +64,8 @@ def test_an_output_without_a_name_of_its_own_is_refused(
 ) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    refused(Path(name), "has no name of its own", force=force, is_folder=True)
+    not_begun(Path(name), "has no name of its own", force=force, is_folder=True)
     assert [p.name for p in tmp_path.rglob("*")] == ["here"]
-
-
-FULL = OSError(28, "No space left on device", "a")
 
 
 def fails_as(error: BaseException) -> Callable[[Path], None]:
@@ -104,17 +95,11 @@ def test_a_failure_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_run_leaves_only_a_partial(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), output_path(tmp_path / "out", force=False, is_folder=True) as partial:
-        (partial / "a").write_text("1")
-        raise KeyboardInterrupt
-    assert [p.name for p in tmp_path.iterdir()] == ["out.partial"]
-
-
 @pytest.mark.parametrize(
     ("resume", "error", "is_kept"),
     [
         (False, FULL, True),
+        (False, KeyboardInterrupt(), True),
         (False, InputError("bad"), False),
         (False, ZeroDivisionError(), False),
         (True, FULL, True),
@@ -123,51 +108,35 @@ def test_an_interrupted_run_leaves_only_a_partial(tmp_path: Path) -> None:
     ],
 )
 def test_a_failure_leaves_what_a_run_can_go_on_from(
-    tmp_path: Path, resume: bool, error: Exception, is_kept: bool
+    tmp_path: Path, resume: bool, error: BaseException, is_kept: bool
 ) -> None:
     out, partial = tmp_path / "out", tmp_path / "out.partial"
+    checkpoint = "" if isinstance(error, KeyboardInterrupt) else "state"
     if resume:
         partial.mkdir()
         (partial / "state").write_text("1")
     with (
         pytest.raises(WriteError if error is FULL else type(error)),
-        output_path(out, force=False, is_folder=True, checkpoint="state", resume=resume) as folder,
+        output_path(out, force=False, is_folder=True, checkpoint=checkpoint, resume=resume) as folder,
     ):
         assert (folder / "state").exists() == resume
         (folder / "state").write_text("1")
         raise error
-    assert partial.exists() == is_kept
-
-
-def test_a_partial_without_a_checkpoint_is_begun_again(tmp_path: Path) -> None:
-    (tmp_path / "out.partial").mkdir()
-    (tmp_path / "out.partial" / "rest").write_text("1")
-    with output_path(tmp_path / "out", force=False, is_folder=True, checkpoint="state", resume=True) as folder:
-        assert not list(folder.iterdir())
-    assert (tmp_path / "out").is_dir()
-
-
-def test_what_a_killed_replacement_left_of_the_old_output_goes_with_the_next(tmp_path: Path) -> None:
-    (tmp_path / "out.partial.old").mkdir()
-    with output_path(tmp_path / "out", force=False, is_folder=True):
-        pass
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    assert names(tmp_path) == ["out.partial"] * is_kept
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "state"
-    write_durably(path, lambda p: p.write_text("old"))
 
     def half(p: Path) -> None:
         p.write_text("ne")
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(OSError, match="No space"):
-        write_durably(path, half)
-    assert path.read_text() == "old"
-    write_durably(path, lambda p: p.write_text("new"))
-    assert path.read_text() == "new"
-    assert [p.name for p in tmp_path.iterdir()] == ["state"]
+    for text in ("old", "new"):
+        write_durably(path, lambda p, text=text: p.write_text(text))
+        with pytest.raises(OSError, match="No space"):
+            write_durably(path, half)
+        assert (path.read_text(), names(tmp_path)) == (text, ["state"])
 
 
 HOLDER = """
@@ -209,7 +178,7 @@ def test_the_second_of_two_writers_is_refused_and_the_first_ends_well(
             pytest.fail("must not get here")
         first.communicate("\n")
         assert first.returncode == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert names(tmp_path) == ["out"]
     assert kind == "file" or (out / "state").read_text() == "half"
 
 
@@ -219,20 +188,11 @@ def test_a_killed_writer_leaves_no_lock_and_can_be_gone_on_from(tmp_path: Path, 
     with another_writer(out, kind) as first:
         first.send_signal(signal.SIGKILL)
         first.wait()
-    assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
+    assert names(tmp_path) == ["out.partial"]
     with output_path(out, force=False, is_folder=kind == "folder", checkpoint=checkpoint, resume=resume) as partial:
         assert (partial / "state").exists() == resume
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert names(tmp_path) == ["out"]
     assert not resume or (out / "state").read_text() == "half"
-
-
-def test_an_output_within_an_output_is_written(tmp_path: Path) -> None:
-    with (
-        output_path(tmp_path / "out", force=False, is_folder=True) as outer,
-        output_path(outer / "in", force=False, is_folder=True) as inner,
-    ):
-        (inner / "a").write_text("1")
-    assert (tmp_path / "out" / "in" / "a").read_text() == "1"
 
 
 def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,7 +209,7 @@ def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monke
     monkeypatch.setattr(output, "held", held_late)
     with pytest.raises(UsageError, match="already exists"), output_path(out, force=False, is_folder=True):
         pytest.fail("must not get here")
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert names(tmp_path) == ["out"]
 
 
 @pytest.mark.parametrize("is_folder", [True, False])
@@ -270,17 +230,10 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path: Path, is_folder
     assert sorted(path.name for path in tmp_path.rglob("re*")) == ["real"]
 
 
-def test_a_link_to_nothing_yet_leads_to_the_output(tmp_path: Path) -> None:
-    (tmp_path / "link").symlink_to(tmp_path / "disk" / "real")
-    with output_path(tmp_path / "link", force=False, is_folder=True) as partial:
-        (partial / "a").write_text("1")
-    assert (tmp_path / "disk" / "real" / "a").read_text() == "1" and (tmp_path / "link").is_symlink()
-
-
 def test_a_link_to_itself_and_a_place_of_a_disk_are_refused(tmp_path: Path) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    refused(tmp_path / "loop", "is a link to itself", force=True, is_folder=True)
-    refused(Path("/proc"), r"/proc: .*", force=True, is_folder=True)
+    not_begun(tmp_path / "loop", "is a link to itself", force=True, is_folder=True)
+    not_begun(Path("/proc"), r"/proc: .*", force=True, is_folder=True)
 
 
 def test_whether_an_output_can_be_written_is_known_without_trying(
@@ -288,9 +241,28 @@ def test_whether_an_output_can_be_written_is_known_without_trying(
 ) -> None:
     (tmp_path / "file").write_text("x")
     check_can_be_written(tmp_path / "a" / "b" / "c")
-    with pytest.raises(UsageError, match="file is no folder"):
-        check_can_be_written(tmp_path / "file" / "a" / "b")
+    refused("file is no folder", check_can_be_written, tmp_path / "file" / "a" / "b", error=UsageError)
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    with pytest.raises(UsageError, match="is read-only"):
-        check_can_be_written(tmp_path / "a" / "b" / "c")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    refused("is read-only", check_can_be_written, tmp_path / "a" / "b" / "c", error=UsageError)
+    assert names(tmp_path) == ["file"]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_a_folder_appears_when_it_is_done_within_another_output_or_behind_a_link(tmp_path: Path, link: bool) -> None:
+    (tmp_path / "out.partial.old").mkdir()  # which a killed replacement left
+    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / "rest").write_text("1")  # without a checkpoint: begun again
+    if link:
+        (tmp_path / "out").symlink_to(tmp_path / "disk" / "real")
+    with output_path(tmp_path / "out", force=False, is_folder=True, checkpoint="state", resume=not link) as partial:
+        assert not list(partial.iterdir())
+        (partial / "a").write_text("1")
+        with output_path(partial / "in", force=False, is_folder=True) as inner:
+            (inner / "b").write_text("2")
+        assert not (tmp_path / "out").exists()
+    assert (tmp_path / "out" / "a").read_text() + (tmp_path / "out" / "in" / "b").read_text() == "12"
+    assert (tmp_path / "out").is_symlink() == link and (link or names(tmp_path) == ["out"])

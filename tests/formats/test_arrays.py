@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from benchmarks.fuzz_mutate import mutated
 from benchmarks.readers import Reader, all_readers, splat_suffixes
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, read_arrays, savez
 from splatctrl_cli.formats.grid.npz_grid import MOST_PACKED, read_npz
 from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT, read_checkpoint
@@ -23,6 +22,7 @@ from splatctrl_cli.recording.folder.idr import read_idr
 from splatctrl_cli.recording.source import describe
 from tests.formats.make_npz import write_zeros
 from tests.properties import few
+from tests.refused import refused
 
 GIB4 = (1 << 14, 1 << 9, 1 << 9)  # of bytes
 
@@ -58,8 +58,7 @@ def test_gigabytes_of_zeros_in_a_small_file_are_refused_unread(
 ) -> None:
     path = write_zeros(tmp_path / "x.npz", {name: (GIB4, dtype)}, header="{}", origin=np.zeros(3), voxel=0.1)
     assert path.stat().st_size < 40_000_000
-    with pytest.raises(InputError, match=said):
-        read(path)
+    refused(said, read, path)
 
 
 @pytest.mark.parametrize("name", ["sdf", "features"])
@@ -69,16 +68,15 @@ def test_a_zip_of_a_later_version_is_no_fault_of_the_program(tmp_path: Path, nam
     content = bytearray(path.read_bytes())
     content[content.index(b"PK\x01\x02") + 6] = 255
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"x.npz: not a readable .npz: zip file version 25.5"):
-        describe(path)
+    refused("x.npz: not a readable .npz: zip file version 25.5", describe, path)
 
 
 def test_arrays_that_are_missing_too_large_or_not_whole_raise(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     savez(path, {"a": np.arange(100.0), "b": np.arange(100.0)})
+    assert len(read_arrays(path, most=1600)) == 2
     with pytest.raises(ValueError, match=r"b: 800 bytes, expected at most 799"):
         read_arrays(path, most=1599)
-    assert len(read_arrays(path, most=1600)) == 2
     with pytest.raises(KeyError):
         read_arrays(path, ["c"], most=1600)
     np.savez(path, a=np.array([{}], dtype=object))

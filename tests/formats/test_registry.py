@@ -24,33 +24,27 @@ class Thing:
 def test_a_room_holds_what_its_modules_list_by_order_and_then_by_module(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "a_room").mkdir()
     for module, things in {"__init__": "", "b": "('B', 1), ('first', 0)", "a": "('A', 1)", "none": ""}.items():
         made = f"from {__name__} import Thing\nENTRIES = [Thing(*args) for args in [{things}]]\n" if things else ""
-        (tmp_path / "a_room").mkdir(exist_ok=True)
         (tmp_path / "a_room" / f"{module}.py").write_text(made)
     (tmp_path / "a_room" / "other.py").write_text("ENTRIES = ('of another kind',)\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert [thing.name for thing in entries_of("a_room", Thing)] == ["first", "A", "B"]
-
-
-def test_no_two_entries_of_a_room_have_one_place() -> None:
     for registry in (SPLAT_FORMATS.values(), GRID_FORMATS.values(), LAYOUTS):
         orders = [entry.order for entry in registry]
-        assert len(orders) == len(set(orders)) > 5
+        assert len(orders) == len(set(orders)) > 5, "no two have one place"
 
 
 def test_names_come_sorted_and_files_below_are_counted_once(tmp_path: Path) -> None:
     for name, size in (("b", 3), ("a", 2), ("c/d/e", 5)):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(bytes(size))
-    (tmp_path / "loop").symlink_to(".")
-    (tmp_path / "nowhere").symlink_to("nothing")
-    (tmp_path / "again").symlink_to("a")
+    for link, target in (("loop", "."), ("nowhere", "nothing"), ("again", "a")):
+        (tmp_path / link).symlink_to(target)
     assert names_in(tmp_path) == ["a", "again", "b", "c", "loop", "nowhere"]
-    assert files_below(tmp_path) == (4, 12)
-    assert files_below(tmp_path / "c") == (1, 5)
-    assert files_below(tmp_path / "b") == (1, 3)
-    assert files_below(tmp_path / "nowhere") == (0, 0)
+    counted = [files_below(tmp_path / name) for name in (".", "c", "b", "nowhere")]
+    assert counted == [(4, 12), (1, 5), (1, 3), (0, 0)]
 
 
 def test_a_run_folder_is_described_by_its_first_thousand_names(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ def with_unknown(grid: DistanceGrid) -> DistanceGrid:
     """`grid` with a block of cells without a value in sdf and gradient, by its policy."""
     channels = {name: values.copy() for name, values in grid.channels.items()}
     for name in {"sdf", "gradient"} & channels.keys():
-        channels[name][1:3, 2, 3:9] = np.nan
+        channels[name][1:3, 2:3, 3:9] = np.nan
     header = {**grid.header, "unknown": "nan"}
     return DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=header)
 

@@ -1,7 +1,7 @@
 """The scene folder reads back what was written, and says what is wrong with others."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import make_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.files.output import write_json
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.formats.scene.scene_folder import open_scene
@@ -27,13 +27,10 @@ from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.voxels import SWEPT, EvidenceClass, LostEdges, OccupancyGrid, Unseen
 from tests.plain import known, plain_grid, plain_splats
+from tests.refused import refused
 
-
-@dataclass(frozen=True)
-class Row:
-    stamp_ns: int
-
-
+Row = make_dataclass("Row", [("stamp_ns", int)])
+FREE_BELOW = "run.json: config.occupancy.free_below: expected what reconstruct writes"
 STATE = {"a": np.arange(4), "scalar": np.array(2.5)}
 
 
@@ -55,42 +52,43 @@ def written(folder: Path) -> Path:
     folder.mkdir()
     writer = SceneWriter(folder, {"frame": "world"})
     for stamp in (100, 200, 300):
-        writer.audit(Row(stamp))
-        writer.snapshot(stamp, splats(stamp // 100), known(grid(), stamp), grid().states(0.3, 0.7))
-    writer.finish(300, splats(3), known(grid(), 300))
-    writer.checkpoint({}, STATE, is_last=True)
+        step(writer, stamp, stamp // 100)
+    finish(writer, {})
     write_json(folder / "run.json", {"metrics": {"cameras": ["cam0"], "has_clock": True, "stamp_ns": 300}})
     return folder
+
+
+def step(writer: SceneWriter, stamp: int, num: int) -> None:
+    """A row of the audit, and a snapshot of so many splats."""
+    writer.audit(Row(stamp))
+    writer.snapshot(stamp, splats(num), known(grid(), stamp), grid().states(0.3, 0.7))
+
+
+def finish(writer: SceneWriter, progress: dict[str, Any]) -> None:
+    writer.finish(300, splats(3), known(grid(), 300))
+    writer.checkpoint(progress, STATE, is_last=True)
 
 
 def test_a_scene_is_known_by_its_newest_snapshot(tmp_path: Path) -> None:
     scene = open_scene(written(tmp_path / "scene"))
     assert [len(scene.splats_at(stamp)) for stamp in (100, 199, 200, 10_000)] == [1, 1, 2, 3]
-    with pytest.raises(NotEvaluableError, match="no snapshot"):
-        scene.splats_at(99)
-    assert scene.cameras == ("cam0",)
-    assert scene.stamp_ns == 300
+    refused("no snapshot", scene.splats_at, 99, error=NotEvaluableError)
+    assert (scene.cameras, scene.stamp_ns) == (("cam0",), 300)
 
 
-def test_occupancy_comes_back_bit_by_bit(tmp_path: Path) -> None:
-    write_occupancy(tmp_path / "occupancy.npz", known(grid()))
-    again = read_occupancy(tmp_path / "occupancy.npz")
-    want = grid()
+def test_occupancy_comes_back_bit_by_bit_also_without_lost_edges(tmp_path: Path) -> None:
+    path, want = tmp_path / "occupancy.npz", grid()
+    write_occupancy(path, known(want))
+    again = read_occupancy(path)
     assert again.voxel == want.voxel
     for name in ("origin", "log_odds", "num_updates", "entity"):
         assert getattr(again, name).tobytes() == getattr(want, name).tobytes()
-
-
-def test_the_same_scene_gives_the_same_bytes(tmp_path: Path) -> None:
-    one, two = written(tmp_path / "one"), written(tmp_path / "two")
-    for path in sorted(p.relative_to(one) for p in one.rglob("*") if p.is_file()):
-        assert (one / path).read_bytes() == (two / path).read_bytes()
-
-
-def test_a_checkpoint_keeps_scalars_scalar(tmp_path: Path) -> None:
-    state = read_checkpoint(written(tmp_path / "scene")).state
-    assert state["scalar"].shape == ()
-    assert state["a"].tolist() == [0, 1, 2, 3]
+    arrays = {name: array for name, array in read_arrays(path, most=1 << 20).items() if name != "edges"}
+    header = json.loads(str(arrays["header"]))
+    del header["edges"]
+    savez(path, {**arrays, "header": np.array(json.dumps(header))})
+    for found in (read_seen(path), read_known_occupancy(path)):
+        assert found is not None and len(found.edges.radii) == 0
 
 
 def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
@@ -99,24 +97,21 @@ def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path)
         folder.mkdir()
         writer = SceneWriter(folder, {"frame": "world"})
         for stamp in (100, 200):
-            writer.audit(Row(stamp))
-            writer.snapshot(stamp, splats(2), known(grid()), grid().states(0.3, 0.7))
+            step(writer, stamp, 2)
         writer.checkpoint({"num_read": 2}, STATE)
         if folder is cut:
-            writer.audit(Row(999))
-            writer.snapshot(999, splats(9), known(grid()), grid().states(0.3, 0.7))
+            step(writer, 999, 9)
             writer.settle()
             for name in ("audit.jsonl", "snapshots/000003.ply", f"{CHECKPOINT}.new", "splats.ply", "run.json"):
                 with (folder / name).open("ab") as stream:
                     stream.write(b'{"stamp')
             again = read_checkpoint(folder)
             assert again.progress == {"num_read": 2}
+            assert again.state["scalar"].shape == () and again.state["a"].tolist() == [0, 1, 2, 3]
             writer = SceneWriter(folder, {"frame": "world"}, again)
             assert [row["stamp_ns"] for row in writer.audited()] == [100, 200]
-        writer.audit(Row(300))
-        writer.snapshot(300, splats(3), known(grid()), grid().states(0.3, 0.7))
-        writer.finish(300, splats(3), known(grid(), 300))
-        writer.checkpoint({"num_read": 3}, STATE, is_last=True)
+        step(writer, 300, 3)
+        finish(writer, {"num_read": 3})
     files = {p.relative_to(cut): p.read_bytes() for p in cut.rglob("*") if p.is_file()}
     assert files == {p.relative_to(straight): p.read_bytes() for p in straight.rglob("*") if p.is_file()}
 
@@ -125,8 +120,7 @@ def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path)
 def test_a_partial_scene_that_lacks_a_file_does_not_go_on(tmp_path: Path, name: str) -> None:
     folder = written(tmp_path / "scene.partial")
     (folder / name).unlink()
-    with pytest.raises(InputError, match="start over"):
-        SceneWriter(folder, {}, read_checkpoint(folder))
+    refused("start over", lambda: SceneWriter(folder, {}, read_checkpoint(folder)))
 
 
 def test_a_snapshot_that_was_changed_since_the_checkpoint_is_not_gone_on_with(tmp_path: Path) -> None:
@@ -134,14 +128,8 @@ def test_a_snapshot_that_was_changed_since_the_checkpoint_is_not_gone_on_with(tm
     checkpoint = read_checkpoint(folder)
     file = folder / "snapshots" / "000001.npz"
     file.write_bytes(file.read_bytes()[:-1] + b"x")
-    with pytest.raises(InputError, match=r"000001.npz: was changed after it was written .*; start over"):
-        SceneWriter(folder, {}, checkpoint)
+    refused(r"000001.npz: was changed after it was written .*; start over", SceneWriter, folder, {}, checkpoint)
     SceneWriter(folder, {}, replace(checkpoint, parts=None))  # of an older version
-
-
-def test_an_interrupted_run_is_not_read_as_a_scene(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"an interrupted run; continue it: .*--resume"):
-        open_scene(written(tmp_path / "scene.partial"))
 
 
 def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
@@ -152,13 +140,9 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
     assert set(states.ravel().tolist()) == {0, 1, 2, 3, 4}
     write_states(tmp_path / "a.npz", known(want), states)
     again = read_states(tmp_path / "a.npz")
-    assert again.voxel == want.voxel
-    assert again.origin.tobytes() == want.origin.tobytes()
+    assert again.voxel == want.voxel and again.origin.tobytes() == want.origin.tobytes()
     for thresholds in ((0.3, 0.7), (0.01, 0.99)):
         assert (again.states(*thresholds) == states).all()
-    (tmp_path / "b.npz").write_bytes(b"PK")
-    with pytest.raises(InputError, match="not the voxel states"):
-        read_states(tmp_path / "b.npz")
 
 
 @pytest.mark.parametrize("num_steps", [2, 239, 240, 255, 300])
@@ -198,32 +182,18 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
 
 @pytest.mark.parametrize("num_steps", [2, 245])
 def test_the_largest_number_of_an_older_file_is_looked_at_in_vain(tmp_path: Path, num_steps: int) -> None:
-    """In one byte, where 240 and more were time steps as well."""
-    header = {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 3], "step_stamps_ns": list(range(num_steps))}
-    last_seen = np.array([[[num_steps, 0, 0xFF]]], np.uint8)
-    np.savez(tmp_path / "a.npz", header=np.array(json.dumps(header)), last_seen=last_seen)
-    seen = read_seen(tmp_path / "a.npz")
+    """In one byte, where 240 and more were time steps as well. Still older files are without evidence."""
+    path, header = tmp_path / "a.npz", {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 3]}
+    last_seen, steps = np.array([[[num_steps, 0, 0xFF]]], np.uint8), {"step_stamps_ns": list(range(num_steps))}
+    np.savez(path, header=np.array(json.dumps(header | steps)), last_seen=last_seen)
+    seen = read_seen(path)
     assert seen is not None
     stamps_ns, classes = seen.look(np.array([[0.0, 0.0, 0.1 * k] for k in range(3)]))
     assert stamps_ns.tolist() == [num_steps - 1, -1, -1]
     assert classes.tolist() == [EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW, EvidenceClass.UNANSWERED]
-
-
-def test_voxel_files_of_an_older_version_are_read_without_evidence(tmp_path: Path) -> None:
-    header = {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 1]}
-    np.savez(tmp_path / "a.npz", header=np.array(json.dumps(header)), states=np.full((1, 1, 1), 2, np.uint8))
-    assert read_unrepresented(tmp_path / "a.npz") is None and read_seen(tmp_path / "a.npz") is None
-    assert read_states(tmp_path / "a.npz").log_odds.item() == 20.0
-
-
-def test_a_voxel_file_without_lost_edges_is_read_as_with_none(tmp_path: Path) -> None:
-    write_occupancy(tmp_path / "a.npz", known(grid()))
-    arrays = {name: array for name, array in read_arrays(tmp_path / "a.npz", most=1 << 20).items() if name != "edges"}
-    header = json.loads(str(arrays["header"]))
-    del header["edges"]
-    savez(tmp_path / "a.npz", {**arrays, "header": np.array(json.dumps(header))})
-    for found in (read_seen(tmp_path / "a.npz"), read_known_occupancy(tmp_path / "a.npz")):
-        assert found is not None and len(found.edges.radii) == 0
+    np.savez(path, header=np.array(json.dumps(header)), states=np.full((1, 1, 3), 2, np.uint8))
+    assert read_unrepresented(path) is None and read_seen(path) is None
+    assert (read_states(path).log_odds == 20.0).all()
 
 
 @pytest.mark.parametrize(
@@ -238,13 +208,12 @@ def test_a_voxel_file_without_lost_edges_is_read_as_with_none(tmp_path: Path) ->
     ],
 )
 def test_evidence_that_is_none_is_named(tmp_path: Path, changed: dict[str, NDArray[Any]], said: str) -> None:
-    write_occupancy(tmp_path / "a.npz", known(grid(), unrepresented=[[0.0, 0.25, 0.4]]))
-    savez(tmp_path / "a.npz", {**read_arrays(tmp_path / "a.npz", most=1 << 20), **changed})
-    with pytest.raises(InputError, match=said):
-        read_known_occupancy(tmp_path / "a.npz")
+    path = tmp_path / "a.npz"
+    write_occupancy(path, known(grid(), unrepresented=[[0.0, 0.25, 0.4]]))
+    savez(path, {**read_arrays(path, most=1 << 20), **changed})
+    refused(said, read_known_occupancy, path)
     if "unrepresented" not in changed:
-        with pytest.raises(InputError, match=said):
-            read_seen(tmp_path / "a.npz")
+        refused(said, read_seen, path)
 
 
 @pytest.mark.parametrize(
@@ -256,45 +225,42 @@ def test_evidence_that_is_none_is_named(tmp_path: Path, changed: dict[str, NDArr
         ('{"metrics": {"cameras": 3}}', "metrics.cameras: expected what reconstruct writes, got 'int' object"),
         ('{"metrics": {"cameras": [], "background": [1]}}', "metrics.background: expected what reconstruct writes"),
         ("{", "cannot be read"),
+        *(
+            (f'{{"metrics": {{"cameras": []}}, "config": {{"occupancy": {{"free_below": {value}}}}}}}', FREE_BELOW)
+            for value in ("1", "0", "-1", "NaN", '"x"', "[]")
+        ),
     ],
 )
 def test_a_run_json_that_reconstruct_did_not_write_is_named(tmp_path: Path, run: str, said: str) -> None:
-    (written(tmp_path / "scene") / "run.json").write_text(run)
-    with pytest.raises(InputError, match=said):
-        scene = open_scene(tmp_path / "scene")
-        assert scene.cameras == scene.background
-
-
-@pytest.mark.parametrize("value", ["1", "0", "-1", "NaN", '"x"', "[]"])
-def test_a_threshold_that_is_no_probability_is_named(tmp_path: Path, value: str) -> None:
-    run = f'{{"metrics": {{"cameras": []}}, "config": {{"occupancy": {{"free_below": {value}}}}}}}'
-    (written(tmp_path / "scene") / "run.json").write_text(run)
-    with pytest.raises(InputError, match=r"run.json: config.occupancy.free_below: expected what reconstruct writes"):
-        describe(tmp_path / "scene")
+    folder = written(tmp_path / "scene")
+    (folder / "run.json").write_text(run)
+    if said == FREE_BELOW:
+        refused(said, describe, folder)
+    else:
+        refused(said, lambda: [open_scene(folder).cameras, open_scene(folder).background])
 
 
 @pytest.mark.parametrize("row", ["300", "300,snapshots/000000.ply", "x,snapshots/000000.ply,3", "300,../evil.ply,3"])
 def test_a_row_of_snapshots_that_is_none_is_named(tmp_path: Path, row: str) -> None:
     file = written(tmp_path / "scene") / "snapshots.csv"
     file.write_text(f"{file.read_text()}{row}\n")
-    with pytest.raises(InputError, match=r"snapshots.csv: cannot be read"):
-        open_scene(tmp_path / "scene").splats_at(300)
+    refused(r"snapshots.csv: cannot be read", lambda: open_scene(tmp_path / "scene").splats_at(300))
 
 
 def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such scene"):
-        open_scene(tmp_path / "nowhere")
-    with pytest.raises(InputError, match="expected a scene folder"):
-        open_scene(tmp_path)
+    refused("no such scene", open_scene, tmp_path / "nowhere")
+    refused("expected a scene folder", open_scene, tmp_path)
+    partial = written(tmp_path / "scene.partial")
+    refused("an interrupted run; continue it: .*--resume", open_scene, partial)
 
 
 def test_a_foreign_or_cut_occupancy_grid_is_refused(tmp_path: Path) -> None:
-    foreign, cut = tmp_path / "foreign.npz", tmp_path / "cut.npz"
-    np.savez(foreign, x=np.zeros(3))
-    write_occupancy(cut, known(grid()))
-    cut.write_bytes(cut.read_bytes()[:-40])
-    pickled = tmp_path / "pickled.npz"
-    np.savez(pickled, header=np.array({"a": 1}, dtype=object))
-    for path in (foreign, cut, pickled):
-        with pytest.raises(InputError, match="not an occupancy grid"):
-            read_occupancy(path)
+    path = tmp_path / "a.npz"
+    np.savez(path, x=np.zeros(3))
+    refused("not an occupancy grid", read_occupancy, path)
+    np.savez(path, header=np.array({"a": 1}, dtype=object))
+    refused("not an occupancy grid", read_occupancy, path)
+    write_occupancy(path, known(grid()))
+    path.write_bytes(path.read_bytes()[:-40])
+    refused("not an occupancy grid", read_occupancy, path)
+    refused("not the voxel states", read_states, path)

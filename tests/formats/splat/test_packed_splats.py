@@ -1,41 +1,45 @@
-"""Splats of 32 bytes and `.spz`: the bytes of one Gaussian, files of other tools, and what is refused."""
+"""Splats of 32 bytes, `.spz`, glTF and OpenUSD: the bytes of one Gaussian, files of other tools, what is refused."""
 
+import errno
 import gzip
+import json
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.splat.gltf import read_gltf, write_glb
 from splatctrl_cli.formats.splat.packed_splats import read_splat, read_spz, spz_bound, write_splat, write_spz
 from splatctrl_cli.formats.splat.splat_format import differences
-from tests.formats.splat.test_gaussian_ply import gaussian_set
+from splatctrl_cli.formats.splat.usd import read_usd, write_usd
+from splatctrl_cli.records import GaussianSet
+from tests.formats.splat.test_gaussian_ply import changed, gaussian_set
+from tests.refused import refused
 
 ROW = struct.Struct("<6f8B")
 
 
 def test_one_gaussian_has_the_32_bytes_that_viewers_expect(tmp_path: Path) -> None:
-    one = replace(
+    one = changed(
         gaussian_set(1),
-        centers=np.array([[1, 2, 3]], np.float32),
-        scales=np.array([[0.01, 0.02, 0.03]], np.float32),
-        quats_wxyz=np.array([[0.5, 0.5, -0.5, 0.5]], np.float32),
-        opacities=np.array([0.4], np.float32),
-        harmonics=np.array([[[0.0, 0.5 / 0.28209479, -0.3 / 0.28209479]]], np.float32),
+        centers=[[1, 2, 3]],
+        scales=[[0.01, 0.02, 0.03]],
+        quats_wxyz=[[0.5, 0.5, -0.5, 0.5]],
+        opacities=[0.4],
+        harmonics=[[[0.0, 0.5 / 0.28209479, -0.3 / 0.28209479]]],
     )
     write_splat(tmp_path / "a.splat", one, {})
     row = ROW.unpack((tmp_path / "a.splat").read_bytes())
     np.testing.assert_allclose(row[:6], [1, 2, 3, 0.01, 0.02, 0.03], rtol=1e-6)
     assert row[6:10] == (128, 255, 51, 102)  # 0.5 rounds to even
     assert row[10:] == (64, 64, 192, 64)  # the same rotation, its first component negative
-
-
-def test_no_rotation_is_exact(tmp_path: Path) -> None:
-    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (3, 1))
-    write_splat(tmp_path / "a.splat", replace(gaussian_set(3), quats_wxyz=quats), {})
-    assert np.array_equal(np.abs(read_splat(tmp_path / "a.splat")[0].quats_wxyz), quats)
+    write_splat(tmp_path / "b.splat", changed(one, quats_wxyz=[[1, 0, 0, 0]]), {})
+    assert np.abs(read_splat(tmp_path / "b.splat")[0].quats_wxyz).tolist() == [[1, 0, 0, 0]], "no rotation is exact"
 
 
 def test_a_file_of_another_tool_is_read(tmp_path: Path) -> None:
@@ -57,13 +61,12 @@ def test_a_file_of_another_tool_is_read(tmp_path: Path) -> None:
     ],
 )
 def test_rows_that_are_no_gaussians_are_refused(tmp_path: Path, row: bytes, message: str) -> None:
-    good = ROW.pack(0, 0, 0, 1, 1, 1, *[200] * 8)
-    (tmp_path / "a.splat").write_bytes(good + row)
-    with pytest.raises(InputError, match=message):
-        read_splat(tmp_path / "a.splat")
+    (tmp_path / "a.splat").write_bytes(ROW.pack(0, 0, 0, 1, 1, 1, *[200] * 8) + row)
+    refused(message, read_splat, tmp_path / "a.splat")
 
 
 HEADER = struct.Struct("<IIIBBBB")
+
 MAGIC = 0x5053474E
 
 
@@ -73,25 +76,20 @@ def packed(path: Path, *parts: bytes) -> Path:
 
 
 def test_one_gaussian_has_the_bytes_of_version_3(tmp_path: Path) -> None:
-    harmonics = np.zeros((1, 4, 3), np.float32)
-    harmonics[0, 0] = [0.0, 1.0, -1.0]
-    harmonics[0, 1:] = np.array([[0.5, -0.5, 0.25], [0, 0, 0], [-1, 0.125, 0]])
-    one = replace(
+    one = changed(
         gaussian_set(1),
-        centers=np.array([[1, -2, 0.25]], np.float32),
-        scales=np.exp(np.array([[-4, -5, -6]])).astype(np.float32),
-        quats_wxyz=np.array([[-0.3, 0.8, 0.4, np.sqrt(0.11)]], np.float32),  # x is largest
-        opacities=np.array([0.2], np.float32),
-        harmonics=harmonics,
+        centers=[[1, -2, 0.25]],
+        scales=np.exp([[-4, -5, -6]]),
+        quats_wxyz=[[-0.3, 0.8, 0.4, np.sqrt(0.11)]],  # x is largest
+        opacities=[0.2],
+        harmonics=[[[0.0, 1.0, -1.0], [0.5, -0.5, 0.25], [0, 0, 0], [-1, 0.125, 0]]],
     )
     write_spz(tmp_path / "a.spz", one, {})
     content = gzip.decompress((tmp_path / "a.spz").read_bytes())
     assert HEADER.unpack_from(content) == (MAGIC, 3, 1, 1, 12, 0, 0)
     body = content[HEADER.size :]
     assert body[:9] == b"".join(int(v * 4096).to_bytes(3, "little", signed=True) for v in (1, -2, 0.25))
-    assert body[9] == 51
-    assert list(body[10:13]) == [128, 166, 89]  # 38.25 f_dc + 127.5
-    assert list(body[13:16]) == [96, 80, 64]
+    assert list(body[9:16]) == [51, 128, 166, 89, 96, 80, 64]  # opacity, 38.25 f_dc + 127.5, scales
     word = int.from_bytes(body[16:20], "little")
     assert word >> 30 == 0  # x y z w
     assert [word >> shift & 0x3FF for shift in (20, 10, 0)] == [289, 240, 512 + 217]  # y, z, w; 511 is sqrt(1/2)
@@ -141,5 +139,182 @@ def test_what_is_farther_than_2_km_is_held_in_larger_steps(tmp_path: Path) -> No
     ],
 )
 def test_what_is_no_file_of_these_versions_is_refused(tmp_path: Path, header: tuple[int, ...], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_spz(packed(tmp_path / "a.spz", HEADER.pack(*header)))
+    refused(message, read_spz, packed(tmp_path / "a.spz", HEADER.pack(*header)))
+
+
+SPLATS = "KHR_gaussian_splatting"
+
+
+def document_of(path: Path) -> tuple[dict[str, Any], bytes]:
+    content = path.read_bytes()
+    magic, version, length, json_length, kind = struct.unpack_from("<4sII I4s", content)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(content), b"JSON")
+    binary_length, kind = struct.unpack_from("<I4s", content, 20 + json_length)
+    assert (28 + json_length + binary_length, kind) == (length, b"BIN\0")
+    document: dict[str, Any] = json.loads(content[20 : 20 + json_length])
+    return document, content[28 + json_length :]
+
+
+def with_document(path: Path, document: dict[str, Any], binary: bytes) -> Path:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII I4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+    path.write_bytes(head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    return path
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> tuple[Path, GaussianSet]:
+    gaussians = gaussian_set(20, degree=1)
+    write_glb(tmp_path / "a.glb", gaussians, {"scene": "made up"})
+    return tmp_path / "a.glb", gaussians
+
+
+def test_the_document_is_what_the_extension_asks_for(written: tuple[Path, GaussianSet]) -> None:
+    path, gaussians = written
+    document, binary = document_of(path)
+    primitive, accessors = document["meshes"][0]["primitives"][0], document["accessors"]
+    assert (document["extensionsUsed"], primitive["mode"]) == ([SPLATS], 0)
+    said = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    assert said.items() <= primitive["extensions"][SPLATS].items()
+    names = ["ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0", *(f"SH_DEGREE_1_COEF_{k}" for k in range(3))]
+    assert list(primitive["attributes"]) == ["POSITION", "COLOR_0", *(f"{SPLATS}:{name}" for name in names)]
+    types = [accessors[i]["type"] for i in primitive["attributes"].values()]
+    assert types == ["VEC3", "VEC4", "VEC4", "VEC3", "SCALAR", *["VEC3"] * 4]
+    position = accessors[primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(np.float32(position["min"]), gaussians.centers.min(axis=0))
+    assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
+    rotation = accessors[primitive["attributes"][f"{SPLATS}:ROTATION"]]
+    start = document["bufferViews"][rotation["bufferView"]]["byteOffset"]
+    w, x, y, z = gaussians.quats_wxyz[0]
+    assert struct.unpack_from("<4f", binary, start) == (x, y, z, w)
+
+
+def test_another_reader_finds_the_points_and_their_colours_with_z_turned_up(
+    written: tuple[Path, GaussianSet],
+) -> None:
+    path, gaussians = written
+    scene = trimesh.load(path)
+    (cloud,) = scene.geometry.values()
+    assert np.array_equal(cloud.vertices, gaussians.centers)
+    colors = np.clip(0.5 + 0.28209479 * gaussians.harmonics[:, 0], 0, 1)
+    np.testing.assert_allclose(cloud.colors[:, :3] / 255, colors, atol=0.5001 / 255)
+    (node,) = scene.graph.nodes_geometry
+    np.testing.assert_allclose(scene.graph.get(node)[0][:3, :3] @ [0, 0, 1], [0, 1, 0], atol=1e-7)
+
+
+def test_normalised_bytes_interleaved_with_others_are_read(tmp_path: Path) -> None:
+    rows = np.zeros(2, np.dtype([("p", "<f4", 3), ("q", "i1", 4), ("s", "<f4", 3), ("o", "u1", 4), ("c", "<f4", 3)]))
+    rows["p"], rows["s"], rows["c"] = [[1, 2, 3], [4, 5, 6]], 0.5, 0.25
+    rows["q"], rows["o"][:, 0] = [[0, 0, 0, 127], [127, 0, 0, 0]], [255, 51]
+    kinds = [(5126, "VEC3"), (5120, "VEC4"), (5126, "VEC3"), (5121, "SCALAR"), (5126, "VEC3")]
+    accessors = [
+        {"bufferView": 0, "byteOffset": offset, "componentType": kind, "count": 2, "type": shape}
+        | ({"normalized": True} if kind != 5126 else {})
+        for (kind, shape), (_, offset) in zip(kinds, (rows.dtype.fields or {}).values(), strict=True)
+    ]
+    names = ["POSITION", *(f"{SPLATS}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"))]
+    attributes = {name: i for i, name in enumerate(names)}
+    document = {
+        "asset": {"version": "2.0"},
+        "meshes": [{"primitives": [{"attributes": attributes, "extensions": {SPLATS: {"kernel": "ellipse"}}}]}],
+        "accessors": accessors,
+        "bufferViews": [{"buffer": 0, "byteLength": rows.nbytes, "byteStride": rows.itemsize}],
+        "buffers": [{"byteLength": rows.nbytes}],
+    }
+    g, comments = read_gltf(with_document(tmp_path / "a.glb", document, rows.tobytes()))
+    assert comments == {}
+    np.testing.assert_array_equal(g.centers, rows["p"])
+    np.testing.assert_array_equal(g.quats_wxyz, [[1, 0, 0, 0], [0, 1, 0, 0]])
+    np.testing.assert_allclose(g.opacities, [1, 0.2], rtol=1e-6)
+
+
+COMPRESSED = {"KHR_gaussian_splatting_compression_spz_2": {}}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: p["extensions"].clear(), f"expected one primitive with {SPLATS}, got 0 of 1"),
+        (lambda p: p["attributes"].pop(f"{SPLATS}:SCALE"), f"its Gaussians have no {SPLATS}:SCALE"),
+        (lambda p: p["attributes"].pop(f"{SPLATS}:SH_DEGREE_1_COEF_2"), "expected 1, 4, 9 or 16 coefficients, got 3"),
+        (lambda p: p["extensions"][SPLATS].update(kernel="cube"), "expected ellipse, got cube"),
+        (lambda p: p["attributes"].update(POSITION=99), "glTF not understood: IndexError"),
+        (lambda p: p["attributes"].update(POSITION=1), "accessor 1: expected a plain VEC3, got VEC4"),
+        (
+            lambda p: p["extensions"][SPLATS].update(extensions=COMPRESSED),
+            "packed by KHR_gaussian_splatting_compression_spz_2, expected plain attributes",
+        ),
+    ],
+)
+def test_what_is_no_plain_set_of_gaussians_is_refused(
+    written: tuple[Path, GaussianSet], change: Callable[[dict[str, Any]], object], message: str
+) -> None:
+    path, gaussians = written
+    document, binary = document_of(path)
+    primitive, accessors = document["meshes"][0]["primitives"][0], document["accessors"]
+    scale = accessors[primitive["attributes"][f"{SPLATS}:SCALE"]]
+    start = document["bufferViews"][scale["bufferView"]]["byteOffset"]
+    logs = np.log(gaussians.scales).tobytes()
+    drafts = with_document(path, document, binary[:start] + logs + binary[start + len(logs) :])
+    refused("splat 0: .*:SCALE: expected no negative sigma, got .*drafts", read_gltf, drafts)
+    accessors[0]["count"] = 10**6
+    refused(r"accessor 0: reaches beyond the \d+ bytes of data", read_gltf, with_document(path, document, binary))
+    accessors[0]["count"] = len(gaussians)
+    change(primitive)
+    refused(message, read_gltf, with_document(path, document, binary))
+
+
+@pytest.fixture
+def usd_core() -> Any:
+    return pytest.importorskip("pxr", reason="usd-core is not installed: USD was not written")
+
+
+@pytest.mark.usefixtures("usd_core")
+def test_the_stage_is_a_particle_field_in_metres_with_z_up(tmp_path: Path) -> None:
+    from pxr import Usd, UsdGeom, UsdVol
+
+    gaussians = gaussian_set(5, degree=1)
+    write_usd(tmp_path / "a.usda", gaussians, {}, suffix=".usda")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == (UsdGeom.Tokens.z, 1)
+    field = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    quat = field.GetOrientationsAttr().Get()[0]
+    np.testing.assert_array_equal([quat.GetReal(), *quat.GetImaginary()], gaussians.quats_wxyz[0])
+    assert field.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
+    coefficients = np.asarray(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get())
+    np.testing.assert_array_equal(coefficients[:4], gaussians.harmonics[0])
+    lower, upper = np.asarray(field.GetExtentAttr().Get())
+    assert (lower <= gaussians.centers).all() and (gaussians.centers <= upper).all()
+
+
+@pytest.mark.usefixtures("usd_core")
+def test_what_is_no_particle_field_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    write_usd(path, replace(gaussian_set(2), labels=np.uint8([0, 1])), {}, suffix=".usda")
+    good = path.read_text()
+    for text, said in (
+        ('#usda 1.0\ndef Xform "World" {}\n', "expected one ParticleField3DGaussianSplat, got 0"),
+        ("no such file", "no USD file that the library can open"),
+        (
+            good.replace("label = [0, 1]", "label = [0, 1, 1]"),
+            "label: expected a number from 0 to 255 for each of 2",
+        ),
+        (good.replace("float3[] scales", "float3[] sizes"), "its ParticleField3DGaussianSplat has no scales"),
+    ):
+        path.write_text(text)
+        refused(said, read_usd, path, suffix=".usda")
+
+
+@pytest.mark.usefixtures("usd_core")
+def test_a_disk_that_is_full_is_an_error_of_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pxr import Sdf, Tf
+
+    def export(_layer: object, _path: str) -> None:
+        raise Tf.ErrorException("Error occurred writing file: No space left on device")
+
+    monkeypatch.setattr(Sdf.Layer, "Export", export)
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        write_usd(tmp_path / "a.usdc", gaussian_set(2), {}, suffix=".usdc")
+    assert caught.value.errno == errno.ENOSPC
+    assert not list(tmp_path.iterdir())

@@ -5,7 +5,8 @@ split and hostile ones give what precedes or follows the damage.
 import os
 import sqlite3
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -18,15 +19,16 @@ from rosbags.rosbag2 import Reader as Bag2Reader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.unpacking import MAX_BLOCK
-from splatctrl_cli.recording.container.bag_logs import Bag1Log, BagFile, Db3Log
+from splatctrl_cli.recording.container.bag_logs import BagFile, Db3Log
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 from tests.cases.container_cases import kill_recorder
 from tests.recording.log.make_log import T, encoded, write_bag
+from tests.refused import refused
 
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
+
 COMPRESSIONS = [None, Bag1Writer.CompressionFormat.BZ2, Bag1Writer.CompressionFormat.LZ4]
 
 
@@ -46,11 +48,6 @@ def make_bag1(path: Path, compression: Bag1Writer.CompressionFormat | None = Non
     return path
 
 
-def read1(path: Path) -> tuple[list[RawMessage], Damage]:
-    damage = Damage()
-    return list(Bag1Log(path).messages(damage)), damage
-
-
 def by_rosbags(path: Path) -> list[tuple[str, str, str, int, bytes]]:
     with Reader(path) as reader:
         return [(c.topic, c.msgtype, c.msgdef.data, stamp, data) for c, stamp, data in reader.messages()]
@@ -65,103 +62,73 @@ def test_a_whole_bag_gives_what_rosbags_gives(
     tmp_path: Path, compression: Bag1Writer.CompressionFormat | None
 ) -> None:
     bag = make_bag1(tmp_path / "x.bag", compression)
-    found, damage = read1(bag)
+    found, damage = read(bag)
     assert plain(found) == by_rosbags(bag)
-    assert len(found) == 60
-    assert damage.notes == []
-    assert {topic.name for topic in Bag1Log(bag).topics()} == {"/a", "/b"}
-    assert [m.log_time_ns for m in Bag1Log(bag).messages(Damage(), {"/b"})] == [m.log_time_ns for m in found[1::2]]
+    assert len(found) == 60 and damage.notes == []
+    assert {topic.name for topic in open_raw_log(bag).topics()} == {"/a", "/b"}
+    assert plain(read(bag, {"/b"})[0]) == plain(found[1::2])
 
 
-def test_a_real_bag_gives_what_rosbags_gives(real_data: Path) -> None:
-    for bag in sorted((real_data / "realsense_bag").glob("*.bag")):
-        found, damage = read1(bag)
-        assert sorted(plain(found)) == sorted(by_rosbags(bag))
-        assert damage.notes == []
+LEFT_OUT = "the chunk at byte {0} was left out: "
+
+LZ4 = Bag1Writer.CompressionFormat.LZ4
 
 
-def test_an_uncompressed_chunk_gives_what_precedes_the_cut_in_it(tmp_path: Path) -> None:
-    bag = make_bag1(tmp_path / "x.bag")
-    chunk = [record for record in BagFile(bag).records(Damage()) if record.kind == 5][2]
-    before = len(_messages(bag, up_to=chunk.offset))
-    bag.write_bytes(bag.read_bytes()[: chunk.offset + 1500])
-    found, damage = read1(bag)
-    assert len(found) >= before + 2
-    assert damage.notes[0] == f"x.bag: cut or damaged after byte {chunk.offset}"
-
-
-def _messages(bag: Path, up_to: int) -> list[RawMessage]:
-    cut = bag.with_name("before.bag")
-    cut.write_bytes(bag.read_bytes()[:up_to])
-    return read1(cut)[0]
-
-
-def test_a_bag_that_is_still_written_says_that_it_has_no_index(tmp_path: Path) -> None:
-    bag = make_bag1(tmp_path / "x.bag")
-    data = bytearray(bag.read_bytes())
-    at = data.index(b"index_pos=") + len("index_pos=")
-    end = struct.unpack_from("<Q", data, at)[0]
-    data[at : at + 8] = bytes(8)
-    bag.write_bytes(data[:end])
-    found, damage = read1(bag)
-    assert len(found) == 60
-    assert damage.notes == ["x.bag: has no index: cut, or still being written"]
-
-
-def test_a_bag_that_ends_between_two_entries_of_its_index_is_not_whole(tmp_path: Path) -> None:
-    bag = make_bag1(tmp_path / "x.bag")
-    infos = [record for record in BagFile(bag).records(Damage()) if record.kind == 6]
-    bag.write_bytes(bag.read_bytes()[: infos[-1].offset])
-    found, damage = read1(bag)
-    assert len(found) == 60
-    assert damage.notes == ["x.bag: its index is not whole"]
-
-
-def announcing_gigabytes(data: bytes, at: int) -> bytes:
-    """With another size in the header of the chunk whose body begins at a byte."""
+def with_size(data: bytes, at: int, _end: int) -> bytes:
+    """Announcing gigabytes in the header of the chunk whose body begins at a byte."""
     place = data.rindex(b"size=", 0, at) + 5
     return data[:place] + b"\xff" * 4 + data[place + 4 :]
 
 
-LEFT_OUT = "the chunk at byte {} was left out: "
+def still_written(data: bytes, _at: int, _end: int) -> bytes:
+    """Without the index, and without its place in the head."""
+    place = data.index(b"index_pos=") + len("index_pos=")
+    return data[:place] + bytes(8) + data[place + 8 : struct.unpack_from("<Q", data, place)[0]]
 
 
 @pytest.mark.parametrize(
-    ("compression", "change", "note"),
+    ("compression", "change", "num", "note"),
     [
         *(
             (
                 kind,
-                lambda data, at: data[: at + 40] + bytes(40) + data[at + 80 :],
-                f"{LEFT_OUT}cannot be decompressed",
+                lambda data, at, _: data[: at + 40] + bytes(40) + data[at + 80 :],
+                range(41, 60),
+                f"{LEFT_OUT}{said}",
             )
-            for kind in COMPRESSIONS[1:]
+            for kind, said in zip(COMPRESSIONS[1:], ["cannot be decompressed"] * 2, strict=True)
+        ),
+        (
+            LZ4,
+            with_size,
+            range(41, 60),
+            f"{LEFT_OUT}announces {0xFFFFFFFF} bytes unpacked, at most {MAX_BLOCK} are read",
         ),
         (
             None,
-            lambda data, at: data[: at - 4] + b"\xff" * 4 + data[at:],
-            "bytes {} to {} are damaged and were left out",
+            lambda data, at, _: data[: at - 4] + b"\xff" * 4 + data[at:],
+            range(41, 60),
+            "bytes {0} to {1} are damaged and were left out",
         ),
-        (
-            Bag1Writer.CompressionFormat.LZ4,
-            announcing_gigabytes,
-            f"{LEFT_OUT}announces {0xFFFFFFFF} bytes unpacked, at most {MAX_BLOCK} are read",
-        ),
+        (None, lambda data, at, _: data[: at + 1400], range(6, 10), "cut or damaged after byte {0}"),
+        (None, still_written, [60], "has no index: cut, or still being written"),
+        (None, lambda data, _, end: data[:end], [60], "its index is not whole"),
     ],
 )
-def test_a_damaged_chunk_costs_itself_alone(
+def test_a_damaged_chunk_costs_itself_alone_and_a_cut_what_follows(
     tmp_path: Path,
     compression: Bag1Writer.CompressionFormat | None,
-    change: Callable[[bytes, int], bytes],
+    change: Callable[[bytes, int, int], bytes],
+    num: Sequence[int],
     note: str,
 ) -> None:
     bag = make_bag1(tmp_path / "x.bag", compression)
-    chunks = [record for record in BagFile(bag).records(Damage()) if record.kind == 5]
-    data = bag.read_bytes()
-    bag.write_bytes(change(data, data.index(chunks[1].body)))
-    found, damage = read1(bag)
-    assert 40 < len(found) < 60
-    assert damage.notes == [f"x.bag: {note.format(chunks[1].offset, chunks[2].offset)}"]
+    records, data = list(BagFile(bag).records(Damage())), bag.read_bytes()
+    chunks = [record for record in records if record.kind == 5]
+    bag.write_bytes(change(data, data.index(chunks[1].body), records[-1].offset))
+    found, damage = read(bag)
+    assert len(found) in num
+    assert damage.notes[0] == f"x.bag: {note.format(chunks[1].offset, chunks[2].offset)}"
 
 
 def make_bag(
@@ -176,12 +143,19 @@ def make_bag(
     return write_bag(folder, messages, plugin=plugin, mode=mode)
 
 
-def read(path: Path) -> tuple[list[RawMessage], Damage]:
+def read(path: Path, names: set[str] | None = None) -> tuple[list[RawMessage], Damage]:
     damage = Damage()
-    return list(open_raw_log(path).messages(damage)), damage
+    return list(open_raw_log(path).messages(damage, names)), damage
+
+
+def stamps(path: Path) -> list[int]:
+    return [message.log_time_ns for message in read(path)[0]]
 
 
 def test_every_real_bag_gives_what_rosbags_gives(real_data: Path) -> None:
+    for bag in (real_data / "realsense_bag").glob("*.bag"):
+        found, damage = read(bag)
+        assert sorted(plain(found)) == sorted(by_rosbags(bag)) and damage.notes == []
     bags = sorted((real_data / "rosbag2_testbags").rglob("*.db3"))
     assert len(bags) > 10
     for bag in bags:
@@ -217,44 +191,33 @@ def test_metadata_of_every_version_is_read(tmp_path: Path, version: int) -> None
     file = bag / "metadata.yaml"
     content = yaml.safe_load(file.read_text())
     told = content["rosbag2_bagfile_information"]
-    told["version"] = version
-    if version < 4:
-        told["relative_file_paths"] = [f"bag/{name}" for name in told["relative_file_paths"]]
+    paths = [f"bag/{name}" if version < 4 else name for name in told["relative_file_paths"]]
+    told |= {"version": version, "relative_file_paths": paths}
     file.write_text(yaml.safe_dump(content))
-    assert len(read(bag)[0]) == 3
+    assert stamps(bag) == [1, 2, 3]
 
 
 def test_split_files_without_metadata_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    folder = tmp_path / "split"
-    folder.mkdir()
+    (tmp_path / "split").mkdir()
     for part in (2, 10, 1):
         source = make_bag(tmp_path / f"part{part}", num=part)
-        (source / f"part{part}.db3").rename(folder / f"rec_{part}.db3")
-    assert [m.log_time_ns for m in read(folder)[0]] == [1, 1, 2, *range(1, 11)]
+        (source / f"part{part}.db3").rename(tmp_path / f"split/rec_{part}.db3")
+    assert stamps(tmp_path / "split") == [1, 1, 2, *range(1, 11)]
 
 
-def test_a_damaged_page_costs_its_rows(tmp_path: Path) -> None:
+def test_a_damaged_page_costs_its_rows_and_a_cut_file_those_behind_it(tmp_path: Path) -> None:
     file = make_bag(tmp_path / "bag") / "bag.db3"
-    data = bytearray(file.read_bytes())
-    page = int.from_bytes(data[16:18], "big")
-    at = data.index(b"    200    200") // page * page
-    data[at : at + page] = os.urandom(8) * (page // 8)
-    file.write_bytes(data)
-    found, damage = read(file)
-    stamps = [m.log_time_ns for m in found]
-    assert 380 < len(stamps) < 400
-    assert {1, 190, 215, 400} <= set(stamps)
-    assert sorted(set(stamps)) == stamps
-    assert "damaged behind message" in damage.notes[0]
-
-
-def test_a_cut_file_gives_the_rows_before_the_cut(tmp_path: Path) -> None:
-    file = make_bag(tmp_path / "bag") / "bag.db3"
-    file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
-    found, damage = read(file)
-    assert [m.log_time_ns for m in found] == list(range(1, len(found) + 1))
-    assert 150 < len(found) < 400
-    assert damage.count >= 1
+    whole = file.read_bytes()
+    page = int.from_bytes(whole[16:18], "big")
+    at = whole.index(b"    200    200") // page * page
+    file.write_bytes(whole[:at] + os.urandom(8) * (page // 8) + whole[at + page :])
+    found = stamps(file)
+    assert 380 < len(found) < 400 and {1, 190, 215, 400} <= set(found) and sorted(set(found)) == found
+    assert "damaged behind message" in read(file)[1].notes[0]
+    file.write_bytes(whole[: len(whole) * 2 // 3])
+    found = stamps(file)
+    assert found == list(range(1, len(found) + 1)) and 150 < len(found) < 400
+    assert read(file)[1].count >= 1
 
 
 def test_a_journal_of_nonsense_is_damage_and_the_bag_is_read_without(tmp_path: Path) -> None:
@@ -284,84 +247,57 @@ def test_what_a_killed_recorder_left_in_its_journal_is_read_and_nothing_is_writt
     finally:
         file.parent.chmod(0o700)
     assert [m.log_time_ns for m in found] == list(range(1, 41))
-    assert damage.count == 0
-    assert "was not closed" in damage.all_notes[0]
+    assert damage.count == 0 and "was not closed" in damage.all_notes[0]
     assert "pages of bag.db3-wal were read" in damage.all_notes[0]
     assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before
 
 
-def test_a_journal_that_ends_inside_a_page_gives_what_was_committed_before(tmp_path: Path) -> None:
+def test_a_journal_that_is_cut_gives_what_was_committed_before_and_a_missing_one_is_named(tmp_path: Path) -> None:
     file = make_killed(tmp_path, closed=13)
     journal = file.with_name("bag.db3-wal")
     journal.write_bytes(journal.read_bytes()[: 32 + 2 * 4120 + 100])
-    found, damage = read(file)
-    assert [m.log_time_ns for m in found] == list(range(1, 14))
-    assert "bag.db3-wal" in damage.all_notes[0]
+    assert stamps(file) == list(range(1, 14)) and "bag.db3-wal" in read(file)[1].all_notes[0]
+    empty = make_killed(tmp_path / "empty")
+    empty.with_name("bag.db3-wal").unlink()
+    refused("bag.db3-wal is not beside it.*; copy bag.db3-wal from where the bag was recorded", read, empty)
 
 
-def test_a_missing_journal_is_named_where_the_bag_is_empty_without_it(tmp_path: Path) -> None:
-    file = make_killed(tmp_path)
-    file.with_name("bag.db3-wal").unlink()
-    with pytest.raises(InputError, match=r"bag\.db3-wal is not beside it") as caught:
-        read(file)
-    assert caught.value.remedy.startswith("copy bag.db3-wal from where the bag was recorded")
-
-
-def test_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "endless.db3"
-    endless = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS id, 1 AS topic_id FROM n"
-    with sqlite3.connect(path) as database:
-        database.execute("CREATE TABLE topics(id, name, type, serialization_format)")
-        database.execute(f"CREATE VIEW messages AS {endless}")
-    with pytest.raises(InputError, match="no tables named topics and messages"):
-        open_raw_log(path)
-
-
-def test_values_of_the_wrong_type_are_counted(tmp_path: Path) -> None:
+def test_values_of_the_wrong_type_are_counted_and_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "odd.db3"
-    with sqlite3.connect(path) as database:
+    with closing(sqlite3.connect(path)) as database, database:
         database.execute("CREATE TABLE topics(id, name, type, serialization_format)")
         database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
         database.execute("INSERT INTO topics VALUES (1, NULL, 7, x'ff')")
         rows = [(1, 1, "soon", b"x"), (2, 1, 5, "text"), (3, None, 5, b"x"), (4, 1, 5, b"good"), (5, 9, 5, b"x")]
         database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
     found, damage = read(path)
-    assert [m.data for m in found] == [b"good"]
-    assert damage.count == 4
+    assert ([m.data for m in found], damage.count) == ([b"good"], 4)
+    endless = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS id, 1 AS topic_id FROM n"
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("DROP TABLE messages")
+        database.execute(f"CREATE VIEW messages AS {endless}")
+    refused("no tables named topics and messages", open_raw_log, path)
 
 
 def test_a_compressed_file_that_is_cut_gives_what_precedes(tmp_path: Path) -> None:
-    bag = make_bag(tmp_path / "bag", mode=CompressionMode.FILE)
-    packed = next(bag.glob("*.zstd"))
-    data = zstandard.ZstdCompressor(level=1).compress(_unpacked(packed))
+    packed = tmp_path / "bag.db3.zstd"
+    data = zstandard.ZstdCompressor(level=1).compress((make_bag(tmp_path / "bag") / "bag.db3").read_bytes())
     packed.write_bytes(data[: len(data) * 3 // 4])
-    damage = Damage()
-    found = list(open_raw_log(packed).messages(damage))
-    assert 0 < len(found) < 400
-    assert damage.count >= 1
+    found, damage = read(packed)
+    assert 0 < len(found) < 400 and damage.count >= 1
 
 
-def _unpacked(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return zstandard.ZstdDecompressor().stream_reader(stream).read()
-
-
-def test_a_bomb_stops_on_disk_and_a_nested_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bomb_stops_on_disk_or_is_counted_and_a_nested_file_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("splatctrl_cli.recording.container.log_formats.FREE_BYTES", 1 << 20)
-    magic = b"\x89MCAP0\r\n"
-    (tmp_path / "bomb.mcap.zstd").write_bytes(zstandard.compress(magic + bytes(1 << 26)))
-    damage = Damage()
-    assert list(open_raw_log(tmp_path / "bomb.mcap.zstd").messages(damage)) == []
-    assert damage.notes[0] == "bomb.mcap.zstd: unpacks to over 100 times its size"
-    (tmp_path / "twice.zstd").write_bytes(zstandard.compress(zstandard.compress(magic)))
-    with pytest.raises(InputError, match="compressed twice"):
-        open_raw_log(tmp_path / "twice.zstd")
-
-
-def test_a_bomb_in_a_message_is_counted(tmp_path: Path) -> None:
+    magic, bomb, twice = b"\x89MCAP0\r\n", tmp_path / "bomb.mcap.zstd", tmp_path / "twice.zstd"
+    bomb.write_bytes(zstandard.compress(magic + bytes(1 << 26)))
+    found, damage = read(bomb)
+    assert (found, damage.notes[0]) == ([], "bomb.mcap.zstd: unpacks to over 100 times its size")
+    twice.write_bytes(zstandard.compress(zstandard.compress(magic)))
+    refused("compressed twice", open_raw_log, twice)
     bag = make_bag(tmp_path / "bag", num=3, mode=CompressionMode.MESSAGE)
-    with sqlite3.connect(bag / "bag.db3") as database:
+    with closing(sqlite3.connect(bag / "bag.db3")) as database, database:
         database.execute("UPDATE messages SET data = ? WHERE id = 2", (zstandard.compress(bytes(1 << 28)),))
-    found, damage = read(bag)
-    assert [m.log_time_ns for m in found] == [1, 3]
-    assert "announces 268435456 bytes unpacked" in damage.notes[0]
+    assert stamps(bag) == [1, 3] and "announces 268435456 bytes unpacked" in read(bag)[1].notes[0]

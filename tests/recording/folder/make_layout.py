@@ -341,3 +341,10 @@ def half_size(view: DtuView) -> DtuView:
     mask = np.zeros((k.height // 2, k.width // 2), np.bool_)
     mask[20:-20, 30:-30] = True
     return replace(shrunk(view, 2), mask=mask)
+
+
+def changed_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """The file with its tree changed."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))

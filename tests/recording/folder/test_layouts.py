@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -14,13 +15,13 @@ from splatctrl_cli.recording.folder.layout import Layout
 from splatctrl_cli.recording.folder.layouts import LAYOUTS, layout_of
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import RgbdFrame
 from tests.recording.folder.make_layout import (
     EXAMPLES,
     GIVEN,
     POSES,
     WIDTH,
     K,
+    changed_json,
     check,
     color_of,
     make_bop,
@@ -33,6 +34,7 @@ from tests.recording.folder.make_layout import (
     matrix_text,
 )
 from tests.recording.log.make_log import frames_of
+from tests.refused import refused
 
 
 @pytest.fixture(params=[layout for layout in LAYOUTS if layout.name in EXAMPLES], ids=lambda layout: layout.name)
@@ -49,7 +51,7 @@ def test_a_layout_is_known_by_its_files_described_and_read_to_the_value(tmp_path
     summary = describe(folder)
     assert (summary.kind, summary.grids[0].rows) == (layout.name, [["camera", 3]])
     source = open_source(folder, example.options)
-    frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
+    frames = frames_of(source)
     check(frames, example.unit)
     assert source.has_clock == (example.stamps_ns is not None)
     if example.stamps_ns is not None:
@@ -81,88 +83,70 @@ def test_the_camera_of_a_tum_folder_is_known_by_its_name(tmp_path: Path) -> None
     frame = frames_of(make_tum(tmp_path / "rgbd_dataset_freiburg3_x"))[0]
     assert (frame.intrinsics.fx, frame.intrinsics.cy) == (535.4, 247.6)
     assert np.array_equal(frame.color, color_of(0))  # no distortion
-    with pytest.raises(InputError, match=r"expected calibration.txt, or a name with.*give --intrinsics camera="):
-        open_source(make_tum(tmp_path / "desk"))
+    refused(
+        r"expected calibration.txt, or a name with.*give --intrinsics camera=",
+        lambda: open_source(make_tum(tmp_path / "desk")),
+    )
 
 
 def test_tum_images_without_partner_or_pose_are_counted(tmp_path: Path) -> None:
     folder = make_tum(tmp_path / "freiburg3")
-    lines = (folder / "depth.txt").read_text().splitlines()
-    (folder / "depth.txt").write_text("\n".join(lines[1:]) + "\n")
-    rows = (folder / "groundtruth.txt").read_text().splitlines()
-    (folder / "groundtruth.txt").write_text("\n".join(rows[:5]) + "\n")
+    for name, kept in (("depth.txt", slice(1, None)), ("groundtruth.txt", slice(5))):
+        lines = (folder / name).read_text().splitlines(keepends=True)
+        (folder / name).write_text("".join(lines[kept]))
     source = open_source(folder, GIVEN)
     assert len(list(source.records())) == 1
     assert (source.loss.unpaired_color, source.loss.unpaired_depth, source.loss.without_pose) == (1, 0, 1)
 
 
 def test_an_open3d_scene_goes_by_number_where_there_are_more_poses(tmp_path: Path) -> None:
-    folder = make_redwood(tmp_path)
-    text = (folder / "trajectory.log").read_text()
-    for index in range(3):
-        text = text.replace(f"{index} {index} {index + 1}\n", f"{index + 9} {index + 9} {index + 10}\n")
-    (folder / "trajectory.log").write_text(f"0 0 1\n{matrix_text(np.eye(4))}" + text)
-    check(frames_of(folder))
+    log = make_redwood(tmp_path) / "trajectory.log"
+    text = re.sub(
+        r"^(\d) \1 \d$", lambda m: f"{int(m[1]) + 9} {int(m[1]) + 9} {int(m[1]) + 10}", log.read_text(), flags=re.M
+    )
+    log.write_text(f"0 0 1\n{matrix_text(np.eye(4))}" + text)
+    check(frames_of(tmp_path))
 
 
 def test_an_open3d_scene_without_intrinsics_asks_for_them(tmp_path: Path) -> None:
     folder = make_redwood(tmp_path / "scene")
     (folder / "camera_intrinsic.json").unlink()
-    with pytest.raises(InputError, match=r"no camera_intrinsic.json in it or above it; give --intrinsics"):
-        open_source(folder)
+    refused("no camera_intrinsic.json in it or above it; give --intrinsics", open_source, folder)
     check(frames_of(folder, GIVEN))
 
 
-@pytest.mark.parametrize("sequence", ["seq-01", "", "data"])
-def test_seven_scenes_take_65535_for_no_depth(tmp_path: Path, sequence: str) -> None:
-    source = open_source(make_frames(tmp_path, sequence), GIVEN)
-    check([r for r in source.records() if isinstance(r, RgbdFrame)])
-    assert source.loss.notes == []
-    assert not source.has_clock
-
-
-def test_frames_with_their_own_intrinsics_need_no_default(tmp_path: Path) -> None:
-    folder = make_frames(tmp_path)
+@pytest.mark.parametrize("sequence", ["", "data", "own"])
+def test_seven_scenes_need_no_default_where_intrinsics_are_given_or_their_own(tmp_path: Path, sequence: str) -> None:
+    folder = make_frames(tmp_path, sequence.replace("own", "data"))
     matrix = [[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]]
-    (folder / "camera-intrinsics.txt").write_text("\n".join(" ".join(map(str, row)) for row in matrix))
-    source = open_source(folder)
-    check([r for r in source.records() if isinstance(r, RgbdFrame)])
-    assert source.loss.notes == []
+    if sequence == "own":
+        (folder / "camera-intrinsics.txt").write_text("\n".join(" ".join(map(str, row)) for row in matrix))
+    source = open_source(folder, None if sequence == "own" else GIVEN)
+    check(frames_of(source))  # 65535 is no depth
+    assert source.loss.notes == [] and not source.has_clock
 
 
 def test_a_bop_scene_without_poses_needs_a_camera_that_stands_still(tmp_path: Path) -> None:
     folder = make_bop(tmp_path, with_poses=False)
-    with pytest.raises(InputError, match=r"scene_camera.json has no pose for any image.*give --camera-pose"):
-        open_source(folder)
-    still = SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)})
-    assert [frame.T_world_camera[:3, 3].tolist() for frame in frames_of(folder, still)] == [[1.0, 2.0, 3.0]] * 3
-    assert "camera camera: stands still where --camera-pose puts it" in open_source(folder, still).loss.notes[0]
+    refused("scene_camera.json has no pose for any image.*give --camera-pose", open_source, folder)
+    still = open_source(folder, SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)}))
+    assert [frame.T_world_camera[:3, 3].tolist() for frame in frames_of(still)] == [[1.0, 2.0, 3.0]] * 3
+    assert "camera camera: stands still where --camera-pose puts it" in still.loss.notes[0]
 
 
-def test_frames_with_a_lens_of_their_own_become_a_camera_of_their_own(tmp_path: Path) -> None:
-    frames = frames_of(make_nerfstudio(tmp_path, fl_x=20.0))
-    assert [(frame.camera, frame.intrinsics.fx) for frame in frames] == [
-        ("camera", 10.0),
-        ("camera-1", 20.0),
-        ("camera", 10.0),
-    ]
-
-
-def test_a_capture_refuses_a_camera_that_changes_its_lens(tmp_path: Path) -> None:
-    folder = make_nerfstudio(tmp_path, fl_x=20.0)
-    (tmp_path / "out").mkdir()
+def test_frames_with_a_lens_of_their_own_become_a_camera_that_a_capture_keeps_apart(tmp_path: Path) -> None:
+    folder = make_nerfstudio(tmp_path / "in", fl_x=20.0)
+    found = [(frame.camera, frame.intrinsics.fx) for frame in frames_of(folder)]
+    assert found == [("camera", 10.0), ("camera-1", 20.0), ("camera", 10.0)]
     write_capture(tmp_path / "out", open_source(folder))
-    with pytest.raises(InputError, match="camera holdout changes its intrinsics"):
-        write_capture(tmp_path / "again", open_source(folder, SourceOptions(holdout=("0", "1"))))
+    held = open_source(folder, SourceOptions(holdout=("0", "1")))
+    refused("camera holdout changes its intrinsics", write_capture, tmp_path / "again", held)
 
 
 def test_a_nerfstudio_frame_without_depth_is_named(tmp_path: Path) -> None:
     folder = make_nerfstudio(tmp_path)
-    content = json.loads((folder / "transforms.json").read_text())
-    del content["frames"][2]["depth_file_path"]
-    (folder / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"frame_2.png: depth_file_path is missing \(1 of 3 frames\)"):
-        open_source(folder)
+    changed_json(folder / "transforms.json", lambda content: content["frames"][2].pop("depth_file_path"))
+    refused("frame_2.png: depth_file_path is missing (1 of 3 frames)", open_source, folder)
 
 
 def test_a_folder_of_scenes_names_them(tmp_path: Path) -> None:
@@ -170,10 +154,8 @@ def test_a_folder_of_scenes_names_them(tmp_path: Path) -> None:
     make_scannet(tmp_path / "scene0000_00")
     (tmp_path / "notes").mkdir()
     (tmp_path / "run.bag").write_bytes(b"")
-    with pytest.raises(InputError, match=r"give one that is in it: kitchen \(Open3D scene\), run.bag, scene0000_00"):
-        open_source(tmp_path)
-    with pytest.raises(InputError, match=r"of no known kind; give one that is in it: kitchen"):
-        describe(tmp_path)
+    refused("give one that is in it: kitchen (Open3D scene), run.bag, scene0000_00", open_source, tmp_path)
+    refused("of no known kind; give one that is in it: kitchen", describe, tmp_path)
 
 
 def test_files_that_are_named_but_not_there_are_counted(tmp_path: Path) -> None:
@@ -185,28 +167,22 @@ def test_files_that_are_named_but_not_there_are_counted(tmp_path: Path) -> None:
     assert "1 of 3 views lack a file" in source.loss.notes[0]
     (folder / "rgb").rename(tmp_path / "rgb")
     (folder / "rgb.txt").write_text((folder / "rgb.txt").read_text().replace("rgb/", "../rgb/"))
-    with pytest.raises(InputError, match="is not in"):
-        open_source(folder, GIVEN)
+    refused("is not in", open_source, folder, GIVEN)
 
 
 def test_a_name_that_no_camera_has_is_refused(tmp_path: Path) -> None:
-    folder = make_redwood(tmp_path)
-    with pytest.raises(InputError, match="no camera 'cam0'; use one of: camera"):
-        open_source(folder, SourceOptions(camera_poses={"cam0": (0, 0, 0, 0, 0, 0, 1)}))
-    with pytest.raises(InputError, match="--intrinsics does not apply to a BOP scene"):
-        open_source(make_bop(tmp_path / "bop"), GIVEN)
-
-
-def test_frames_can_be_held_out_of_a_layout(tmp_path: Path) -> None:
-    frames = frames_of(make_bop(tmp_path), SourceOptions(holdout=("1",)))
-    assert [frame.camera for frame in frames] == ["camera", "holdout", "camera"]
+    still = SourceOptions(camera_poses={"cam0": (0, 0, 0, 0, 0, 0, 1)})
+    refused("no camera 'cam0'; use one of: camera", open_source, make_redwood(tmp_path), still)
+    bop = make_bop(tmp_path / "bop")
+    refused("--intrinsics does not apply to a BOP scene", open_source, bop, GIVEN)
+    held = frames_of(bop, SourceOptions(holdout=("1",)))
+    assert [frame.camera for frame in held] == ["camera", "holdout", "camera"]
 
 
 def test_a_tum_folder_without_its_poses_names_the_file(tmp_path: Path) -> None:
     folder = make_tum(tmp_path / "rgbd_dataset_freiburg3_x")
     (folder / "groundtruth.txt").unlink()
-    with pytest.raises(InputError, match=r"groundtruth.txt: no such file.*; copy it too, or give --camera-pose"):
-        open_source(folder)
+    refused("groundtruth.txt: no such file.*; copy it too, or give --camera-pose", open_source, folder)
     assert open_source(folder, SourceOptions(camera_poses={"camera": (0, 0, 0, 0, 0, 0, 1)})).cameras == ("camera",)
 
 
@@ -216,32 +192,28 @@ def without_depth(folder: Path, kind: str) -> Path:
         shutil.rmtree(make_mvsnet(folder) / "depths")
         return folder
     content = json.loads((make_nerfstudio(folder) / "transforms.json").read_text())
-    frames = [{k: v for k, v in frame.items() if k != "depth_file_path"} for frame in content["frames"]]
-    if kind == "nerfstudio":
-        (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
-        return folder
-    angle = 2 * math.atan(WIDTH / 2 / K[0])
-    frames = [{**frame, "file_path": frame["file_path"].removesuffix(".png"), "rotation": 0.01} for frame in frames]
-    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    for frame in content["frames"]:
+        del frame["depth_file_path"]
+        if kind == "Blender":
+            frame.update(file_path=frame["file_path"].removesuffix(".png"), rotation=0.01)
+    short = {"camera_angle_x": 2 * math.atan(WIDTH / 2 / K[0]), "frames": content["frames"]}
     (folder / "transforms.json").unlink()
+    name, told = ("transforms_train.json", short) if kind == "Blender" else ("transforms.json", content)
+    (folder / name).write_text(json.dumps(told))
     return folder
 
 
 @pytest.mark.parametrize("kind", ["nerfstudio", "Blender", "MVSNet"])
 def test_views_without_depth_say_so_first_and_what_works_without(tmp_path: Path, kind: str) -> None:
     folder = without_depth(tmp_path / "set", kind)
-    with pytest.raises(InputError) as caught:
-        open_source(folder)
-    message = str(caught.value)
-    assert "depth is missing: none of its 3 views has any; add " in message
+    said = "depth is missing: none of its 3 views has any; add "
+    message = refused(said, open_source, folder)
     assert "info, score and reconstruct --points CLOUD.ply work without depth" in message
-    assert "\n" not in message
-    assert describe(folder).missing[0].startswith("depth is missing: none of its 3 views has any; add ")
-    frames = [r for r in open_source(folder, needs_depth=False).records() if isinstance(r, RgbdFrame)]
+    assert describe(folder).missing[0].startswith(said)
+    frames = frames_of(open_source(folder, needs_depth=False))
     assert len(frames) == 3
     for index, frame in enumerate(frames):
-        assert not frame.depth.any()
-        assert np.array_equal(frame.color, color_of(index))
+        assert not frame.depth.any() and np.array_equal(frame.color, color_of(index))
         assert frame.T_world_camera == pytest.approx(POSES[index], abs=1e-9)
         assert frame.intrinsics.fx == pytest.approx(K[0])
 
@@ -253,5 +225,4 @@ def test_images_alone_say_that_depth_is_missing(tmp_path: Path, places: list[str
         (tmp_path / place).write_bytes(b"x")
     what = "images of a COLMAP model" if len(places) > 1 else "images"
     for look in (open_source, describe):
-        with pytest.raises(InputError, match=rf"depth is missing: {what} alone \(1\); describe colour"):
-            look(tmp_path)
+        refused(f"depth is missing: {what} alone (1); describe colour", look, tmp_path)

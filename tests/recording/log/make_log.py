@@ -2,7 +2,7 @@
 joints, tf), and good ones broken in exactly one way.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
@@ -19,12 +20,88 @@ from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RecordSource, RgbdFrame
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 SCHEMAS = {"cdr": "ros2msg", "ros1": "ros1msg", "protobuf": "protobuf", "json": "jsonschema"}  # by encoding
+
+
+def built(kind: str, store: Any = STORE, **given: Any) -> Any:
+    """A message of a type: dicts are messages within it, and what is not given is zero. Case is that of the type."""
+    folded = {name.lower(): value for name, value in given.items()}
+    fields = store.fielddefs[kind][1]
+    return store.types[kind](**{name: _field(store, folded.get(name.lower()), *form) for name, form in fields})
+
+
+def _field(store: Any, value: Any, node: Nodetype, detail: Any) -> Any:
+    if node == Nodetype.NAME:
+        return built(detail, store, **(value or {})) if value is None or isinstance(value, dict) else value
+    if node == Nodetype.BASE:
+        zero = "" if detail[0] == "string" else np.dtype(detail[0]).type().item()
+        return zero if value is None else value
+    (of, of_detail), size = detail
+    if of == Nodetype.NAME or of_detail[0] == "string":
+        return [_field(store, item, of, of_detail) for item in (() if value is None else value)]
+    if isinstance(value, bytes):
+        return np.frombuffer(value, np.uint8)
+    return np.array(np.zeros(size) if value is None else value, of_detail[0]).ravel()
+
+
+def header(stamp: int, frame: str = "", store: Any = STORE) -> Any:
+    """A std_msgs/Header of either ROS."""
+    time = dict(zip(("sec", "nanosec"), divmod(stamp, 1_000_000_000), strict=True))
+    return built("std_msgs/msg/Header", store, stamp=time, frame_id=frame)
+
+
+def image(
+    stamp: int,
+    frame: str,
+    encoding: str,
+    pixels: np.ndarray[Any, Any],
+    *,
+    big: bool = False,
+    padding: int = 0,
+    store: Any = STORE,
+) -> Any:
+    """A sensor_msgs/Image: pixels in either byte order, so many bytes behind each row."""
+    swapped = pixels.astype(pixels.dtype.newbyteorder(">" if big else "<"))
+    rows = np.frombuffer(swapped.tobytes(), dtype=np.uint8).reshape(len(pixels), -1)
+    padded = np.pad(rows, ((0, 0), (0, padding)), constant_values=77)
+    size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": padded.shape[1]}
+    form = {"header": header(stamp, frame, store), "encoding": encoding, "is_bigendian": int(big)}
+    return built(IMAGE, store, **form, **size, data=padded)
+
+
+def camera_info(
+    stamp: int, frame: str, size: tuple[int, int], lens: Sequence[float], *, store: Any = STORE, **said: Any
+) -> Any:
+    """A sensor_msgs/CameraInfo of images of this width and height, of a lens (fx, fy, cx, cy)."""
+    fx, fy, cx, cy = lens
+    known = {"distortion_model": "plumb_bob", "k": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "r": np.eye(3)}
+    stamped = {"header": header(stamp, frame, store), "width": size[0], "height": size[1]}
+    return built(CAMERA_INFO, store, **stamped, **(known | said))
+
+
+def transform(
+    stamp: int,
+    parent: str,
+    child: str,
+    position: Sequence[float] = (0, 0, 0),
+    quat: Sequence[float] = (0, 0, 0, 1),
+    store: Any = STORE,
+) -> Any:
+    """A geometry_msgs/TransformStamped."""
+    moved = {"translation": by_axis(position), "rotation": by_axis(quat)}
+    head = header(stamp, parent, store)
+    return built("geometry_msgs/msg/TransformStamped", store, header=head, child_frame_id=child, transform=moved)
+
+
+def by_axis(values: Sequence[float]) -> dict[str, float]:
+    """The fields x, y, z and, of a quaternion, w."""
+    return {axis: float(value) for axis, value in zip("xyzw", values, strict=False)}
 
 
 @lru_cache
@@ -67,12 +144,12 @@ def write_bag(
     messages: Iterable[RawMessage],
     store: Any = STORE,
     plugin: StoragePlugin | None = None,
-    mode: CompressionMode = CompressionMode.NONE,
+    mode: CompressionMode | Bag1Writer.CompressionFormat = CompressionMode.NONE,
 ) -> Path:
     """A bag of the messages by rosbags: of ROS 2 in a folder, kept by `plugin`, or without one a file of ROS 1."""
     writer = Bag1Writer(path) if plugin is None else Bag2Writer(path, version=9, storage_plugin=plugin)
-    if isinstance(writer, Bag2Writer) and mode != CompressionMode.NONE:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
+    if mode != CompressionMode.NONE:
+        writer.set_compression(*((mode, CompressionFormat.ZSTD) if isinstance(mode, CompressionMode) else (mode,)))
     with writer:
         connections: dict[str, Any] = {}
         for message in messages:
@@ -130,12 +207,10 @@ class LogRecipe:
     is_bigendian: bool = False
     step_padding: int = 0
     distortion: tuple[float, ...] = (0.0,) * 5
-    with_velocity: bool = True
     color_name: str = "image_raw"
     projection_focal: float = 0.0
     chunk_size: int = 4096
     mask_every: int = 0  # frames; 0: no masks
-    mask_encoding: str = "mono8"
 
 
 def camera_x(index: int) -> float:
@@ -145,7 +220,11 @@ def camera_x(index: int) -> float:
 
 def make_log(path: Path, recipe: LogRecipe | None = None) -> Path:
     """Write the log and return its path."""
-    return _LogWriter(path, recipe or LogRecipe()).write()
+    recipe = recipe or LogRecipe()
+    tf = list(_transforms(recipe)) if recipe.has_tf else []
+    body = [message for index in range(recipe.num_frames) for message in _frame(recipe, index)]
+    messages = (encoded(*message) for message in ([*body, *tf] if recipe.tf_last else [*tf, *body]))
+    return write_raw(path, messages, chunk_size=recipe.chunk_size)
 
 
 def color_pixels(index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
@@ -164,143 +243,71 @@ def mask_pixels(index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
     return mask
 
 
-class _LogWriter:
-    def __init__(self, path: Path, recipe: LogRecipe) -> None:
-        self.path, self.recipe = path, recipe
-
-    def write(self) -> Path:
-        recipe = self.recipe
-        tf = list(self._tf()) if recipe.has_tf else []
-        body = []
-        for index in range(recipe.num_frames):
-            body.extend(self._frame(index))
-        ordered = [*body, *tf] if recipe.tf_last else [*tf, *body]
-        messages = (encoded(time, topic, content) for time, topic, _, content in ordered)
-        return write_raw(self.path, messages, chunk_size=recipe.chunk_size)
-
-    def _tf(self) -> Any:
-        recipe = self.recipe
-        static = [self._transform(START_NS, f"{c}_link", f"{c}_optical", (0.0, 0.0, 0.5)) for c in recipe.cameras]
-        if recipe.depth_frame is not None:
-            static.append(self._transform(START_NS, f"{recipe.cameras[0]}_optical", recipe.depth_frame, (0.05, 0, 0)))
-        yield START_NS, "/tf_static", "tf2_msgs/msg/TFMessage", T["tf2_msgs/msg/TFMessage"](transforms=static)
-        for index in range(recipe.tf_frames if recipe.tf_frames is not None else recipe.num_frames):
-            stamp = START_NS + index * FRAME_NS + recipe.tf_delay_ns
-            moving = [
-                self._transform(stamp, "world", f"{c}_link", (camera_x(index), 0.0, 0.0)) for c in recipe.cameras
-            ]
-            yield stamp, "/tf", "tf2_msgs/msg/TFMessage", T["tf2_msgs/msg/TFMessage"](transforms=moving)
-
-    def _frame(self, index: int) -> Any:
-        recipe = self.recipe
-        stamp = START_NS + index * FRAME_NS
-        for camera in recipe.cameras:
-            optical = f"{camera}_optical"
-            yield stamp, *self._color(f"/{camera}/color/{recipe.color_name}", stamp, optical, index)
-            if recipe.has_info:
-                yield stamp, f"/{camera}/color/camera_info", *self._info(stamp, optical, (WIDTH, HEIGHT))
-            if recipe.has_depth:
-                frame = recipe.depth_frame or optical
-                late = stamp + recipe.depth_delay_ns
-                yield late, f"/{camera}/depth/image_raw", *self._depth(late, frame)
-                if recipe.depth_frame is not None:
-                    yield stamp, f"/{camera}/depth/camera_info", *self._info(stamp, frame, recipe.depth_size)
-            if recipe.mask_every and index % recipe.mask_every == 0:
-                mask = self._image(late, optical, recipe.mask_encoding, mask_pixels(index))
-                yield late, f"/{camera}/people/mask", "sensor_msgs/msg/Image", mask
-        if recipe.has_joints:
-            yield stamp, "/joint_states", *self._joints(stamp, index)
-
-    def _color(self, topic: str, stamp: int, frame: str, index: int) -> tuple[str, str, Any]:
-        pixels, form = color_pixels(index), self.recipe.color_format
-        if form in {"jpeg", "png"}:
-            data = cv2.imencode(f".{form}", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1]
-            kind = "sensor_msgs/msg/CompressedImage"
-            return f"{topic}/compressed", kind, T[kind](header=header(stamp, frame), format=form, data=data.ravel())
-        encoded = {
-            "rgb8": pixels,
-            "bgr8": pixels[..., ::-1],
-            "rgba8": np.dstack([pixels, np.full((HEIGHT, WIDTH), 255, np.uint8)]),
-            "bgra8": np.dstack([pixels[..., ::-1], np.full((HEIGHT, WIDTH), 255, np.uint8)]),
-            "mono8": pixels[..., 1],
-        }[form]
-        return topic, "sensor_msgs/msg/Image", self._image(stamp, frame, form, encoded)
-
-    def _depth(self, stamp: int, frame: str) -> tuple[str, Any]:
-        recipe = self.recipe
-        width, height = recipe.depth_size
-        if recipe.depth_encoding == "32FC1":
-            pixels = np.full((height, width), recipe.depth_m, dtype=np.float32)
-            pixels[0, 0] = np.nan
-        else:
-            counts = round(recipe.depth_m * 1000) if recipe.depth_counts is None else recipe.depth_counts
-            pixels = np.full((height, width), counts, dtype=np.uint16)
-            pixels[0, 0] = 0
-        pixels[0, 1 + (stamp - START_NS) // FRAME_NS % 20] = 0  # by noise no image equals the one before
-        return "sensor_msgs/msg/Image", self._image(stamp, frame, recipe.depth_encoding, pixels)
-
-    def _image(self, stamp: int, frame: str, encoding: str, pixels: np.ndarray[Any, Any]) -> Any:
-        big = self.recipe.is_bigendian
-        swapped = pixels.astype(pixels.dtype.newbyteorder(">" if big else "<"))
-        rows = np.frombuffer(swapped.tobytes(), dtype=np.uint8).reshape(pixels.shape[0], -1)
-        padded = np.pad(rows, ((0, 0), (0, self.recipe.step_padding)), constant_values=77)
-        return T["sensor_msgs/msg/Image"](
-            header=header(stamp, frame),
-            height=pixels.shape[0],
-            width=pixels.shape[1],
-            encoding=encoding,
-            is_bigendian=int(big),
-            step=padded.shape[1],
-            data=padded.ravel(),
-        )
-
-    def _info(self, stamp: int, frame: str, size: tuple[int, int]) -> tuple[str, Any]:
-        width, height = size
-        f = 30.0 * width / WIDTH
-        K = np.array([f, 0, (width - 1) / 2, 0, f, (height - 1) / 2, 0, 0, 1])
-        roi = T["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        return "sensor_msgs/msg/CameraInfo", T["sensor_msgs/msg/CameraInfo"](
-            header=header(stamp, frame),
-            height=height,
-            width=width,
-            distortion_model="plumb_bob",
-            d=np.array(self.recipe.distortion),
-            k=K,
-            r=np.eye(3).ravel(),
-            p=np.array([self.recipe.projection_focal, 0, 16, 0, 0, self.recipe.projection_focal, 12, 0, 0, 0, 1, 0]),
-            binning_x=0,
-            binning_y=0,
-            roi=roi,
-        )
-
-    def _joints(self, stamp: int, index: int) -> tuple[str, Any]:
-        velocity = np.array([1.0, -1.0]) if self.recipe.with_velocity else np.zeros(0)
-        return "sensor_msgs/msg/JointState", T["sensor_msgs/msg/JointState"](
-            header=header(stamp, ""),
-            name=["joint_a", "joint_b"],
-            position=np.array([0.1 * index, -0.1 * index]),
-            velocity=velocity,
-            effort=np.zeros(0),
-        )
-
-    @staticmethod
-    def _transform(stamp: int, parent: str, child: str, position: tuple[float, ...]) -> Any:
-        x, y, z = position
-        return T["geometry_msgs/msg/TransformStamped"](
-            header=header(stamp, parent),
-            child_frame_id=child,
-            transform=T["geometry_msgs/msg/Transform"](
-                translation=T["geometry_msgs/msg/Vector3"](x=float(x), y=float(y), z=float(z)),
-                rotation=T["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
-            ),
-        )
+Content = tuple[int, str, Any]  # log time [ns], topic, message
 
 
-def header(stamp: int, frame: str) -> Any:
-    """A std_msgs/Header."""
-    seconds, nanoseconds = divmod(stamp, 1_000_000_000)
-    time = T["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-    return T["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+def _transforms(recipe: LogRecipe) -> Iterator[Content]:
+    static = [transform(START_NS, f"{name}_link", f"{name}_optical", (0, 0, 0.5)) for name in recipe.cameras]
+    if recipe.depth_frame is not None:
+        static.append(transform(START_NS, f"{recipe.cameras[0]}_optical", recipe.depth_frame, (0.05, 0, 0)))
+    yield START_NS, "/tf_static", built("tf2_msgs/msg/TFMessage", transforms=static)
+    for index in range(recipe.num_frames if recipe.tf_frames is None else recipe.tf_frames):
+        stamp = START_NS + index * FRAME_NS + recipe.tf_delay_ns
+        moving = [transform(stamp, "world", f"{name}_link", (camera_x(index), 0, 0)) for name in recipe.cameras]
+        yield stamp, "/tf", built("tf2_msgs/msg/TFMessage", transforms=moving)
+
+
+def _frame(recipe: LogRecipe, index: int) -> Iterator[Content]:
+    stamp = START_NS + index * FRAME_NS
+    late = stamp + recipe.depth_delay_ns
+    form = {"big": recipe.is_bigendian, "padding": recipe.step_padding}
+    for camera in recipe.cameras:
+        optical = f"{camera}_optical"
+        frame = recipe.depth_frame or optical
+        yield stamp, *_color(recipe, f"/{camera}/color/{recipe.color_name}", stamp, optical, index)
+        if recipe.has_info:
+            yield stamp, f"/{camera}/color/camera_info", _info(recipe, stamp, optical, (WIDTH, HEIGHT))
+        if recipe.has_depth:
+            pixels = _depth(recipe, index)
+            yield late, f"/{camera}/depth/image_raw", image(late, frame, recipe.depth_encoding, pixels, **form)
+        if recipe.has_depth and recipe.depth_frame is not None:
+            yield stamp, f"/{camera}/depth/camera_info", _info(recipe, stamp, frame, recipe.depth_size)
+        if recipe.mask_every and index % recipe.mask_every == 0:
+            yield late, f"/{camera}/people/mask", image(late, optical, "mono8", mask_pixels(index), **form)
+    if recipe.has_joints:
+        moved = {"name": ["joint_a", "joint_b"], "position": [0.1 * index, -0.1 * index], "velocity": [1.0, -1.0]}
+        yield stamp, "/joint_states", built(JOINT_STATE, header=header(stamp), **moved)
+
+
+def _color(recipe: LogRecipe, topic: str, stamp: int, frame: str, index: int) -> tuple[str, Any]:
+    pixels, form = color_pixels(index), recipe.color_format
+    if form in {"jpeg", "png"}:
+        data = cv2.imencode(f".{form}", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1]
+        return f"{topic}/compressed", built(COMPRESSED_IMAGE, header=header(stamp, frame), format=form, data=data)
+    turned = pixels[..., ::-1] if form.startswith("bgr") else pixels
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    forms = {"rgba8": np.dstack([turned, alpha]), "bgra8": np.dstack([turned, alpha]), "mono8": pixels[..., 1]}
+    odd = {"big": recipe.is_bigendian, "padding": recipe.step_padding}
+    return topic, image(stamp, frame, form, forms.get(form, turned), **odd)
+
+
+def _depth(recipe: LogRecipe, index: int) -> np.ndarray[Any, Any]:
+    size = recipe.depth_size[::-1]
+    if recipe.depth_encoding == "32FC1":
+        pixels = np.full(size, recipe.depth_m, np.float32)
+        pixels[0, 0] = np.nan
+    else:
+        counts = round(recipe.depth_m * 1000) if recipe.depth_counts is None else recipe.depth_counts
+        pixels = np.full(size, counts, np.uint16)
+        pixels[0, 0] = 0
+    pixels[0, 1 + (index + recipe.depth_delay_ns // FRAME_NS) % 20] = 0  # by noise no image equals the one before
+    return pixels
+
+
+def _info(recipe: LogRecipe, stamp: int, frame: str, size: tuple[int, int]) -> Any:
+    f, p = 30.0 * size[0] / WIDTH, recipe.projection_focal
+    lens = (f, f, (size[0] - 1) / 2, (size[1] - 1) / 2)
+    return camera_info(stamp, frame, size, lens, d=recipe.distortion, p=[p, 0, 16, 0, 0, p, 12, 0, 0, 0, 1, 0])
 
 
 Message = tuple[int, str, str, Any]  # log time [ns], topic, type, message

@@ -5,18 +5,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.log.decoder import JOINT_STATE
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import JointState, RecordSource
-from tests.recording.log.make_log import STORE, encoded, write_bag, write_raw
+from tests.recording.log.make_log import START_NS, STORE, built, encoded, write_bag, write_raw
+from tests.recording.log.make_log import header as stamped_header
+from tests.refused import refused
 
-START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 POINT = "trajectory_msgs/JointTrajectoryPoint"
 OLD_CONTROLLER = f"std_msgs/Header header\nstring[] joint_names\n{POINT} desired\n{POINT} actual\n{POINT} error\n"
@@ -54,14 +53,7 @@ def store_with(**definitions: str) -> Any:
 
 def header(store: Any, stamp_ns: int, frame: str = "") -> Any:
     """A std_msgs/Header of either ROS."""
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    kind, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
-    stamp = time(sec=seconds, nanosec=nanoseconds)
-    return (
-        kind(seq=0, stamp=stamp, frame_id=frame)
-        if "seq" in kind.__dataclass_fields__
-        else kind(stamp=stamp, frame_id=frame)
-    )
+    return stamped_header(stamp_ns, frame, store)
 
 
 def joint_state(
@@ -73,13 +65,8 @@ def joint_state(
     store: Any = STORE,
 ) -> Any:
     """A sensor_msgs/JointState."""
-    return store.types["sensor_msgs/msg/JointState"](
-        header=header(store, stamp_ns),
-        name=list(names),
-        position=np.array(position, dtype=np.float64),
-        velocity=np.array(velocity, dtype=np.float64),
-        effort=np.zeros(0),
-    )
+    head = header(store, stamp_ns)
+    return built(JOINT_STATE, store, header=head, name=names, position=position, velocity=velocity)
 
 
 def states_of(
@@ -97,7 +84,7 @@ def states_of(
         Message(
             log_ns=stamp + log_delay_ns,
             topic=topic,
-            type_name="sensor_msgs/msg/JointState",
+            type_name=JOINT_STATE,
             content=joint_state(stamp, names, q[i], () if velocity is None else velocity[i]),
         )
         for i, stamp in enumerate(times)
@@ -135,9 +122,5 @@ def states(source: Path | RecordSource) -> list[JointState]:
 
 
 def refusal(path: Path, joints: tuple[str, ...] = AB, **options: Any) -> str:
-    """Why there are none, which comes with a remedy."""
-    with pytest.raises(InputError) as caught:
-        opened(path, joints, **options)
-    assert caught.value.exit_code == 4
-    assert caught.value.remedy
-    return str(caught.value)
+    """Why there are none."""
+    return refused("", opened, path, joints, has_remedy=True, **options)

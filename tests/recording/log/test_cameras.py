@@ -1,6 +1,6 @@
 """Cameras found in the topic names that real drivers use, and what names of topics say of their images."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,166 +18,114 @@ from splatctrl_cli.recording.log.messages import ImageMessage
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
-from tests.recording.log.make_log import LogRecipe, Message, T, broken_log, make_log, messages_of, write_raw
+from tests.recording.log.make_log import LogRecipe, Message, broken_log, built, make_log, messages_of, write_raw
+from tests.refused import refused
 
 
-@dataclass(frozen=True, kw_only=True)
-class Has:
-    """A topic of the pretended log; a focal length makes it a CameraInfo."""
-
-    name: str
-    encoding: str = "rgb8"
-    size: tuple[int, int] = (640, 480)
-    frame: str = "optical"
-    focal: float = 0.0
-
-
-def log_with(*topics: Has) -> Survey:
+def log_with(topics: Mapping[str, str]) -> Survey:
+    """Topics of the pretended log: encoding or, of a CameraInfo, focal length [px]; frame; width, height."""
     survey = Survey()
-    for has in topics:
-        compressed = b"" if has.name.endswith("compressed") else None
-        kind = CAMERA_INFO if has.focal else IMAGE if compressed is None else COMPRESSED_IMAGE
-        entry = TopicSurvey(topic=Topic(name=has.name, type_name=kind, encoding="cdr"), count=1)
-        if has.focal:
-            K = np.array([[has.focal, 0, 320], [0, has.focal, 240], [0, 0, 1.0]])
-            entry.calibration = Calibration(
-                width=has.size[0],
-                height=has.size[1],
-                K=K,
-                projection=np.zeros((3, 3)),
-                rotation=np.zeros((3, 3)),
-                distortion_model="plumb_bob",
-                distortion=np.zeros(5),
-                frame_id=has.frame,
-            )
+    for name, said in topics.items():
+        what, frame, width, height = (said.split() + ["optical", "640", "480"][len(said.split()) - 1 :])[:4]
+        size = {"width": int(width), "height": int(height)}
+        compressed = b"" if name.endswith("compressed") else None
+        kind = CAMERA_INFO if what.isdigit() else IMAGE if compressed is None else COMPRESSED_IMAGE
+        entry = TopicSurvey(topic=Topic(name=name, type_name=kind, encoding="cdr"), count=1)
+        if what.isdigit():
+            K, none = np.array([[int(what), 0, 320], [0, int(what), 240], [0, 0, 1.0]]), np.zeros((3, 3))
+            lens: dict[str, Any] = {"K": K, "distortion_model": "plumb_bob", "distortion": np.zeros(5)}
+            entry.calibration = Calibration(projection=none, rotation=none, frame_id=frame, **size, **lens)
         else:
-            width, height = has.size
+            decode = partial(np.zeros, (int(height), int(width)), np.uint8)
             entry.first_image = ImageMessage(
-                stamp_ns=0,
-                frame_id=has.frame,
-                encoding=has.encoding,
-                width=width,
-                height=height,
-                decode=partial(np.zeros, (height, width), np.uint8),
-                compressed=compressed,
+                stamp_ns=0, frame_id=frame, encoding=what, decode=decode, compressed=compressed, **size
             )
-        survey.topics[has.name] = entry
+        survey.topics[name] = entry
     return survey
 
 
-def test_a_realsense_prefers_depth_aligned_to_colour_and_colour_to_infrared() -> None:
-    (camera,) = find_cameras(
-        log_with(
-            Has(name="/camera/camera/color/image_raw"),
-            Has(name="/camera/camera/color/image_raw/compressed"),
-            Has(name="/camera/camera/color/camera_info", focal=615),
-            Has(name="/camera/camera/depth/image_rect_raw", encoding="16UC1", frame="depth"),
-            Has(name="/camera/camera/depth/camera_info", focal=390, frame="depth"),
-            Has(name="/camera/camera/aligned_depth_to_color/image_raw", encoding="16UC1"),
-            Has(name="/camera/camera/aligned_depth_to_color/camera_info", focal=615),
-            Has(name="/camera/camera/infra1/image_rect_raw", encoding="mono8", frame="infra"),
-        )
-    )
-    assert camera.name == "camera"
-    assert camera.color == "/camera/camera/color/image_raw"
-    assert camera.depth == "/camera/camera/aligned_depth_to_color/image_raw"
-    assert camera.info == "/camera/camera/color/camera_info"
+SIDES = [f"/robot/{side}/{kind}/image_raw" for side in ("left", "right") for kind in ("color", "depth")]
+
+ARMS = [f"/{arm}/cam/{kind}/image_raw" for arm in ("arm_a", "arm_b") for kind in ("color", "depth")]
+
+NO_NAMES = {"/cam/rgb/image": "rgb8", "/cam/depth/image": "32FC1 depth"}
 
 
-def test_a_kinect_prefers_depth_in_the_colour_camera() -> None:
-    (camera,) = find_cameras(
-        log_with(
-            Has(name="/k4a/rgb/image_raw", encoding="bgra8"),
-            Has(name="/k4a/rgb/camera_info", focal=600),
-            Has(name="/k4a/depth/image_raw", encoding="16UC1", frame="depth", size=(320, 288)),
-            Has(name="/k4a/depth/camera_info", focal=250, frame="depth", size=(320, 288)),
-            Has(name="/k4a/depth_to_rgb/image_raw", encoding="16UC1"),
-            Has(name="/k4a/depth_to_rgb/camera_info", focal=600),
-        )
-    )
-    assert (camera.name, camera.depth) == ("k4a", "/k4a/depth_to_rgb/image_raw")
-
-
-def test_the_freiburg_recordings_are_one_camera() -> None:
-    (camera,) = find_cameras(
-        log_with(
-            Has(name="/camera/rgb/image_color"),
-            Has(name="/camera/rgb/camera_info", focal=525),
-            Has(name="/camera/depth/image", encoding="32FC1"),
-            Has(name="/camera/depth/camera_info", focal=525),
-        )
-    )
-    assert camera.info == "/camera/rgb/camera_info"
-    assert camera.depth_info == "/camera/depth/camera_info"
-
-
-def test_two_cameras_below_one_namespace_keep_apart() -> None:
-    cameras = find_cameras(
-        log_with(
-            *(
-                Has(name=f"/robot/{side}/{kind}/image_raw", encoding=encoding)
-                for side in ("left", "right")
-                for kind, encoding in (("color", "rgb8"), ("depth", "16UC1"))
-            )
-        )
-    )
-    assert [(c.name, c.color, c.depth) for c in cameras] == [
-        ("left", "/robot/left/color/image_raw", "/robot/left/depth/image_raw"),
-        ("right", "/robot/right/color/image_raw", "/robot/right/depth/image_raw"),
-    ]
-
-
-def test_cameras_of_the_same_last_name_are_told_apart_by_all_of_it() -> None:
-    names = [
-        camera.name
-        for camera in find_cameras(
-            log_with(
-                *(
-                    Has(name=f"/{arm}/cam/{kind}/image_raw", encoding=encoding)
-                    for arm in ("arm_a", "arm_b")
-                    for kind, encoding in (("color", "rgb8"), ("depth", "16UC1"))
-                )
-            )
-        )
-    ]
-    assert names == ["arm_a_cam", "arm_b_cam"]
-
-
-@pytest.mark.parametrize("info", ["/cam/camera_info", "/cam/rgb/camera_info"])
-def test_a_calibration_beside_or_above_the_image_is_found(info: str) -> None:
-    (camera,) = find_cameras(
-        log_with(
-            Has(name="/cam/rgb/image"), Has(name="/cam/depth/image", encoding="32FC1"), Has(name=info, focal=500)
-        )
-    )
-    assert camera.info == info
-
-
-def test_the_depth_cameras_calibration_is_not_taken_for_the_colours() -> None:
-    (camera,) = find_cameras(
-        log_with(
-            Has(name="/cam/rgb/image"),
-            Has(name="/cam/depth/image", encoding="32FC1", frame="depth"),
-            Has(name="/cam/depth/camera_info", focal=390, frame="depth"),
-        )
-    )
-    assert camera.info == ""
-
-
-def test_topics_without_a_namespace_are_one_camera() -> None:
-    (camera,) = find_cameras(log_with(Has(name="/rgb"), Has(name="/depth", encoding="16UC1")))
-    assert (camera.name, camera.color, camera.depth) == ("camera", "/rgb", "/depth")
-
-
-def test_a_lone_colour_camera_takes_no_other_cameras_depth() -> None:
-    cameras = find_cameras(
-        log_with(
-            Has(name="/robot/wrist/color/image_raw"),
-            Has(name="/robot/wrist/depth/image_raw", encoding="16UC1"),
-            Has(name="/robot/webcam/image_raw"),
-        )
-    )
-    assert [camera.color for camera in cameras] == ["/robot/wrist/color/image_raw"]
+@pytest.mark.parametrize(
+    ("topics", "cameras"),
+    [
+        (
+            {
+                "/camera/camera/color/image_raw": "rgb8",
+                "/camera/camera/color/image_raw/compressed": "rgb8",
+                "/camera/camera/color/camera_info": "615",
+                "/camera/camera/depth/image_rect_raw": "16UC1 depth",
+                "/camera/camera/depth/camera_info": "390 depth",
+                "/camera/camera/aligned_depth_to_color/image_raw": "16UC1",
+                "/camera/camera/aligned_depth_to_color/camera_info": "615",
+                "/camera/camera/infra1/image_rect_raw": "mono8 infra",
+            },
+            [
+                {
+                    "name": "camera",
+                    "color": "/camera/camera/color/image_raw",
+                    "depth": "/camera/camera/aligned_depth_to_color/image_raw",
+                    "info": "/camera/camera/color/camera_info",
+                }
+            ],
+        ),
+        (
+            {
+                "/k4a/rgb/image_raw": "bgra8",
+                "/k4a/rgb/camera_info": "600",
+                "/k4a/depth/image_raw": "16UC1 depth 320 288",
+                "/k4a/depth/camera_info": "250 depth 320 288",
+                "/k4a/depth_to_rgb/image_raw": "16UC1",
+                "/k4a/depth_to_rgb/camera_info": "600",
+            },
+            [{"name": "k4a", "depth": "/k4a/depth_to_rgb/image_raw"}],
+        ),
+        (
+            {
+                "/camera/rgb/image_color": "rgb8",
+                "/camera/rgb/camera_info": "525",
+                "/camera/depth/image": "32FC1",
+                "/camera/depth/camera_info": "525",
+            },
+            [{"info": "/camera/rgb/camera_info", "depth_info": "/camera/depth/camera_info"}],
+        ),
+        (
+            dict(zip(SIDES, ["rgb8", "16UC1"] * 2, strict=True)),
+            [
+                {"name": "left", "color": SIDES[0], "depth": SIDES[1]},
+                {"name": "right", "color": SIDES[2], "depth": SIDES[3]},
+            ],
+        ),
+        (dict(zip(ARMS, ["rgb8", "16UC1"] * 2, strict=True)), [{"name": "arm_a_cam"}, {"name": "arm_b_cam"}]),
+        *(
+            ({"/cam/rgb/image": "rgb8", "/cam/depth/image": "32FC1", info: "500"}, [{"info": info}])
+            for info in ("/cam/camera_info", "/cam/rgb/camera_info")
+        ),
+        (NO_NAMES | {"/cam/depth/camera_info": "390 depth"}, [{"info": ""}]),
+        ({"/rgb": "rgb8", "/depth": "16UC1"}, [{"name": "camera", "color": "/rgb", "depth": "/depth"}]),
+        (
+            {
+                "/robot/wrist/color/image_raw": "rgb8",
+                "/robot/wrist/depth/image_raw": "16UC1",
+                "/robot/webcam/image_raw": "rgb8",
+            },
+            [{"color": "/robot/wrist/color/image_raw"}],
+        ),
+    ],
+    ids=[
+        *("RealSense: aligned depth, no infrared", "Kinect: depth in the colour camera", "Freiburg"),
+        *("two below one namespace", "the same last name", "CameraInfo above", "CameraInfo beside"),
+        *("the depth camera's is not the colour's", "no namespace", "a lone colour camera takes no other's depth"),
+    ],
+)
+def test_cameras_are_found_in_the_topics_of_drivers(topics: dict[str, str], cameras: list[dict[str, str]]) -> None:
+    found = find_cameras(log_with(topics))
+    assert [{key: getattr(c, key) for key in want} for c, want in zip(found, cameras, strict=True)] == cameras
 
 
 DEPTHS = (
@@ -190,6 +138,7 @@ DEPTHS = (
     "ir_camera/depth/image",
     "aux/depthmap",
 )
+
 OTHERS = (
     "camera/infra1/image_rect_raw",
     "ir/image_raw",
@@ -202,6 +151,7 @@ OTHERS = (
     "ouster/nearir_image",
     "stereo/disparity",
 )
+
 SILENT = (
     "camera/image_raw",
     "left/image_rect",
@@ -216,20 +166,16 @@ SILENT = (
 def test_a_topic_says_depth_or_something_else_or_nothing(name: str) -> None:
     word = word_of(tuple(name.split("/")))
     assert (word == DEPTH, is_other(word)) == (name in DEPTHS, name in OTHERS)
-
-
-def test_a_depth_camera_may_give_colour() -> None:
-    assert word_of(("depth_camera", "image_raw")) == DEPTH
-    assert word_of(("depth_camera", "image_raw"), is_device=False) == ""
-    assert word_of(("depth", "image_raw"), is_device=False) == DEPTH
+    assert word_of(("depth_camera", "image_raw"), is_device=False) == "", "a depth camera may give colour"
+    assert word_of(("depth_camera", "image_raw")) == word_of(("depth", "image_raw"), is_device=False) == DEPTH
 
 
 def _as_jpeg(log_ns: int, topic: str, kind: str, message: Any) -> list[Message]:
     if topic != "/cam0/depth/image_raw":
         return [(log_ns, topic, kind, message)]
     counts = np.frombuffer(message.data.tobytes(), "<u2").reshape(message.height, message.width)
-    data = cv2.imencode(".jpg", (counts >> 4).astype(np.uint8))[1].ravel()
-    packed = T["sensor_msgs/msg/CompressedImage"](header=message.header, format="jpeg", data=data)
+    data = cv2.imencode(".jpg", (counts >> 4).astype(np.uint8))[1]
+    packed = built(COMPRESSED_IMAGE, header=message.header, format="jpeg", data=data)
     return [(log_ns, f"{topic}/compressed", packed.__msgtype__, packed)]
 
 
@@ -238,14 +184,12 @@ def test_a_jpeg_on_a_depth_topic_is_neither_depth_nor_colour(tmp_path: Path, *, 
     path = broken_log(tmp_path / "log.mcap", _as_jpeg, LogRecipe(num_frames=6))
     messages = [m for m in messages_of(path) if has_color or "color/image" not in m.topic.name]
     write_raw(tmp_path / "log.mcap", messages)
-    with pytest.raises(InputError, match=r"/cam0/depth/image_raw/compressed \(.*JPEG loses depth: record PNG\)"):
-        open_source(path)
+    refused(r"/cam0/depth/image_raw/compressed \(.*JPEG loses depth: record PNG\)", open_source, path)
     if has_color:
         given = CameraTopics(
             name="c", color="/cam0/color/image_raw/compressed", depth="/cam0/depth/image_raw/compressed"
         )
-        with pytest.raises(InputError, match="expected depth images, got mono8"):
-            open_source(path, SourceOptions(camera_topics=(given,)))
+        refused("expected depth images, got mono8", open_source, path, SourceOptions(camera_topics=(given,)))
 
 
 def test_colour_and_depth_in_one_message_are_named_with_what_to_record_instead(tmp_path: Path) -> None:

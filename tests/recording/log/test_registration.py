@@ -1,64 +1,63 @@
 """Depth warped into the colour camera; lens distortion removed."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from pinocchio.rpy import rpyToMatrix
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.recording.log.registration import DepthToColor, Undistortion
 from splatctrl_cli.records import Intrinsics
+from tests.refused import refused
 
 SMALL = Intrinsics(fx=40, fy=40, cx=19.5, cy=14.5, width=40, height=30)
+
 LARGE = Intrinsics(fx=64, fy=64, cx=31.5, cy=23.5, width=64, height=48)
-
-
-def shift(x: float = 0.0, z: float = 0.0) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    return pose_at([x, 0, z])
 
 
 def test_the_same_camera_gives_the_same_depth() -> None:
     depth = np.random.default_rng(0).uniform(0.5, 2.0, (30, 40)).astype(np.float32)
     depth[5, 5] = 0
-    warped = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=SMALL, T_color_depth=np.eye(4)).warp(depth)
-    assert warped == pytest.approx(depth, abs=1e-6)
+    assert warped(depth) == pytest.approx(depth, abs=1e-6)
 
 
-def test_a_wall_fills_a_finer_color_camera_without_holes() -> None:
+def test_a_wall_fills_a_finer_color_camera_without_holes_and_is_left_out_behind_it() -> None:
     wall = np.full((30, 40), 1.5, dtype=np.float32)
-    warped = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=LARGE, T_color_depth=shift(z=0.1)).warp(wall)
-    inside = warped[4:-4, 4:-4]
-    assert inside == pytest.approx(1.6, abs=1e-6)
+    assert warped(wall, LARGE, z=0.1)[4:-4, 4:-4] == pytest.approx(1.6, abs=1e-6)
+    assert not warped(wall, z=-1.7).any()
 
 
 def test_a_baseline_moves_a_column_by_its_disparity() -> None:
     depth = np.zeros((30, 40), dtype=np.float32)
     depth[:, 10] = 0.8
-    warped = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=SMALL, T_color_depth=shift(x=0.1)).warp(depth)
-    columns = np.flatnonzero(warped[15])
-    assert columns.tolist() == [10 + round(40 * 0.1 / 0.8)]
+    assert np.flatnonzero(warped(depth, x=0.1)[15]).tolist() == [10 + round(40 * 0.1 / 0.8)]
 
 
 def test_the_nearest_of_two_surfaces_on_a_pixel_counts() -> None:
     depth = np.zeros((30, 40), dtype=np.float32)
     depth[15, 20], depth[15, 24] = 0.5, 2.0  # with x = 0.1: disparities 8 and 2 px
     depth[15, 26] = 2.0
-    warped = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=SMALL, T_color_depth=shift(x=0.1)).warp(depth)
-    assert warped[15, 28] == pytest.approx(0.5)
-    assert warped[15, 26] == pytest.approx(2.0)
+    assert warped(depth, x=0.1)[15, [28, 26]] == pytest.approx([0.5, 2.0])
 
 
-def test_points_behind_the_color_camera_are_left_out() -> None:
-    depth = np.full((30, 40), 0.3, dtype=np.float32)
-    warp = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=SMALL, T_color_depth=shift(z=-0.5))
-    assert not warp.warp(depth).any()
-
-
-def test_undistorting_without_distortion_changes_nothing() -> None:
+@pytest.mark.parametrize(
+    ("model", "coefficients", "said"),
+    [
+        ("plumb_bob", [-500.0, 0, 0, 0, 0], "the camera saw 0% of the pinhole's image, expected at least 25%"),
+        ("plumb_bob", [0.01, 0, 0], "plumb_bob: expected 4, 5, 8, 12, 14 coefficients, got 3; calibrate again"),
+        ("equidistant", [0.01, 0, 0], "equidistant: expected 4 coefficients, got 3; calibrate again"),
+    ],
+)
+def test_coefficients_that_no_model_has_or_that_show_hardly_anything_are_refused(
+    model: str, coefficients: list[float], said: str
+) -> None:
+    refused(said, Undistortion, SMALL, model, np.array(coefficients))
     image = np.random.default_rng(1).integers(0, 256, (30, 40, 3)).astype(np.uint8)
-    assert np.array_equal(Undistortion(SMALL, "plumb_bob", np.zeros(5)).color(image), image)
+    assert np.array_equal(Undistortion(SMALL, "plumb_bob", np.zeros(5)).color(image), image), "none changes nothing"
+    barrel = Undistortion(SMALL, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0]))
+    assert barrel.valid is None, "shows every pixel of its own pinhole"
 
 
 @pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
@@ -92,10 +91,6 @@ def test_a_turned_and_zoomed_result_shows_what_the_lens_saw_there() -> None:
     assert np.array_equal(seen, (column >= 0) & (column <= 63) & (row >= 0) & (row <= 47))
 
 
-def test_a_barrel_shows_every_pixel_of_its_own_pinhole() -> None:
-    assert Undistortion(SMALL, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0])).valid is None
-
-
 @pytest.mark.parametrize(
     ("model", "coefficients", "turns_at"),
     [
@@ -116,17 +111,6 @@ def test_where_a_polynomial_turns_back_nothing_is_shown_twice(
     assert np.array_equal(valid, radius < turns_at)
 
 
-def test_a_lens_that_saw_hardly_anything_is_refused() -> None:
-    with pytest.raises(InputError, match=r"the camera saw 0% of the pinhole's image, expected at least 25%"):
-        Undistortion(SMALL, "plumb_bob", np.array([-500.0, 0, 0, 0, 0]))
-
-
-@pytest.mark.parametrize(("model", "counts"), [("plumb_bob", "4, 5, 8, 12, 14"), ("equidistant", "4")])
-def test_a_number_of_coefficients_that_no_model_has_is_refused(model: str, counts: str) -> None:
-    with pytest.raises(InputError, match=rf"{model}: expected {counts} coefficients, got 3; calibrate again"):
-        Undistortion(SMALL, model, np.array([0.01, 0, 0]))
-
-
 def test_the_depth_cameras_own_lens_is_undone_before_its_depth_is_registered() -> None:
     """A distorted column of depth becomes straight."""
     k1 = 0.3
@@ -140,3 +124,10 @@ def test_the_depth_cameras_own_lens_is_undone_before_its_depth_is_registered() -
     warp = DepthToColor(depth_intrinsics=LARGE, color_intrinsics=LARGE, T_color_depth=np.eye(4), undistortion=own)
     found = np.nonzero(warp.warp(bent))[1]
     assert np.abs(found - (LARGE.fx * x + LARGE.cx)).max() <= 1.0
+
+
+def warped(depth: np.ndarray[Any, Any], color: Intrinsics = SMALL, **shift: float) -> np.ndarray[Any, Any]:
+    """Depth of the small camera in a colour camera that is moved along x and z [m]."""
+    T_color_depth = pose_at([shift.get("x", 0.0), 0, shift.get("z", 0.0)])
+    warp = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=color, T_color_depth=T_color_depth)
+    return warp.warp(depth)

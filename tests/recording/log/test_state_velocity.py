@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.log.state_topics import checked_stamps
 from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, differentiated, gaps_of, smoothed_seconds
 from splatctrl_cli.records import LossReport
+from tests.refused import refused
 
 MS = 1_000_000
+
 START_NS = 1_700_000_000_000_000_000
 
 
@@ -34,19 +35,6 @@ def test_jitter_of_sending_is_smoothed_out_of_a_fixed_rate() -> None:
     raw = np.abs(np.gradient(position[:, 0], (sent - sent[0]) * 1e-9)[:, None] - truth)
     assert error.max() < 0.04
     assert np.median(error) < np.median(raw) / 10
-
-
-def test_lost_states_do_not_bend_the_smoothed_clock() -> None:
-    keep = np.ones(200, dtype=bool)
-    keep[[30, 31, 77, 150]] = False
-    stamps = regular(200)[keep]
-    assert smoothed_seconds(stamps) == pytest.approx((stamps - stamps[0]) * 1e-9, abs=1e-9)
-
-
-def test_stamps_without_a_rate_are_left_as_they_are() -> None:
-    rng = np.random.default_rng(3)
-    stamps = START_NS + np.cumsum(rng.integers(1, 100, 300)) * MS
-    assert np.array_equal(smoothed_seconds(stamps), (stamps - stamps[0]) * 1e-9)
 
 
 def test_nothing_is_fitted_across_a_gap() -> None:
@@ -87,27 +75,6 @@ def test_recorded_velocities_are_kept_and_other_units_are_said() -> None:
     assert "57.3 times the change of the positions" in loss.notes[0]
 
 
-def test_stamps_that_were_never_set_give_way_to_the_time_of_logging() -> None:
-    loss, log = LossReport(), regular(5)
-    assert np.array_equal(checked_stamps(np.zeros(5, dtype=np.int64), log, "t", loss), log)
-    assert "no state has a stamp" in loss.notes[0]
-
-
-def test_stamps_that_are_set_in_part_are_mixed_clocks() -> None:
-    stamps = regular(20)
-    stamps[3] = 0
-    with pytest.raises(InputError, match="t: mixed clocks: 1 of 20 states have no stamp"):
-        checked_stamps(stamps, regular(20), "t", LossReport())
-
-
-@pytest.mark.parametrize("num", [6, 60])
-def test_a_jump_from_simulated_to_wall_time_is_mixed_clocks(num: int) -> None:
-    stamps = regular(num)
-    stamps[: num // 2] -= START_NS
-    with pytest.raises(InputError, match=f"mixed clocks: stamps jump by .* at state {num // 2}"):
-        checked_stamps(stamps, regular(num), "t", LossReport())
-
-
 def test_a_clock_that_was_set_is_said_and_one_late_message_is_not() -> None:
     stamps, log, loss = regular(60), regular(60), LossReport()
     log[30] += 3_000 * MS
@@ -118,21 +85,37 @@ def test_a_clock_that_was_set_is_said_and_one_late_message_is_not() -> None:
     assert "stamps step by 2.500 s against the time of logging at state 40" in loss.notes[0]
 
 
-def test_another_clock_and_its_drift_are_measured() -> None:
-    log = regular(2000)
-    seconds = np.arange(2000) * 0.01
-    stamps = log - START_NS - np.round(seconds * 1e9 * 1e-3).astype(np.int64)  # simulated, 1000 ppm slow
-    delay = np.random.default_rng(4).exponential(2 * MS, 2000).astype(np.int64)
-    loss = LossReport()
+def test_lost_states_do_not_bend_the_smoothed_clock_and_stamps_without_a_rate_stay() -> None:
+    keep = np.ones(200, dtype=bool)
+    keep[[30, 31, 77, 150]] = False
+    stamps = regular(200)[keep]
+    assert smoothed_seconds(stamps) == pytest.approx((stamps - stamps[0]) * 1e-9, abs=1e-9)
+    odd = START_NS + np.cumsum(np.random.default_rng(3).integers(1, 100, 300)) * MS
+    assert np.array_equal(smoothed_seconds(odd), (odd - odd[0]) * 1e-9)
+
+
+@pytest.mark.parametrize("num", [6, 60])
+def test_a_jump_from_simulated_to_wall_time_is_mixed_clocks_and_so_are_stamps_set_in_part(num: int) -> None:
+    stamps, log, loss = regular(num), regular(num), LossReport()
+    stamps[: num // 2] -= START_NS
+    said = f"mixed clocks: stamps jump by .* at state {num // 2}"
+    refused(said, checked_stamps, stamps, log, "t", loss)
+    stamps = regular(num)
+    stamps[3] = 0
+    refused(f"t: mixed clocks: 1 of {num} states have no stamp", checked_stamps, stamps, log, "t", loss)
+    assert np.array_equal(checked_stamps(np.zeros(num, np.int64), log, "t", loss), log), "never set: of logging"
+    assert "no state has a stamp" in loss.notes[0]
+
+
+def test_another_clock_and_its_drift_are_measured_and_delays_of_logging_alone_are_none() -> None:
+    log, rng, loss = regular(2000), np.random.default_rng(4), LossReport()
+    slow = np.round(np.arange(2000) * 0.01 * 1e9 * 1e-3).astype(np.int64)
+    stamps = log - START_NS - slow  # simulated, 1000 ppm slow
+    delay = rng.exponential(2 * MS, 2000).astype(np.int64)
     assert np.array_equal(checked_stamps(stamps, log + delay, "t", loss), stamps)
     assert "two clocks" in loss.notes[0]
-    ppm = float(loss.notes[1].split("(")[1].split(" ")[0])
-    assert ppm == pytest.approx(1000, rel=0.03)
-
-
-def test_delays_of_logging_alone_are_no_drift() -> None:
-    delay = np.random.default_rng(5).exponential(5 * MS, 2000).astype(np.int64)
+    assert float(loss.notes[1].split("(")[1].split(" ")[0]) == pytest.approx(1000, rel=0.03)
+    delay, none = np.random.default_rng(5).exponential(5 * MS, 2000).astype(np.int64), LossReport()
     delay[1700:] += 30 * MS  # a disk that stalls near the end
-    loss = LossReport()
-    checked_stamps(regular(2000), regular(2000) + delay, "t", loss)
-    assert loss.notes == []
+    checked_stamps(log, log + delay, "t", none)
+    assert none.notes == []

@@ -7,25 +7,30 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import quat_from_rotation, rotation_from_quat, transform_from
 from splatctrl_cli.recording.log.registration import TfTree
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.recording.source_options import PoseTopic, SourceOptions
-from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.records import Float64
 from tests.recording.log.make_log import (
     FRAME_NS,
     START_NS,
-    STORE,
     LogRecipe,
+    built,
+    by_axis,
     camera_x,
     encoded,
+    frames_of,
+    header,
     make_log,
     messages_of,
+    transform,
     write_raw,
 )
+from tests.refused import refused
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
 QUARTER_TURN = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])  # about z
 
 
@@ -50,15 +55,11 @@ def test_static_transforms_that_differ_hold_each_from_its_stamp_on() -> None:
 
 
 def test_a_moving_frame_is_interpolated_and_a_static_one_holds_always() -> None:
-    T = moving_tree().lookup("world", "camera", 500_000_000)
-    assert T is not None
-    angle = np.pi / 4
-    assert T[:3, 3] == pytest.approx([0.5, 0, 0.5])
-    assert T[:2, :2] == pytest.approx(np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]))
-    early = moving_tree().lookup("world", "camera", 200_000_000)
-    assert early is not None
-    assert early[:3, 3] == pytest.approx([0.2, 0, 0.5])
-    assert early[1, 0] == pytest.approx(np.sin(0.2 * np.pi / 2))
+    for share in (0.2, 0.5):
+        T, angle = moving_tree().lookup("world", "camera", int(share * 1e9)), share * np.pi / 2
+        assert T is not None and T[:3, 3] == pytest.approx([share, 0, 0.5])
+        turned = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        assert T[:2, :2] == pytest.approx(np.array(turned))
 
 
 def test_siblings_are_joined_through_their_common_ancestor() -> None:
@@ -68,15 +69,17 @@ def test_siblings_are_joined_through_their_common_ancestor() -> None:
     T = tree.lookup("arm", "lamp", 777_000_000)
     assert T is not None
     assert pytest.approx(transform_from([-0.3, -0.2, -0.1], -QUARTER_TURN * [1, 1, 1, -1]), abs=1e-12) == T
+    tree.add("map", "other", 0, np.zeros(3), IDENTITY, static=True)
+    assert tree.lookup("world", "other", 0) is None, "not connected"
+    assert (tree.roots, tree.root_of("camera")) == (("map", "world"), "world")
 
 
 def test_outside_the_recorded_time_nothing_is_known_beyond_the_tolerance() -> None:
-    tree = moving_tree()
-    assert tree.lookup("world", "camera", 1_030_000_000, tolerance_ns=20_000_000) is None
-    assert tree.lookup("world", "camera", -30_000_000, tolerance_ns=20_000_000) is None
-    late = tree.lookup("world", "camera", 1_010_000_000, tolerance_ns=20_000_000)
-    assert late is not None
-    assert late[:3, 3] == pytest.approx([1.0, 0, 0.5])
+    tree, near = moving_tree(), {"tolerance_ns": 20_000_000}
+    assert tree.lookup("world", "camera", 1_030_000_000, **near) is None
+    assert tree.lookup("world", "camera", -30_000_000, **near) is None
+    late = tree.lookup("world", "camera", 1_010_000_000, **near)
+    assert late is not None and late[:3, 3] == pytest.approx([1.0, 0, 0.5])
 
 
 def test_a_long_gap_is_bridged_only_where_nothing_moved() -> None:
@@ -85,34 +88,6 @@ def test_a_long_gap_is_bridged_only_where_nothing_moved() -> None:
         tree.add("world", "base", stamp_s * 1_000_000_000, np.array([x, 0, 0]), IDENTITY, static=False)
     assert tree.lookup("world", "base", 2_000_000_000) is not None
     assert tree.lookup("world", "base", 7_000_000_000) is None
-
-
-def test_unconnected_frames_have_no_transform() -> None:
-    tree = moving_tree()
-    tree.add("map", "other", 0, np.zeros(3), IDENTITY, static=True)
-    assert tree.lookup("world", "other", 0) is None
-    assert tree.roots == ("map", "world")
-    assert tree.root_of("camera") == "world"
-
-
-def test_a_second_parent_is_noted_and_the_first_kept() -> None:
-    tree = moving_tree()
-    tree.add("elsewhere", "camera", 0, np.array([9.0, 9, 9]), IDENTITY, static=True)
-    T = tree.lookup("world", "camera", 0)
-    assert T is not None
-    assert T[:3, 3] == pytest.approx([0, 0, 0.5])
-    assert "camera has parents base and elsewhere" in tree.notes[0]
-
-
-@pytest.mark.parametrize("bottom", ["world", "base", "camera"])
-def test_a_transform_that_would_close_a_loop_is_left_out_and_noted(bottom: str) -> None:
-    tree = moving_tree()
-    tree.add(bottom, "world", 0, np.array([9.0, 9, 9]), IDENTITY, static=True)
-    T = tree.lookup("world", "camera", 0)
-    assert T is not None
-    assert T[:3, 3] == pytest.approx([0, 0, 0.5])
-    assert tree.roots == ("world",) and tree.connects("world", "camera")
-    assert f"tf: {bottom} -> world would close a loop" in tree.notes[0]
 
 
 def test_a_zero_quaternion_is_refused() -> None:
@@ -130,33 +105,24 @@ def test_slerp_passes_through_the_shorter_arc() -> None:
     assert T[:3, :3] == pytest.approx(rotation_from_quat(QUARTER_TURN))
 
 
-T = STORE.types
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+
 TRANSFORM, COVARIANCE = "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+
 OPTICAL = "cam0_optical"
 
 
 def stamped(kind: str, index: int, parent: str, child: str) -> Any:
     """The camera of the rail at a frame, as a message."""
-    stamp = START_NS + index * FRAME_NS
-    time = T["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
-    header = T["std_msgs/msg/Header"](stamp=time, frame_id=parent)
-    turn = T["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
-    if kind == TRANSFORM:
-        move = T["geometry_msgs/msg/Vector3"](x=camera_x(index), y=0.5, z=0.0)
-        transform = T["geometry_msgs/msg/Transform"](translation=move, rotation=turn)
-        return T[TRANSFORM](header=header, child_frame_id=child, transform=transform)
-    position = T["geometry_msgs/msg/Point"](x=camera_x(index), y=0.5, z=0.0)
-    pose = T["geometry_msgs/msg/Pose"](position=position, orientation=turn)
-    if kind == POSE:
-        return T[POSE](header=header, pose=pose)
-    covered = T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36))
-    if kind == COVARIANCE:
-        return T[COVARIANCE](header=header, pose=covered)
-    zero = T["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
-    twist = T["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
-    speed = T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36))
-    return T[ODOMETRY](header=header, child_frame_id=child, pose=covered, twist=speed)
+    where, turn, head = by_axis((camera_x(index), 0.5, 0.0)), {"w": 1.0}, header(START_NS + index * FRAME_NS, parent)
+    pose = {"position": where, "orientation": turn}
+    fields: dict[str, Any] = {
+        TRANSFORM: {"child_frame_id": child, "transform": {"translation": where, "rotation": turn}},
+        POSE: {"pose": pose},
+        COVARIANCE: {"pose": {"pose": pose}},
+        ODOMETRY: {"pose": {"pose": pose}, "child_frame_id": child},
+    }
+    return built(kind, header=head, **fields[kind])
 
 
 def with_poses(tmp_path: Path, *topics: tuple[str, str, str, str], static: tuple[str, str] | None = None) -> Path:
@@ -164,93 +130,97 @@ def with_poses(tmp_path: Path, *topics: tuple[str, str, str, str], static: tuple
 
     static: an edge of /tf_static, 0.2 m along y.
     """
-    log = make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False, has_joints=False))
-    messages = list(messages_of(log))
+    messages = list(messages_of(make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False, has_joints=False))))
     for name, kind, parent, child in topics:
         poses = (stamped(kind, index, parent, child) for index in range(5))
         messages += [encoded(START_NS + index * FRAME_NS, name, pose) for index, pose in enumerate(poses)]
     if static is not None:
-        edge = stamped(TRANSFORM, 0, *static)
-        edge.transform.translation.x, edge.transform.translation.y = 0.0, 0.2
-        messages.append(encoded(START_NS, "/tf_static", T["tf2_msgs/msg/TFMessage"](transforms=[edge])))
+        edge = transform(START_NS, *static, (0, 0.2, 0))
+        messages.append(encoded(START_NS, "/tf_static", built("tf2_msgs/msg/TFMessage", transforms=[edge])))
     return write_raw(tmp_path / "poses.mcap", messages)
 
 
 def positions(path: Path, options: SourceOptions | None = None) -> Float64:
-    frames = [r for r in open_source(path, options).records() if isinstance(r, RgbdFrame)]
-    return np.array([frame.T_world_camera[:3, 3] for frame in frames])
+    return np.array([frame.T_world_camera[:3, 3] for frame in frames_of(path, options)])
+
+
+def by_topic(topic: str, frame: str = "", camera: str = "cam0") -> SourceOptions:
+    return SourceOptions(camera_pose_topics={camera: PoseTopic(topic=topic, frame=frame)})
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "said"),
+    [
+        *((bottom, "world", f"tf: {bottom} -> world would close a loop") for bottom in ("world", "base", "camera")),
+        ("elsewhere", "camera", "camera has parents base and elsewhere"),
+    ],
+)
+def test_a_transform_that_would_close_a_loop_or_is_a_second_parent_is_left_out_and_noted(
+    parent: str, child: str, said: str
+) -> None:
+    tree = moving_tree()
+    tree.add(parent, child, 0, np.array([9.0, 9, 9]), IDENTITY, static=True)
+    T = tree.lookup("world", "camera", 0)
+    assert T is not None and T[:3, 3] == pytest.approx([0, 0, 0.5])
+    assert "world" in tree.roots and tree.connects("world", "camera")
+    assert said in tree.notes[0]
 
 
 RAIL = np.array([[camera_x(index), 0.5, 0.0] for index in range(5)])
+
 ABOVE = np.array([0.0, 0.2, 0.0])
 
 
 @pytest.mark.parametrize("kind", [ODOMETRY, TRANSFORM])
 def test_a_topic_that_names_the_cameras_frame_places_it(tmp_path: Path, kind: str) -> None:
     path = with_poses(tmp_path, ("/vio/pose", kind, "odom", OPTICAL))
-    options = SourceOptions(camera_pose_topics={"cam0": PoseTopic(topic="/vio/pose")})
-    assert positions(path, options) == pytest.approx(RAIL)
+    assert positions(path, by_topic("/vio/pose")) == pytest.approx(RAIL)
 
 
 @pytest.mark.parametrize("kind", [POSE, COVARIANCE])
 def test_a_pose_without_a_frame_is_the_cameras_own_unless_a_person_says_otherwise(tmp_path: Path, kind: str) -> None:
     path = with_poses(tmp_path, ("/pose", kind, "map", ""), static=("rig", OPTICAL))
-    rig = SourceOptions(camera_pose_topics={"cam0": PoseTopic(topic="/pose", frame="rig")})
-    assert positions(path, rig) == pytest.approx(RAIL + ABOVE)
-    own = SourceOptions(camera_pose_topics={"cam0": PoseTopic(topic="/pose")})
-    with pytest.raises(InputError, match=f"tf has frame '{OPTICAL}' in 'rig' already; leave the option out"):
-        open_source(path, own)
-    (tmp_path / "free").mkdir()
-    free = with_poses(tmp_path / "free", ("/pose", kind, "map", ""))
-    assert positions(free, own) == pytest.approx(RAIL)
+    assert positions(path, by_topic("/pose", "rig")) == pytest.approx(RAIL + ABOVE)
+    said = f"tf has frame '{OPTICAL}' in 'rig' already; leave the option out"
+    refused(said, open_source, path, by_topic("/pose"))
+    free = with_poses(tmp_path, ("/pose", kind, "map", ""))
+    assert positions(free, by_topic("/pose")) == pytest.approx(RAIL)
+    out = tmp_path / "x.capture"
+    assert main(["ingest", str(free), "-o", str(out), "-q", "--camera-pose", "cam0=/pose"]) == 0
+    assert positions(out) == pytest.approx(RAIL)
 
 
 def test_an_odometry_of_a_camera_that_tf_does_not_know_is_taken_and_noted(tmp_path: Path) -> None:
     path = with_poses(tmp_path, ("/vio/odom", ODOMETRY, "odom", OPTICAL))
-    source = open_source(path)
     assert positions(path) == pytest.approx(RAIL)
-    assert source.loss.notes == [f"poses of frame '{OPTICAL}' are those of /vio/odom: tf does not say where it is"]
-    assert describe(path).missing == ()
+    said = f"poses of frame '{OPTICAL}' are those of /vio/odom: tf does not say where it is"
+    assert open_source(path).loss.notes == [said] and describe(path).missing == ()
 
 
 def test_an_odometry_of_the_base_is_taken_where_its_world_is_asked_for(tmp_path: Path) -> None:
     path = with_poses(tmp_path, ("/odom", ODOMETRY, "odom", "base"), static=("base", OPTICAL))
-    still = open_source(path)
     assert positions(path) == pytest.approx(np.tile(ABOVE, (5, 1)))  # in the base, as tf says
-    assert still.loss.notes == ["/odom says where 'base' is in 'odom'; to use it give --world-frame odom"]
-    moved = positions(path, SourceOptions(world_frame="odom"))
-    assert moved == pytest.approx(RAIL + ABOVE)
+    said = "/odom says where 'base' is in 'odom'; to use it give --world-frame odom"
+    assert open_source(path).loss.notes == [said]
+    assert positions(path, SourceOptions(world_frame="odom")) == pytest.approx(RAIL + ABOVE)
 
 
 def test_two_odometries_of_one_frame_are_not_chosen_between(tmp_path: Path) -> None:
     path = with_poses(tmp_path, ("/a", ODOMETRY, "odom", OPTICAL), ("/b", ODOMETRY, "odom", OPTICAL))
-    with pytest.raises(
-        InputError, match=f"2 odometries place frame '{OPTICAL}': /a, /b; choose one with --camera-pose"
-    ):
-        open_source(path)
+    refused(f"2 odometries place frame '{OPTICAL}': /a, /b; choose one with --camera-pose", open_source, path)
     assert any("2 odometries place frame" in lack for lack in describe(path).missing)
-    chosen = SourceOptions(camera_pose_topics={"cam0": PoseTopic(topic="/b")})
-    assert positions(path, chosen) == pytest.approx(RAIL)
+    assert positions(path, by_topic("/b")) == pytest.approx(RAIL)
 
 
 def test_topics_that_cannot_place_the_camera_are_refused_with_those_that_may(tmp_path: Path) -> None:
     path = with_poses(tmp_path, ("/pose", POSE, "map", ""), ("/odom", ODOMETRY, "odom", "base"))
-    with pytest.raises(
-        InputError, match=r"no tf for frame .*or NAME=TOPIC\[@FRAME\] of a pose topic \(/odom, /pose\)"
+    for options, said in (
+        (None, "no tf for frame .*or NAME=TOPIC.@FRAME. of a pose topic ./odom, /pose."),
+        (by_topic("/none"), "no poses on that topic; expected Odometry, .*pose topics there: /odom, /pose"),
+        (by_topic("/odom"), f"poses frame 'base', which tf does not join to the camera's frame '{OPTICAL}'"),
+        (by_topic("/pose", camera="cam9"), "no camera 'cam9'; use one of: cam0"),
     ):
-        open_source(path)
-    nothing = SourceOptions(camera_pose_topics={"cam0": PoseTopic(topic="/none")})
-    with pytest.raises(
-        InputError, match=r"no poses on that topic; expected Odometry, .*pose topics there: /odom, /pose"
-    ):
-        open_source(path, nothing)
-    base = SourceOptions(camera_pose_topics={"cam0": PoseTopic(topic="/odom")})
-    with pytest.raises(
-        InputError, match=f"poses frame 'base', which tf does not join to the camera's frame '{OPTICAL}'"
-    ):
-        open_source(path, base)
-    with pytest.raises(InputError, match="no camera 'cam9'; use one of: cam0"):
-        open_source(path, SourceOptions(camera_pose_topics={"cam9": PoseTopic(topic="/pose")}))
+        refused(said, open_source, path, options)
 
 
 @pytest.mark.parametrize("text", ["cam0=/pose@", "=/pose", "cam0=/pose@@"])
@@ -260,10 +230,3 @@ def test_a_pose_topic_on_the_command_line_has_a_name_and_a_topic(
     path = with_poses(tmp_path, ("/pose", POSE, "map", ""))
     assert main(["ingest", str(path), "-o", str(tmp_path / "x.capture"), "--camera-pose", text]) in {2, 4}
     assert "Traceback" not in capsys.readouterr().err
-
-
-def test_the_command_line_takes_a_pose_topic(tmp_path: Path) -> None:
-    path = with_poses(tmp_path, ("/pose", POSE, "map", ""))
-    out = tmp_path / "x.capture"
-    assert main(["ingest", str(path), "-o", str(out), "-q", "--camera-pose", "cam0=/pose"]) == 0
-    assert positions(out) == pytest.approx(RAIL)

@@ -5,8 +5,10 @@ from base64 import b64encode
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from itertools import count
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import av
 import numpy as np
@@ -17,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from splatctrl_cli import libraries
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.recording.container.foxglove import DEFINITIONS
 from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
 from splatctrl_cli.recording.log import cameras
@@ -32,20 +34,26 @@ from tests.recording.log.make_log import (
     START_NS,
     WIDTH,
     LogRecipe,
+    built,
     color_pixels,
+    encoded,
     frames_of,
     header,
     make_log,
     messages_of,
     write_raw,
 )
+from tests.refused import refused
 
 NUM, GOP = 12, 5
+
 RECIPE = LogRecipe(has_joints=False, num_frames=NUM, color_format="png")
+
 FFMPEG = (
     "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\nbool is_bigendian\n"
     "uint8[] data\n"
 )  # ffmpeg_image_transport_msgs/msg/FFMPEGPacket.msg
+
 Change = Callable[[list[tuple[int, bytes]]], list[tuple[int, bytes]]]
 
 
@@ -71,29 +79,21 @@ def as_message(message: RawMessage, data: bytes, kind: str, form: str) -> RawMes
     """A packet in place of an image's message."""
     stamp, frame, topic = message.log_time_ns, "cam0_optical", message.topic.name
     seconds, nanoseconds = divmod(stamp, 10**9)
-    if kind == "protobuf":
+    if kind in {"protobuf", "json"}:
         said = CompressedVideo(frame_id=frame, data=data, format=form)
         said.timestamp.FromNanoseconds(stamp)
-        definition = build_file_descriptor_set(CompressedVideo).SerializeToString().decode("latin-1")
-        channel = Topic(name=topic, type_name="foxglove.CompressedVideo", encoding="protobuf", definition=definition)
-        return replace(message, topic=channel, data=said.SerializeToString())
-    if kind == "json":
         fields = {"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": frame, "format": form}
-        channel = Topic(name=topic, type_name="foxglove.CompressedVideo", encoding="json", definition="{}")
-        return replace(message, topic=channel, data=json.dumps({**fields, "data": b64encode(data).decode()}).encode())
+        text = json.dumps({**fields, "data": b64encode(data).decode()}).encode()
+        definition = build_file_descriptor_set(CompressedVideo).SerializeToString().decode("latin-1")
+        channel = Topic(name=topic, type_name="foxglove.CompressedVideo", encoding=kind, definition=definition)
+        return replace(message, topic=channel, data=said.SerializeToString() if kind == "protobuf" else text)
     store = get_typestore(Stores.ROS2_HUMBLE)
     name = "foxglove_msgs/msg/CompressedVideo" if kind == "cdr" else "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
     store.register(get_types_from_msg(DEFINITIONS[name] if kind == "cdr" else FFMPEG, name))
-    array = np.frombuffer(data, np.uint8)
-    if kind == "cdr":
-        time = store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-        content = store.types[name](timestamp=time, frame_id=frame, data=array, format=form)
-    else:
-        rest: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "pts": 0, "flags": 0, "is_bigendian": False}
-        content = store.types[name](header=header(stamp, frame), encoding=form, data=array, **rest)
-    definition = store.generate_msgdef(name, ros_version=2)[0]
-    channel = Topic(name=topic, type_name=name, encoding="cdr", definition=definition)
-    return replace(message, topic=channel, data=bytes(store.serialize_cdr(content, name)))
+    fields = {"timestamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame, "format": form}
+    if kind == "ffmpeg":
+        fields = {"header": header(stamp, frame, store), "width": WIDTH, "height": HEIGHT, "encoding": form}
+    return encoded(stamp, topic, built(name, store, data=data, **fields), store)
 
 
 def video_log(
@@ -106,23 +106,29 @@ def video_log(
 ) -> Path:
     """A log of RECIPE whose colour is video, its packets by number as `change` leaves them."""
     log = make_log(path.with_name("images.mcap"), RECIPE)
-    kept, number, written = dict(change(list(enumerate(packets(codec))))), -1, []
+    kept, number, written = dict(change(list(enumerate(packets(codec))))), count(), []
     for message in messages_of(log):
         if message.topic.type_name != COMPRESSED_IMAGE:
             written.append(message)
-            continue
-        number += 1
-        if number in kept:
-            written.append(as_message(message, kept[number], kind, form))
+        elif (packet := kept.get(next(number))) is not None:
+            written.append(as_message(message, packet, kind, form))
     return write_raw(path, written)
 
 
 def numbers_of(frames: list[RgbdFrame]) -> list[int]:
     """Of the images, by what is in them; it must be what their stamps say."""
-    for frame in frames:
-        number = (frame.stamp_ns - START_NS) // FRAME_NS
+    numbers = [(frame.stamp_ns - START_NS) // FRAME_NS for frame in frames]
+    for number, frame in zip(numbers, frames, strict=True):
         assert np.abs(frame.color.astype(int) - color_pixels(number)).max() <= 4
-    return [(frame.stamp_ns - START_NS) // FRAME_NS for frame in frames]
+    return numbers
+
+
+def assert_same(found: list[RgbdFrame], folder: Path) -> None:
+    """The frames are those of the log of images."""
+    assert numbers_of(found) == list(range(NUM))
+    for frame, same in zip(found, frames_of(folder / "images.mcap"), strict=True):
+        assert np.array_equal(frame.depth, same.depth) and frame.intrinsics == same.intrinsics
+        assert np.array_equal(frame.T_world_camera, same.T_world_camera)
 
 
 @pytest.mark.parametrize(
@@ -138,14 +144,13 @@ def numbers_of(frames: list[RgbdFrame]) -> list[int]:
 def test_every_image_of_a_video_has_its_stamp_pose_and_depth(
     tmp_path: Path, kind: str, form: str, codec: str
 ) -> None:
-    path = video_log(tmp_path / "video.mcap", kind, form, codec=codec)
-    source = open_source(path)
-    frames = frames_of(source)
-    assert numbers_of(frames) == list(range(NUM))
+    source = open_source(video_log(tmp_path / "video.mcap", kind, form, codec=codec))
+    assert_same(frames_of(source), tmp_path)
     assert source.loss.damaged == 0
-    for frame, same in zip(frames, frames_of(open_source(tmp_path / "images.mcap")), strict=True):
-        assert np.array_equal(frame.depth, same.depth)
-        assert np.array_equal(frame.T_world_camera, same.T_world_camera)
+
+
+def cut_key_frame(numbered: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    return [(i, data[: len(data) // 2] if i == GOP else data) for i, data in numbered]
 
 
 def test_info_and_check_take_video_for_the_colour_that_it_is(tmp_path: Path) -> None:
@@ -157,11 +162,8 @@ def test_info_and_check_take_video_for_the_colour_that_it_is(tmp_path: Path) -> 
     assert [finding.code for finding in report.findings] == [finding.code for finding in images.findings]
 
 
-def cut_key_frame(numbered: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
-    return [(i, data[: len(data) // 2] if i == GOP else data) for i, data in numbered]
-
-
 BEFORE = "3 images of video before its first key frame left out: record a key frame every second, or cut the log"
+
 BEHIND = "2 images of video that follow missing or damaged ones, up to the next key frame"
 
 
@@ -185,30 +187,34 @@ def test_images_that_lack_one_before_them_are_left_out_up_to_the_next_key_frame_
     assert said in source.loss.notes[0]
 
 
-def test_video_without_any_key_frame_is_refused(tmp_path: Path) -> None:
+def test_video_without_any_key_frame_or_of_another_codec_is_refused(tmp_path: Path) -> None:
     log = video_log(tmp_path / "video.mcap", change=lambda numbered: [n for n in numbered if n[0] % GOP])
-    with pytest.raises(InputError, match=r"no image of the video can be decoded \(.*: 9 images of video before its"):
-        open_source(log)
+    refused(r"no image of the video can be decoded \(.*: 9 images of video before its", open_source, log)
+    log = video_log(tmp_path / "video.mcap", form="vp9")
+    refused(r"colour is video \(/cam0/.*\), which is neither H.264 nor H.265; decode it", open_source, log)
 
 
 def test_video_of_another_codec_is_named_with_what_to_do(tmp_path: Path) -> None:
     log = video_log(tmp_path / "video.mcap", form="vp9")
-    with pytest.raises(
-        InputError, match=r"colour is video \(/cam0/.*\), which is neither H.264 nor H.265; decode it"
-    ):
-        open_source(log)
+    refused(r"colour is video \(/cam0/.*\), which is neither H.264 nor H.265; decode it", open_source, log)
 
 
 def test_without_the_library_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = video_log(tmp_path / "video.mcap")
+    log, mp4 = video_log(tmp_path / "video.mcap"), write_mp4(tmp_path / "color.mp4")
     monkeypatch.setattr("splatctrl_cli.recording.log.video.is_installed", lambda name: False)
     monkeypatch.setattr(cameras, "is_installed", lambda name: False)
-    with pytest.raises(InputError, match=r"the library av is not installed; pip install 'splatctrl-cli\[video\]'"):
-        open_source(log)
-    monkeypatch.setattr(libraries, "import_module", lambda name: (_ for _ in ()).throw(ImportError(name)))
-    with pytest.raises(UsageError, match=r"video files need the library av.*splatctrl-cli\[video\]"):
-        (tmp_path / "color.csv").write_text("0.0\n")
-        open_logs([write_mp4(tmp_path / "color.mp4")])
+    refused("the library av is not installed; pip install 'splatctrl-cli[video]'", open_source, log)
+    monkeypatch.setattr(libraries, "import_module", Mock(side_effect=ImportError("av")))
+    (tmp_path / "color.csv").write_text("0.0\n")
+    refused(r"video files need the library av.*splatctrl-cli\[video\]", open_logs, [mp4], error=UsageError)
+
+
+def beside(folder: Path, lines: list[str], *, b_frames: int = 0) -> Path:
+    """The log without its colour, and a video beside it whose stamps are these lines."""
+    log = make_log(folder / "images.mcap", RECIPE)
+    write_raw(folder / "run.mcap", [m for m in messages_of(log) if m.topic.type_name != COMPRESSED_IMAGE])
+    (folder / "color.csv").write_text("\n".join(lines) + "\n")
+    return write_mp4(folder / "color.mp4", b_frames=b_frames)
 
 
 def write_mp4(path: Path, *, b_frames: int = 0) -> Path:
@@ -221,15 +227,6 @@ def write_mp4(path: Path, *, b_frames: int = 0) -> Path:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(color_pixels(i), format="rgb24")))
         container.mux(stream.encode(None))
     return path
-
-
-def stamped(folder: Path, lines: list[str], *, b_frames: int = 0) -> Path:
-    """The log without its colour, and a video beside it whose stamps are these lines."""
-    log = make_log(folder / "images.mcap", RECIPE)
-    kept = [m for m in messages_of(log) if m.topic.type_name != COMPRESSED_IMAGE]
-    write_raw(folder / "run.mcap", kept)
-    (folder / "color.csv").write_text("\n".join(lines) + "\n")
-    return write_mp4(folder / "color.mp4", b_frames=b_frames)
 
 
 STAMPS = [START_NS + i * FRAME_NS for i in range(NUM)]
@@ -247,21 +244,16 @@ STAMPS = [START_NS + i * FRAME_NS for i in range(NUM)]
     ids=["seconds", "nanoseconds", "microseconds", "milliseconds"],
 )
 def test_a_video_file_beside_a_log_is_its_colour(tmp_path: Path, lines: list[str], b_frames: int) -> None:
-    stamped(tmp_path, lines, b_frames=b_frames)
-    source = open_session([tmp_path / "run.mcap", tmp_path / "color.mp4"])
-    frames = frames_of(source)
-    assert numbers_of(frames) == list(range(NUM))
-    for frame, same in zip(frames, frames_of(open_source(tmp_path / "images.mcap")), strict=True):
-        assert np.array_equal(frame.T_world_camera, same.T_world_camera)
-        assert frame.intrinsics == same.intrinsics
+    video = beside(tmp_path, lines, b_frames=b_frames)
+    source = open_session([tmp_path / "run.mcap", video])
+    assert_same(frames_of(source), tmp_path)
     assert set(source.digests()) == {"run.mcap", "color.mp4", "color.csv"}
-    assert describe(tmp_path / "color.mp4").kind == "video"
+    assert describe(video).kind == "video"
 
 
 def test_stamps_that_are_missing_or_too_few_or_unreadable_are_named(tmp_path: Path) -> None:
-    video = stamped(tmp_path, [str(stamp) for stamp in STAMPS[1:]])
-    with pytest.raises(InputError, match=r"color\.mp4: 12 images, but 11 stamps in color\.csv"):
-        open_session([tmp_path / "run.mcap", video])
+    video = beside(tmp_path, [str(stamp) for stamp in STAMPS[1:]])
+    refused("color.mp4: 12 images, but 11 stamps in color.csv", open_session, [tmp_path / "run.mcap", video])
     for lines, words in (
         (["1 2", "2 3"], "expected a stamp a line, or columns whose first line names one"),
         (["frame,image", "0,1"], "expected a stamp a line"),
@@ -269,19 +261,10 @@ def test_stamps_that_are_missing_or_too_few_or_unreadable_are_named(tmp_path: Pa
         ([], "expected a stamp a line"),
     ):
         (tmp_path / "color.csv").write_text("\n".join(lines))
-        with pytest.raises(InputError, match=words):
-            VideoFileLog(video)
+        refused(words, VideoFileLog, video)
     (tmp_path / "color.csv").unlink()
-    with pytest.raises(InputError, match=r"color.mp4: no stamps beside it; write color.csv"):
-        VideoFileLog(video)
-
-
-def test_a_cut_video_file_has_fewer_images_than_stamps_and_is_refused(tmp_path: Path) -> None:
-    stamped(tmp_path, [str(stamp) for stamp in STAMPS])
-    mkv = tmp_path / "other.mkv"
-    write_mp4(mkv)
-    data = mkv.read_bytes()
-    mkv.write_bytes(data[: len(data) // 3])
-    (tmp_path / "other.txt").write_text((tmp_path / "color.csv").read_text())
-    with pytest.raises(InputError, match=r"other\.mkv: \d images, but 12 stamps in other\.txt"):
-        open_session([tmp_path / "run.mcap", mkv])
+    refused("color.mp4: no stamps beside it; write color.csv", VideoFileLog, video)
+    (tmp_path / "other.txt").write_text("\n".join(map(str, STAMPS)))
+    mkv = write_mp4(tmp_path / "other.mkv")
+    mkv.write_bytes(mkv.read_bytes()[: mkv.stat().st_size // 3])
+    refused(r"other\.mkv: \d images, but 12 stamps in other\.txt", open_session, [tmp_path / "run.mcap", mkv])

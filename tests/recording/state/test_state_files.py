@@ -13,6 +13,7 @@ import pytest
 from splatctrl_cli import libraries
 from splatctrl_cli.errors import UsageError
 from tests.recording.log.make_states import AB, opened, refusal, states
+from tests.refused import refused
 
 NUM = 5000  # rows, more than a block
 T = np.arange(NUM) * 0.01
@@ -127,8 +128,9 @@ def test_without_the_library_the_extra_is_named(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "run.h5").write_bytes(b"")
     path = described(tmp_path, file="run.h5", joints=list(AB), time="t", position=["q"])
     monkeypatch.setattr(libraries, "import_module", absent)
-    with pytest.raises(UsageError, match=r"HDF5 files need the library h5py.*pip install 'splatctrl-cli\[tables\]'"):
-        opened(path)
+    refused(
+        r"HDF5 files need the library h5py.*pip install 'splatctrl-cli\[tables\]'", opened, path, error=UsageError
+    )
 
 
 def lerobot(folder: Path, version: int, *, num_episodes: int = 3, names: Any = None) -> Path:

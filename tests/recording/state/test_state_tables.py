@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.recording.state.state_source import open_states
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.recording.state.twists import read_twists
-from splatctrl_cli.records import Float64, JointState
+from splatctrl_cli.records import Float64
+from tests.recording.log.make_log import built, by_axis
 from tests.recording.log.make_states import (
     START_NS,
     STORE,
@@ -25,12 +24,30 @@ from tests.recording.log.make_states import (
     write_bag2,
     write_mcap,
 )
+from tests.refused import refused
 
 ARM = tuple(f"panda_joint{i}" for i in range(1, 8))
 
 
 def block(name: str, num: int = 7, separator: str = ", ") -> str:
     return separator.join(f"{name}[{i}]" for i in range(num))
+
+
+def libfranka_log(path: Path, *, is_new: bool = False, is_commanded: bool = True) -> Path:
+    """As libfranka writes it: before 0.14 with a column `sent commands` without values, q_d and dq_d twice."""
+    of_state, of_command, gap = ("state.", "cmd.", ",") if is_new else ("", "", ", ")
+    names = ("q", "q_d", "dq", "dq_d", "tau_J", "tau_ext_hat_filtered")
+    sent = (("q_d", 7), ("dq_d", 7), ("O_T_EE_d", 16), ("O_dP_EE_d", 6), ("tau_J_d", 7))
+    columns = [block(f"{of_state}{name}", 7, gap) for name in names]
+    columns += [] if is_new else ["sent commands"]
+    columns += [block(f"{of_command}{name}", num, gap) for name, num in sent]
+    lines = [",".join(["time,success_rate" if is_new else "duration, success rate", *columns])]
+    command = values(np.zeros(7), np.full(7, 0.5 * is_commanded), np.zeros(16 + 6 + 7))
+    for i in range(20):
+        measured = values(q_at(i), q_at(i), np.arange(1.0, 8), np.full(7, 0.25), np.zeros(14))
+        lines.append(f"{5000 + i},1,{measured},{'' if is_new else ','}{command}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
 
 
 def values(*rows: Float64) -> str:
@@ -41,79 +58,37 @@ def q_at(i: int) -> Float64:
     return np.arange(7) * 0.1 + 0.001 * i * np.arange(1, 8)
 
 
-def old_log(path: Path, *, is_commanded: bool) -> Path:
-    """As libfranka before 0.14 writes it: a column `sent commands` without values, q_d and dq_d twice."""
-    state = ",".join(block(n) for n in ("q", "q_d", "dq", "dq_d", "tau_J", "tau_ext_hat_filtered"))
-    sent = ",".join((block("q_d"), block("dq_d"), block("O_T_EE_d", 16), block("O_dP_EE_d", 6), block("tau_J_d")))
-    lines = [f"duration, success rate, {state},sent commands,{sent}"]
-    for i in range(20):
-        measured = values(q_at(i), q_at(i), np.arange(1.0, 8), np.full(7, 0.25), np.zeros(14))
-        command = values(np.zeros(7), np.full(7, 0.5 * is_commanded), np.zeros(16 + 6 + 7))
-        lines.append(f"{5000 + i},1,{measured},,{command}")
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def new_log(path: Path) -> Path:
-    """As libfranka since 0.14 writes it."""
-    names = [f"state.{n}" for n in ("q", "q_d", "dq", "dq_d", "tau_J", "tau_ext_hat_filtered")]
-    state = ",".join(block(n, separator=",") for n in names)
-    sent = ",".join(
-        block(f"cmd.{n}", num, ",")
-        for n, num in (("q_d", 7), ("dq_d", 7), ("O_T_EE_d", 16), ("O_dP_EE_d", 6), ("tau_J_d", 7))
-    )
-    lines = [f"time,success_rate,{state},{sent}"]
-    for i in range(20):
-        measured = values(q_at(i), q_at(i), np.arange(1.0, 8), np.full(7, 0.25), np.zeros(14))
-        lines.append(f"{5000 + i},1,{measured},{values(np.zeros(7), np.full(7, 0.5), np.zeros(29))}")
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-@pytest.mark.parametrize("is_new", [False, True])
-def test_libfranka_logs_of_both_kinds_are_read(tmp_path: Path, is_new: bool) -> None:
-    path = tmp_path / "x.csv"
-    source = opened(new_log(path) if is_new else old_log(path, is_commanded=True), ARM)
-    found = [record for record in source.records() if isinstance(record, JointState)]
+@pytest.mark.parametrize(("is_new", "is_commanded"), [(False, True), (True, True), (False, False)])
+def test_libfranka_logs_of_both_kinds_are_read(tmp_path: Path, is_new: bool, is_commanded: bool) -> None:
+    source = opened(libfranka_log(tmp_path / "x.csv", is_new=is_new, is_commanded=is_commanded), ARM)
+    found = states(source)
     assert source.joint_names == ARM
     assert [s.stamp_ns for s in found] == [(5000 + i) * 1_000_000 for i in range(20)]
     assert found[3].position == pytest.approx(q_at(3))
     assert found[3].velocity == pytest.approx(np.arange(1.0, 8))
-    assert found[3].commanded_velocity == pytest.approx(np.full(7, 0.5))
+    wanted = 0.5 if is_commanded else 0.25  # without a command the desired velocity stands for it
+    assert found[3].commanded_velocity == pytest.approx(np.full(7, wanted))
     assert any("since it was switched on" in note for note in source.loss.notes)
 
 
-def test_without_a_velocity_command_the_desired_velocity_stands_for_it(tmp_path: Path) -> None:
-    found = states(opened(old_log(tmp_path / "x.csv", is_commanded=False), ARM))
-    assert found[3].commanded_velocity == pytest.approx(np.full(7, 0.25))
+POSE = pose_at([0.4, -0.1, 0.6], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 
 def test_an_end_effector_pose_that_a_program_added_is_read_by_columns(tmp_path: Path) -> None:
-    T = np.eye(4)
-    T[:3] = [[0, -1, 0, 0.4], [1, 0, 0, -0.1], [0, 0, 1, 0.6]]
-    path = tmp_path / "x.csv"
-    rows = [f"{i},1,{values(q_at(i), T.T.ravel())}" for i in range(5)]
-    path.write_text("\n".join([f"duration, success rate, {block('q')},{block('O_T_EE', 16)}", *rows]))
-    assert states(opened(path, ARM))[2].T_base_ee == pytest.approx(T)
+    rows = [f"{i},1,{values(q_at(i), POSE.T.ravel())}" for i in range(5)]
+    head = f"duration, success rate, {block('q')},{block('O_T_EE', 16)}"
+    (tmp_path / "x.csv").write_text("\n".join([head, *rows]))
+    assert states(opened(tmp_path / "x.csv", ARM))[2].T_base_ee == pytest.approx(POSE)
 
 
-def test_a_csv_of_no_known_kind_asks_for_a_description(tmp_path: Path) -> None:
-    path = tmp_path / "x.csv"
-    path.write_text("t,j1\n0,1\n")
-    assert "expected libfranka's columns" in refusal(path)
-    assert "describe the columns in a .toml" in refusal(path)
-
-
-def test_a_csv_without_states_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.csv"
-    path.write_text("time,success_rate,q[0]\n")
-    assert "expected joint states, got none" in refusal(path)
-
-
-def test_a_line_that_was_cut_is_named(tmp_path: Path) -> None:
-    path = old_log(tmp_path / "x.csv", is_commanded=True)
+def test_a_csv_of_no_known_kind_asks_for_a_description_and_a_cut_line_is_named(tmp_path: Path) -> None:
+    path = libfranka_log(tmp_path / "x.csv")
     path.write_text(path.read_text()[:-100])
     assert f"{path}:21: expected" in refusal(path)
+    path.write_text("time,success_rate,q[0]\n")
+    assert "expected joint states, got none" in refusal(path)
+    path.write_text("t,j1\n0,1\n")
+    refused("expected libfranka's columns.*describe the columns in a .toml", opened, path)
 
 
 DESCRIPTION: dict[str, Any] = {
@@ -144,48 +119,31 @@ def csv_run(folder: Path) -> Path:
 
 def test_degrees_milliseconds_and_an_epoch_become_radians_and_nanoseconds(tmp_path: Path) -> None:
     csv_run(tmp_path)
-    epoch = 1_700_000_000_123_456_789
-    path = described(
-        tmp_path,
-        velocity=["va", "vb"],
-        commanded_velocity=["vb", "va"],
-        epoch_ns=epoch,
-        pose=["x", "y", "z", "qx", "qy", "qz", "qw"],
-        pose_frame="world",
-    )
-    found = states(path)
+    epoch, poses = 1_700_000_000_123_456_789, ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    said = {"velocity": ["va", "vb"], "commanded_velocity": ["vb", "va"], "epoch_ns": epoch}
+    found = states(described(tmp_path, **said, pose=poses, pose_frame="world"))
     assert [s.stamp_ns for s in found] == [epoch + 10_000_000 * i for i in range(20)]
     assert found[7].position == pytest.approx(np.radians([0.7, -0.7]))
     assert found[7].velocity == pytest.approx(np.radians([10, -10]))
     assert found[7].commanded_velocity == pytest.approx(np.radians([-10, 10]))
-    assert found[7].T_base_ee is None
-    assert found[7].T_world_ee is not None
+    assert found[7].T_base_ee is None and found[7].T_world_ee is not None
     assert found[7].T_world_ee[:3] == pytest.approx(np.array([[0, -1, 0, 7], [1, 0, 0, 0], [0, 0, 1, 0.5]]))
-
-
-def test_velocities_that_are_not_described_are_differences(tmp_path: Path) -> None:
-    csv_run(tmp_path)
     source = opened(described(tmp_path))
-    assert next(iter(source.records())).velocity == pytest.approx(np.radians([10, -10]))  # type: ignore[union-attr]
+    assert states(source)[0].velocity == pytest.approx(np.radians([10, -10])), "differences where not described"
     assert source.loss.differentiated_velocities == 20
-
-
-def test_nanoseconds_keep_every_digit(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("t,qa,qb\n1700000000123456789,0,0\n1700000000133456791,0,0\n")
-    found = states(described(tmp_path, time_unit="ns"))
-    assert [s.stamp_ns for s in found] == [1700000000123456789, 1700000000133456791]
+    stamps = [s.stamp_ns for s in states(described(tmp_path, time_unit="ns"))]
+    assert stamps == [1700000000123456789, 1700000000133456791], "nanoseconds keep every digit"
 
 
 def test_npz_arrays_give_their_columns(tmp_path: Path) -> None:
-    T = np.eye(4)
-    T[:3] = [[0, -1, 0, 0.4], [1, 0, 0, -0.1], [0, 0, 1, 0.6]]
     q = np.linspace(0, 1, 40).reshape(20, 2)
-    np.savez(tmp_path / "run.npz", t=np.arange(20) * 0.01, q=q, T=np.broadcast_to(T, (20, 4, 4)))
+    np.savez(tmp_path / "run.npz", t=np.arange(20) * 0.01, q=q, T=np.broadcast_to(POSE, (20, 4, 4)))
     path = described(tmp_path, file="run.npz", position=["q"], unit="rad", time_unit="s", pose=["T"])
     found = states(path)
     assert [s.stamp_ns for s in found] == [10_000_000 * i for i in range(20)]
     assert np.array_equal([s.position for s in found], q)
-    assert found[5].T_base_ee == pytest.approx(T)
+    assert found[5].T_base_ee == pytest.approx(POSE)
 
 
 @pytest.mark.parametrize(
@@ -230,13 +188,30 @@ def test_an_npz_without_the_array_lists_those_there(tmp_path: Path) -> None:
 
 
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
+
 VALUES = [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [1.0, 0.0, 0.0, 0.0, 0.0, -1.0]]
 
 
 def twist(values: list[float], store: Any = STORE) -> Any:
-    vector = store.types["geometry_msgs/msg/Vector3"]
-    linear, angular = (vector(x=x, y=y, z=z) for x, y, z in (values[:3], values[3:]))
-    return store.types[PLAIN](linear=linear, angular=angular)
+    return built(PLAIN, store, linear=by_axis(values[:3]), angular=by_axis(values[3:]))
+
+
+@pytest.mark.parametrize("kind", ["mcap", "bag2", "bag1", "plain"])
+def test_twists_of_any_log_come_by_their_own_stamps_or_the_time_of_logging(tmp_path: Path, kind: str) -> None:
+    if kind == "bag1":
+        store = get_typestore(Stores.ROS1_NOETIC)
+        path = write_bag1(tmp_path / "log.bag", of_log(store), store)
+    elif kind == "plain":
+        rows = enumerate([*VALUES, [np.nan] * 6])
+        sent = [Message(log_ns=START_NS + 50 * i, topic="/cmd", type_name=PLAIN, content=twist(v)) for i, v in rows]
+        path = write_mcap(tmp_path / "log.mcap", sent)
+    else:
+        path = write_mcap(tmp_path / "log.mcap", of_log()) if kind == "mcap" else write_bag2(tmp_path / "b", of_log())
+    found = read_twists(path, "/cmd")
+    np.testing.assert_array_equal(found.twist, VALUES)
+    assert found.stamp_ns.tolist() == [START_NS, START_NS + 50]
+    notes = ("stamps are the times of logging", "1 twists with NaN or infinity: left out")
+    assert (found.frame, found.notes) == (("", notes) if kind == "plain" else ("base", ()))
 
 
 def stamped(values: list[float], stamp_ns: int, frame: str = "base", store: Any = STORE) -> Message:
@@ -249,52 +224,24 @@ def of_log(store: Any = STORE) -> list[Message]:
     return [stamped(VALUES[1], START_NS + 50, store=store), stamped(VALUES[0], START_NS, store=store)]
 
 
-@pytest.mark.parametrize("kind", ["mcap", "bag2", "bag1"])
-def test_stamped_twists_of_any_log_come_by_their_own_stamps(tmp_path: Path, kind: str) -> None:
-    if kind == "bag1":
-        store = get_typestore(Stores.ROS1_NOETIC)
-        path = write_bag1(tmp_path / "log.bag", of_log(store), store)
-    else:
-        path = write_mcap(tmp_path / "log.mcap", of_log()) if kind == "mcap" else write_bag2(tmp_path / "b", of_log())
-    found = read_twists(path, "/cmd")
-    assert found.frame == "base" and found.stamp_ns.tolist() == [START_NS, START_NS + 50]
-    np.testing.assert_array_equal(found.twist, VALUES)
-
-
-def test_twists_without_a_header_come_by_the_time_of_logging(tmp_path: Path) -> None:
-    messages = [
-        Message(log_ns=START_NS + i, topic="/cmd", type_name=PLAIN, content=twist(values))
-        for i, values in enumerate([*VALUES, [np.nan] * 6])
-    ]
-    found = read_twists(write_mcap(tmp_path / "log.mcap", messages), "/cmd")
-    assert found.frame == "" and found.stamp_ns.tolist() == [START_NS, START_NS + 1]
-    assert found.notes == ("stamps are the times of logging", "1 twists with NaN or infinity: left out")
-
-
 def test_what_is_no_topic_of_twists_is_said(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "log.mcap", [*of_log(), *states_of(np.zeros((1, 2)), ("a", "b"))])
-    with pytest.raises(InputError, match=r"got sensor_msgs/msg/JointState; topics with twists: /cmd"):
-        read_twists(path, "/joint_states")
-    with pytest.raises(InputError, match="got no message"):
-        read_twists(path, "/else")
+    refused(r"got sensor_msgs/msg/JointState; topics with twists: /cmd", read_twists, path, "/joint_states")
+    refused("got no message", read_twists, path, "/else")
     mixed = write_mcap(tmp_path / "mixed.mcap", [*of_log(), stamped(VALUES[0], START_NS + 60, "tool")])
-    with pytest.raises(InputError, match="in one frame, got base, tool"):
-        read_twists(mixed, "/cmd")
+    refused("in one frame, got base, tool", read_twists, mixed, "/cmd")
 
 
 def test_a_table_beside_that_of_the_states_holds_twists(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("t,a,vx,vy,vz,wx,wy,wz\n0,0.0,.1,.2,.3,.4,.5,.6\n50,0.1,1,0,0,0,0,-1\n")
-    states = '[states]\nfile = "run.csv"\njoints = ["a"]\ntime = "t"\ntime_unit = "ns"\nposition = ["a"]\n'
+    table = '[states]\nfile = "run.csv"\njoints = ["a"]\ntime = "t"\ntime_unit = "ns"\nposition = ["a"]\n'
     twists = '[twists]\nfile = "run.csv"\ntime = "t"\ntime_unit = "ns"\nlinear = ["vx", "vy", "vz"]\n'
     path = tmp_path / "run.toml"
-    path.write_text(states + twists + 'angular = ["wx", "wy", "wz"]\nframe = "tip"\n')
+    path.write_text(table + twists + 'angular = ["wx", "wy", "wz"]\nframe = "tip"\n')
     found = read_twists(path, "twists")
-    assert found.frame == "tip" and found.stamp_ns.tolist() == [0, 50]
+    assert (found.frame, found.stamp_ns.tolist()) == ("tip", [0, 50])
     np.testing.assert_array_equal(found.twist, VALUES)
-    assert len(list(open_states(path, SourceOptions(), ("a",)).records())) == 2
-    path.write_text(states + twists + 'angular = ["wx"]\n')
-    with pytest.raises(InputError, match="angular of 3 columns"):
-        read_twists(path, "twists")
-    path.write_text(states)
-    with pytest.raises(InputError, match=r"expected a table \[twists\]"):
-        read_twists(path, "twists")
+    assert len(states(opened(path, ("a",)))) == 2
+    for rest, said in ((twists + 'angular = ["wx"]\n', "angular of 3 columns"), ("", "expected a table [twists]")):
+        path.write_text(table + rest)
+        refused(said, read_twists, path, "twists")
