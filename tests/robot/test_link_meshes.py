@@ -95,21 +95,24 @@ def test_mesh_paths_are_found(tmp_path: Path, filename: str, place: str, folder:
     assert len(read_solids(urdf, folders)["base"][0].surface.faces) == 20
 
 
-def test_a_missing_mesh_is_named_with_its_link(tmp_path: Path) -> None:
-    urdf = read_urdf(written(tmp_path, arm_of('<mesh filename="none.stl"/>', BALL)))
-    with pytest.raises(
-        InputError, match=r"robot.urdf: link 'base': mesh none.stl was not found; expected .*none.stl"
-    ):
-        read_solids(urdf)
-
-
-def test_shapes_of_another_kind_and_no_shapes_are_refused(tmp_path: Path) -> None:
-    urdf = read_urdf(written(tmp_path, arm_of('<cone radius="0.1" length="1"/>', BALL)))
-    with pytest.raises(InputError, match="link 'base': expected mesh, box, cylinder, capsule or sphere, got <cone>"):
-        read_solids(urdf)
-    bare = arm_of(BALL, BALL).replace("collision>", "visual>")
-    with pytest.raises(InputError, match="expected collision geometry, got none"):
-        read_solids(read_urdf(written(tmp_path, bare)))
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            arm_of('<mesh filename="none.stl"/>', BALL),
+            "link 'base': mesh none.stl was not found; expected .*none",
+        ),
+        (
+            arm_of('<mesh filename="a.stl" scale="1 0 1"/>', BALL),
+            "mesh: scale: expected three numbers that are not",
+        ),
+        (arm_of('<cone radius="0.1"/>', BALL), "expected mesh, box, cylinder, capsule or sphere, got <cone>"),
+        (arm_of(BALL, BALL).replace("collision>", "visual>"), "expected collision geometry, got none"),
+    ],
+)
+def test_shapes_that_cannot_be_read_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError, match=f"robot.urdf.*{words}"):
+        read_solids(read_urdf(written(tmp_path, text)))
 
 
 def test_an_open_mesh_is_taken_apart_and_its_open_part_measured_by_its_hull(tmp_path: Path) -> None:
