@@ -85,32 +85,17 @@ def test_the_baked_channel_is_the_probability_at_the_cell_centres(form: str) -> 
     np.testing.assert_allclose(values.ravel(), expected, atol=5e-3)  # 2e-5 m of truncation over 2 mm
     assert values.max() > 0.3
     assert grid.header["probability"] == form
-    numbers = grid.header["probability_numbers"]
-    assert isinstance(numbers, dict)
-    assert (
-        numbers.get("sigma" if form == "calibrated" else "variance_divisor")
-        == {"calibrated": 0.002, "paper": 9}[form]
-    )
+    name, value = {"calibrated": ("sigma", 0.002), "paper": ("variance_divisor", 9)}[form]
+    assert grid.header["probability_numbers"][name] == value  # type: ignore[call-overload, index]
 
 
-def test_a_grid_without_the_channel_names_no_probability() -> None:
+def test_a_header_names_no_probability_without_the_channel_and_how_a_full_process_was_solved() -> None:
     header = bake(splat_set(*cloud()), BOX, FieldConfig(voxel=0.05)).header
-    assert "probability" not in header
-    assert "weights_solved" not in header
+    assert "probability" not in header and "weights_solved" not in header
+    solved = bake(splat_set(*cloud(200)), BOX, FieldConfig(voxel=0.05, weights="cg", distance="gpdf")).header
+    assert solved["weights_solved"]["gpdf"]["residual"] < 1e-6  # type: ignore[call-overload, index]
 
 
-def test_the_header_tells_how_a_full_process_was_solved() -> None:
-    config = FieldConfig(voxel=0.05, weights="cg", distance="gpdf")
-    solved = bake(splat_set(*cloud(200)), BOX, config).header["weights_solved"]
-    assert isinstance(solved, dict)
-    assert solved["gpdf"]["residual"] < 1e-6
-
-
-def test_bad_settings_are_refused_in_words() -> None:
-    spheres = Spheres.of(*cloud(10))
-    with pytest.raises(UsageError, match=r"field.probability: expected calibrated or paper, got 'sure'"):
-        make_probability(spheres, FieldConfig(probability="sure"))
-    with pytest.raises(UsageError, match=r"field.error: expected 1e-05 to 1 m, got 0.0"):
-        make_probability(spheres, FieldConfig(error=0.0))
+def test_the_probability_of_the_paper_has_no_full_process() -> None:
     with pytest.raises(UsageError, match=r"expected field.weights = rowsum or voxel, got cg"):
-        make_probability(spheres, FieldConfig(probability="paper", weights="cg"))
+        make_probability(Spheres.of(*cloud(10)), FieldConfig(probability="paper", weights="cg"))
