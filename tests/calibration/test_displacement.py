@@ -43,9 +43,7 @@ def test_a_camera_that_stands_where_the_log_says_sees_the_robot_in_its_place(
     seen: tuple[Arm, list[RgbdFrame]],
 ) -> None:
     found = displacement_of(*seen)
-    assert found is not None
-    assert found[0]["distance_mm"] < 0.5
-    assert found[0]["sigma_mm"] < 1.0
+    assert found is not None and found[0]["distance_mm"] < 0.5 and found[0]["sigma_mm"] < 1.0
 
 
 @pytest.mark.parametrize(
@@ -63,8 +61,7 @@ def test_a_camera_that_stands_elsewhere_moves_what_it_sees_by_as_much(
 ) -> None:
     arm, frames = seen
     twist = np.array([*turn, *move])
-    still = np.zeros(6)
-    shown = [arm.rows(f.depth, f.intrinsics, f.T_world_camera, still, f.stamp_ns, 0.03) for f in frames]
+    shown = [arm.rows(f.depth, f.intrinsics, f.T_world_camera, np.zeros(6), f.stamp_ns, 0.03) for f in frames]
     points = np.concatenate([rows.points for rows in shown if rows is not None])
     T = transform_of(twist)
     true = np.sqrt(np.square(points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]).sum(axis=1).mean())
@@ -109,15 +106,16 @@ def test_a_camera_that_is_too_far_off_is_placed_rightly_or_stays_displaced(
         assert frame.T_world_camera == pytest.approx(frames[0].T_world_camera, abs=2e-3)
 
 
+def assert_stays_displaced(arm: Arm, frames: list[RgbdFrame]) -> None:
+    row = displaced_cameras(arm, frames)[CAMERA]
+    assert (is_displaced(row), is_corrected(row)) == (True, False)
+
+
 def test_no_camera_is_corrected_by_one_posture_or_while_it_moves(seen: tuple[Arm, list[RgbdFrame]]) -> None:
     arm, frames = seen
     off = moved(frames, np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
-    still = [replace(off[0]) for _ in off]
-    shaken = [*off[:-1], *moved(off[-1:], np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))]
-    for some in (still, shaken):
-        row = displaced_cameras(arm, some)[CAMERA]
-        assert is_displaced(row)
-        assert not is_corrected(row)
+    assert_stays_displaced(arm, [replace(off[0]) for _ in off])
+    assert_stays_displaced(arm, [*off[:-1], *moved(off[-1:], np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))])
 
 
 def test_where_one_camera_cannot_be_corrected_none_is(seen: tuple[Arm, list[RgbdFrame]]) -> None:
@@ -133,7 +131,7 @@ def test_where_one_camera_cannot_be_corrected_none_is(seen: tuple[Arm, list[Rgbd
 
 
 @pytest.mark.parametrize("joint", [1, 3])
-@pytest.mark.parametrize("degrees", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("degrees", [1.0, 4.0])
 def test_a_joint_whose_zero_is_off_does_not_move_a_camera(
     seen: tuple[Arm, list[RgbdFrame]], joint: int, degrees: float
 ) -> None:
@@ -143,9 +141,7 @@ def test_a_joint_whose_zero_is_off_does_not_move_a_camera(
         q = posture(stamp_ns)
         return None if q is None else q + np.deg2rad(degrees) * np.eye(len(q))[joint]
 
-    row = displaced_cameras(Arm(seen[0].model, bent), frames)[CAMERA]
-    assert is_displaced(row)
-    assert not is_corrected(row)
+    assert_stays_displaced(Arm(seen[0].model, bent), frames)
 
 
 def test_one_link_alone_does_not_place_a_camera(seen: tuple[Arm, list[RgbdFrame]]) -> None:
@@ -159,9 +155,7 @@ def test_one_link_alone_does_not_place_a_camera(seen: tuple[Arm, list[RgbdFrame]
         shown = arm.surface.render(poses, true.intrinsics, true.T_world_camera, true.depth)
         of_link = shown.link == arm.surface.links.index("panda_link1")
         kept.append(replace(frame, depth=np.where(of_link, frame.depth, np.float32(0.0))))
-    row = displaced_cameras(arm, kept)[CAMERA]
-    assert is_displaced(row)
-    assert not is_corrected(row)
+    assert_stays_displaced(arm, kept)
 
 
 def test_too_little_of_the_robot_says_nothing_of_a_camera(seen: tuple[Arm, list[RgbdFrame]]) -> None:
