@@ -195,12 +195,9 @@ def test_cells_are_counted_where_a_kernel_field_alone_over_estimates_or_has_no_v
     counts = {}
     for name, kind in (("se", SeField), ("gpdf", GpdfField)):
         alone = kind(centers, radii, 0.1).query_raw(points)[0]
-        counts |= {
-            f"{name}_without_value": np.isnan(alone).sum(),
-            f"{name}_over_estimates": (alone > hard + 2e-6).sum(),
-        }
+        counts[f"{name}_without_value"] = np.isnan(alone).sum()
+        counts[f"{name}_over_estimates"] = (alone > hard + 2e-6).sum()
     baked = grid.header["kernel_counts"]
-    assert isinstance(baked, dict)
     assert baked.keys() == counts.keys()
     assert baked["se_without_value"] > 100
     assert baked["gpdf_without_value"] == 0
@@ -233,7 +230,7 @@ def test_a_slab_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) ->
 def test_memory_is_that_of_a_slab_however_long_the_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slabs_module, "SLAB_BYTES", 1)
     splats, peaks = splat_set(*cloud(50)), []
-    for length in (32, 320):
+    for length in (32, 160):
         layout = GridLayout(origin=LAYOUT.origin, voxel=0.02, shape=(length, 40, 40))
         baker = Baker(splats, layout, FieldConfig())
         tracemalloc.start()
@@ -269,15 +266,11 @@ def test_statistics_count_what_the_grid_holds() -> None:
     assert found.hard_share == pytest.approx(1 / 12)
     assert found.excess["se"].count == 1
     assert found.excess["se"].largest == pytest.approx(0.25)
-    assert found.gradient is not None
     histogram = {index: count for index, count in enumerate(found.gradient.histogram) if count}
     assert histogram == {10: 1, 20: 6, 40: 1}, "lengths 0.49, 1, and 7 in the last"
     assert found.gradient.largest == 7.0
     assert found.gradient.mean == pytest.approx((0.49 + 6 + 7) / 8)
     assert found.gradient.share_near_one == pytest.approx(6 / 8)
-
-
-def test_statistics_of_a_grid_without_a_channel_are_none() -> None:
     blank = np.full((2, 2, 2), np.nan, np.float32)
     found = grid_statistics(DistanceGrid(origin=np.zeros(3), voxel=0.1, channels={"sdf": blank}, header={}))
     assert (found.num_blank, found.lowest, found.observed, found.hard_share, found.gradient) == (8, *[None] * 4)

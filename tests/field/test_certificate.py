@@ -25,7 +25,7 @@ from splatctrl_cli.field.grid_cells import LOSS, check_loss
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid, Float64
-from tests.field.scenes import splat_set
+from tests.field.scenes import plane, splat_set
 
 NUM = 4000
 
@@ -183,11 +183,8 @@ def test_over_a_plane_the_kernel_of_the_paper_reads_the_closed_form(length: floa
 
 
 def test_over_a_plane_the_gaussian_kernel_has_no_bias() -> None:
-    axis = np.arange(-0.45, 0.45, 0.01)
-    x, y = np.meshgrid(axis, axis)
-    centers = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.01, 0.01, (NUM_NEAR, 2)), rng.uniform(0.01, 0.2, NUM_NEAR)])
     for radius in (0.0, 0.005):
-        distance = SeField(centers, np.full(len(centers), radius)).query(points)[0]
+        distance = SeField(*plane(radius, 0.01, 0.45)).query(points)[0]
         np.testing.assert_allclose(distance, points[:, 2] - radius, atol=5e-5 + 1e-6)  # the truncation, and float32

@@ -20,7 +20,7 @@ from splatctrl_cli.field.distance import (
 )
 from splatctrl_cli.field.health import planar_zero_level
 from splatctrl_cli.records import DistanceField
-from tests.field.scenes import cloud, queries
+from tests.field.scenes import cloud, plane, queries
 from tests.reference import field as reference
 
 LENGTH, NOISE = 0.02, 1e-6
@@ -103,9 +103,8 @@ def test_planar_zero_level_is_where_the_planar_field_is_zero() -> None:
 
 
 def test_safe_field_never_exceeds_the_exact_distance() -> None:
-    sparse = np.array([[0.0, 0.0, 0.05]])  # one splat before a dense plane: row sums over-estimate its clearance
-    x, y = np.meshgrid(np.arange(-0.2, 0.2, 0.004), np.arange(-0.2, 0.2, 0.004))
-    centers = np.concatenate([sparse, np.stack([x.ravel(), y.ravel(), np.full(x.size, -0.02)], axis=1)])
+    wall = plane(spacing=0.004, half=0.2)[0] - [0.0, 0.0, 0.02]
+    centers = np.concatenate([[[0.0, 0.0, 0.05]], wall])  # one splat before it: row sums over-estimate its clearance
     radii, points = np.full(len(centers), 0.003), queries(400, extent=0.15)
     hard, kernel = SphereField(centers, radii).query(points)[0], GpdfField(centers, radii, LENGTH).query(points)[0]
     safe, gradient = make_field(centers, radii, FieldConfig(distance="safe_gpdf")).query(points)
@@ -221,11 +220,6 @@ def test_shifting_by_the_nearest_centre_overflows_with_radii(rows: list[Row]) ->
     assert len(with_radii) == 2
     for row in with_radii:
         assert [cell.num_bad > 0 for cell in row.cells] == [False, False, True, True, True, True]
-
-
-def plane(radius: float, spacing: float = 0.005) -> tuple[np.ndarray, np.ndarray]:
-    x, y = np.meshgrid(np.arange(-0.4, 0.4, spacing), np.arange(-0.4, 0.4, spacing))
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), np.full(x.size, radius)
 
 
 def test_marching_converges_to_the_level_set_before_a_plane() -> None:

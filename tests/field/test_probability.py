@@ -13,16 +13,11 @@ from splatctrl_cli.field.probability import (
 )
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box
-from tests.field.scenes import cloud, queries, splat_set
+from tests.field.scenes import cloud, plane, queries, splat_set
 from tests.reference import field as reference
 
 LENGTH, NOISE = FieldConfig.length_scale, FieldConfig.noise
 BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]))
-
-
-def plane(spacing: float = 0.005) -> tuple[np.ndarray, np.ndarray]:
-    x, y = np.meshgrid(np.arange(-0.12, 0.12, spacing), np.arange(-0.12, 0.12, spacing))
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), np.zeros(x.size)
 
 
 def test_the_papers_probability_is_that_of_its_equations() -> None:
@@ -35,7 +30,7 @@ def test_the_papers_probability_is_that_of_its_equations() -> None:
 
 
 def test_variance_falls_to_three_quarters_on_a_dense_plane_and_far_away_a_score_is_left() -> None:
-    centers, radii = plane()
+    centers, radii = plane(half=0.12)
     on_plane = np.array([[0.001, 0.002, 0.0]])
     assert 1 - reference.explained(on_plane, centers, LENGTH, NOISE)[0] == pytest.approx(0.75, abs=0.01)
     found = PaperProbability(Spheres.of(centers, radii), FieldConfig()).of(np.array([[0.0, 0.0, 5.0], *on_plane]))

@@ -73,7 +73,6 @@ def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
     assert (dense < 0).any()
     assert solution.residual < 1e-6
     weights = weights_named("cg", Spheres.of(centers, radii), kernel, NOISE, 1)
-    assert weights.sign is not None
     assert weights.num_iterations
     size = np.exp(weights.log_size + log_values)
     np.testing.assert_allclose(weights.sign * size, dense, atol=3e-3)

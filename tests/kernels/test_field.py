@@ -20,29 +20,6 @@ def test_spare_entries_are_never_taken(num: int) -> None:
     assert points.num_points == num
 
 
-def test_every_point_is_in_the_box_of_its_cluster_and_group() -> None:
-    points = cluster_points(cloud(500)[0])
-    is_point = points.is_point.view(np.bool_)
-    assert sorted(points.source[is_point]) == list(range(500))
-    place, boxes = points.clusters.centers[:, is_point], points.clusters.boxes
-    cluster = np.flatnonzero(is_point) // native.LANES
-    group = len(points.source) // native.LANES + cluster // native.LANES
-    for box in (cluster, group):
-        assert (boxes[:3, box] <= place).all()
-        assert (place <= boxes[3:, box]).all()
-
-
-def test_points_that_two_sets_share_keep_their_order_and_bits_in_one_frame() -> None:
-    centers, _ = cloud(500)
-    frame = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.6))
-    whole, half = cluster_points(centers, frame), cluster_points(centers[::2], frame)
-    kept = np.flatnonzero(whole.is_point.view(np.bool_) & (whole.source % 2 == 0))
-    np.testing.assert_array_equal(whole.source[kept], 2 * half.source[half.is_point.view(np.bool_)])
-    np.testing.assert_array_equal(
-        whole.clusters.centers[:, kept], half.clusters.centers[:, half.is_point.view(np.bool_)]
-    )
-
-
 @pytest.mark.parametrize("is_matern", [True, False])
 def test_row_sums_are_those_of_the_kernel_matrix_in_any_order(is_matern: bool) -> None:
     centers, _ = cloud(700)

@@ -85,7 +85,6 @@ def test_an_edge_of_no_length_is_free_or_not_as_its_posture_is(arm: RobotModel) 
 
 def test_shares_do_not_depend_on_threads(arm: RobotModel) -> None:
     room, start, end = room_of(arm, KINDS, 5)
-    assert room.compiled is not None
     asked = {"contact": CONTACT, "give_up": 0.05, "rounding": ROUNDING, "still": STILL_ROW}
     one, *others = (room.compiled.advance(start, end, **asked, only_whole=False, threads=num) for num in (1, 2, 7))
     for other in others:
@@ -109,7 +108,6 @@ def test_shares_do_not_depend_on_threads(arm: RobotModel) -> None:
 )
 def test_arrays_that_do_not_fit_are_refused(arm: RobotModel, changed: Callable[[Any], Any], words: str) -> None:
     room, start, end = room_of(arm, KINDS, 6)
-    assert room.compiled is not None
     changes = changed(room.compiled)
     asked = {"contact": changes.pop("contact", CONTACT), "give_up": 0.1, "rounding": 0.0, "still": STILL_ROW}
     end = end[:, : changes.pop("num_joints", 7)]

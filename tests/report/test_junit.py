@@ -95,12 +95,8 @@ def test_what_could_not_run_or_was_not_run_or_was_killed_is_no_pass() -> None:
     assert (error.message, "exit code: 4" in error.text) == ("scene: no such file", True)
     assert (killed.message, killed.text) == ("timed out after 5 s", "timed out after 5 s\nfits\nstill fits")
     assert (suite.tests, suite.errors, suite.skipped) == (3, 2, 1)
-    suites = [
-        suite_of(*cases_of(VERDICT, "a")[1:]),
-        suite_of(skipped_case("b", "")),
-        suite_of(*cases_of(VERDICT, "c")),
-    ]
-    worst = [case.kind for _, case in worst_first(suites)]
+    each = cases_of(VERDICT, "a")[1:], [skipped_case("b", "")], cases_of(VERDICT, "c")
+    worst = [case.kind for _, case in worst_first([suite_of(*some) for some in each])]
     assert worst == [Kind.FAILED, Kind.NOT_EVALUABLE, Kind.NOT_EVALUABLE, Kind.SKIPPED]
 
 

@@ -157,7 +157,6 @@ def drawn_bytes(draw: Callable[[Path], None]) -> bytes:
 def picture_of(data: bytes) -> UInt8:
     """Blue, green and red of each pixel."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
     return np.asarray(image, np.uint8)
 
 

@@ -110,7 +110,6 @@ def test_a_report_says_deficit_share_and_protrusion_of_each_link(tmp_path: Path)
     half = np.array([0.15, 0.1, 0.05])
     report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.15), ("tip", [0.01, 0, 0], 0.1)))
     base, tip = report.links
-    assert base.deficit is not None
     assert base.deficit.proven == pytest.approx(np.linalg.norm(half) - 0.15, abs=1e-4)
     assert base.protrusion == pytest.approx(0.1)
     assert 0 < base.uncovered_share < 1
@@ -131,26 +130,6 @@ def test_a_ball_in_its_own_sphere_is_covered_exactly_and_a_link_without_one_has_
     assert report.uncovered_share == pytest.approx(0.5)
 
 
-def test_spheres_of_a_link_fixed_to_another_cover_it(tmp_path: Path) -> None:
-    text = arm_of(BALL, BALL).replace(
-        "</robot>",
-        '<link name="pad"><collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
-        '<joint name="glue" type="fixed"><parent link="tip"/><child link="pad"/>'
-        '<origin xyz="0 0 0.05" rpy="0 1 0"/></joint></robot>',
-    )
-    urdf = read_urdf(written(tmp_path, text))
-    report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.1), ("tip", [0, 0, 0.02], 0.101)))
-    assert report.bare_links == ()
-    assert all(link.is_covered for link in report.links)
-    assert [link.num_spheres for link in report.links] == [1, 1, 0]
-
-
-def test_spheres_on_unknown_links_are_refused(tmp_path: Path) -> None:
-    urdf = read_urdf(written(tmp_path, arm_of(BALL, BALL)))
-    with pytest.raises(InputError, match=r"sphere set: link 'wing' is not in .*; links there: base, tip"):
-        coverage_deficit(urdf, spheres(("wing", [0, 0, 0], 0.1)))
-
-
 @pytest.mark.parametrize(
     ("name", "share", "deficit"),
     [
@@ -169,13 +148,18 @@ def test_public_panda_sets_leave_much_of_the_collision_hulls_uncovered(
     assert report.open_links == ("panda_link6",)
 
 
-def test_the_worst_link_of_a_rigid_body_counts_for_all_of_its_spheres(tmp_path: Path) -> None:
+def test_spheres_of_a_rigid_body_cover_all_of_it_and_its_worst_link_counts_for_them_all(tmp_path: Path) -> None:
     pad = '<link name="pad"><collision><geometry><sphere radius="0.05"/></geometry></collision></link>'
     glue = '<joint name="glue" type="fixed"><parent link="tip"/><child link="pad"/><origin xyz="0 0 0.02"/></joint>'
     path = written(tmp_path, arm_of(BALL, BALL).replace("</robot>", f"{pad}{glue}</robot>"))
-    spheres = SphereSet(links=("base", "tip", "pad"), centers=np.zeros((3, 3)), radii=np.array([0.08, 0.07, 0.05]))
-    model = RobotModel.from_urdf(path, spheres)
+    report = coverage_deficit(read_urdf(path), spheres(("base", [0, 0, 0], 0.1), ("tip", [0, 0, 0.02], 0.101)))
+    assert report.bare_links == () and all(link.is_covered for link in report.links)
+    assert [link.num_spheres for link in report.links] == [1, 1, 0]
+    three = spheres(("base", [0, 0, 0], 0.08), ("tip", [0, 0, 0], 0.07), ("pad", [0, 0, 0], 0.05))
+    model = RobotModel.from_urdf(path, three)
     assert np.isnan(model.sphere_deficit).all() and "not read" in model.coverage_unknown
-    measured = model.with_coverage(coverage_deficit(model.urdf, spheres))
+    measured = model.with_coverage(coverage_deficit(model.urdf, three))
     np.testing.assert_allclose(measured.sphere_deficit, [0.0, 0.01, 0.01], atol=1e-9)
     assert np.isnan(model.sphere_deficit).all()
+    with pytest.raises(InputError, match=r"sphere set: link 'wing' is not in .*; links there: base, tip"):
+        coverage_deficit(model.urdf, spheres(("wing", [0, 0, 0], 0.1)))

@@ -245,7 +245,6 @@ def test_rows_and_planner_keep_the_margin_of_their_pair(
     arm: tuple[RobotModel, SelfSurfaces], kept: KeptMargin, eased: RobotModel
 ) -> None:
     model, _ = arm
-    assert kept.margin is not None
     np.testing.assert_allclose(MARGIN - eased.self_allowance, kept.margin)
     np.testing.assert_array_equal(model.self_allowance, 0.0)
     moving = int(model.moving_spheres.sum())

@@ -29,11 +29,22 @@ THREE = """
 """
 
 
-def test_a_plain_file_is_read_and_spheres_of_no_size_are_off(tmp_path: Path) -> None:
+def test_a_plain_file_and_a_urdf_of_spheres_are_read_and_spheres_of_no_size_are_off(tmp_path: Path) -> None:
     file = read_sphere_file(written(tmp_path, "collision_spheres:" + THREE, "s.yaml"))
     assert (file.layout, file.spheres.links, file.num_off) == ("YAML", ("a", "b"), 1)
     np.testing.assert_array_equal(file.spheres.centers, [[0.1, 0, 0], [0, 0.3, 0]])
     np.testing.assert_array_equal(file.spheres.radii, [0.05, 0.01])
+    file = read_sphere_file(written(tmp_path, arm_of(BALL, BALL)))
+    assert (file.layout, file.spheres.links, file.num_off) == ("URDF", ("base", "tip"), 0)
+
+
+def test_what_is_written_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
+    centers = np.random.default_rng(0).normal(size=(2, 3))
+    spheres = SphereSet(links=("a", "b"), centers=centers, radii=np.array([1 / 3, 1e-6]))
+    again = read_sphere_file(written(tmp_path, spheres_yaml(spheres, ["of a test"]), "t.yaml")).spheres
+    assert again.links == spheres.links
+    np.testing.assert_array_equal(again.centers, centers)
+    np.testing.assert_array_equal(again.radii, spheres.radii)
 
 
 @pytest.mark.parametrize(
@@ -47,21 +58,6 @@ def test_curobo_adds_its_buffer_and_may_keep_spheres_elsewhere(
     file = read_sphere_file(written(tmp_path, CUROBO.format(buffer=buffer, spheres="spheres/arm.yml"), "arm.yml"))
     assert (file.layout, file.num_off) == ("cuRobo YAML", num_off)
     np.testing.assert_allclose(file.spheres.radii, radii, rtol=1e-12)
-
-
-def test_a_urdf_of_spheres_is_a_sphere_file(tmp_path: Path) -> None:
-    file = read_sphere_file(written(tmp_path, arm_of(BALL, BALL)))
-    assert (file.layout, file.spheres.links, file.num_off) == ("URDF", ("base", "tip"), 0)
-
-
-def test_what_is_written_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
-    file = read_sphere_file(written(tmp_path, "collision_spheres:" + THREE, "s.yaml"))
-    centers = np.random.default_rng(0).normal(size=(2, 3))
-    spheres = type(file.spheres)(links=("a", "b"), centers=centers, radii=np.array([1 / 3, 1e-6]))
-    again = read_sphere_file(written(tmp_path, spheres_yaml(spheres, ["of a test"]), "t.yaml")).spheres
-    assert again.links == spheres.links
-    np.testing.assert_array_equal(again.centers, centers)
-    np.testing.assert_array_equal(again.radii, spheres.radii)
 
 
 @pytest.mark.parametrize(
