@@ -13,35 +13,30 @@ from splatctrl_cli.field.distance import DISTANCES, GpdfField, make_field
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.unknown import apply_unknown
 from splatctrl_cli.field.weights import METHODS
-from splatctrl_cli.records import Box, Float64
+from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, queries, splat_set
 from tests.reference import field as reference
 
 LENGTHS = [10.0**exponent for exponent in range(-10, 3)]
+CENTERS, RADII = cloud(80)
+SCENES = {
+    "one": (CENTERS[:1], np.array([0.01])),
+    "duplicates": (np.concatenate([CENTERS[:30]] * 3), np.concatenate([RADII[:30]] * 3)),
+    "zero radii": (CENTERS, np.zeros(80)),
+    "mixed radii": (CENTERS, np.geomspace(0.001, 0.3, 80).astype(np.float32).astype(np.float64)),
+    "one place": (np.zeros((4, 3)), np.full(4, 0.02)),
+}
 KERNELS = [name for name in DISTANCES if name != "hard"]
-
-
-def scene(name: str) -> tuple[Float64, Float64]:
-    centers, radii = cloud(80)
-    if name == "one":
-        return centers[:1], np.array([0.01])
-    if name == "duplicates":
-        return np.concatenate([centers[:30]] * 3), np.concatenate([radii[:30]] * 3)
-    if name == "zero radii":
-        return centers, np.zeros(80)
-    if name == "mixed radii":
-        return centers, np.geomspace(0.001, 0.3, 80).astype(np.float32).astype(np.float64)
-    return np.zeros((4, 3)), np.full(4, 0.02)
 
 
 @pytest.mark.parametrize("weights", METHODS)
 @pytest.mark.parametrize("distance", KERNELS)
-@pytest.mark.parametrize("name", ["one", "duplicates", "zero radii", "mixed radii", "one place"])
+@pytest.mark.parametrize("name", SCENES)
 def test_every_length_scale_gives_finite_distances_or_is_refused_in_words(
     name: str, distance: str, weights: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(weights_module, "NODES", 40)  # smaller blocks, for speed
-    centers, radii = scene(name)
+    centers, radii = SCENES[name]
     points = np.concatenate([queries(40), centers[:10], centers[:10] + 1e-4, 30.0 + queries(3)])
     hard = reference.hard(points, centers, radii)
     between = reference.distances(points, centers)

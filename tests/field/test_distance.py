@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from benchmarks.stability import PRINTED, Row, table_rows
+from benchmarks.stability import PRINTED, table_rows
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.distance import (
@@ -195,30 +195,20 @@ def test_no_slope_of_the_gaussian_field_exceeds_its_bound_and_some_exceed_one(se
     assert slope.max() > 1.1
 
 
-@pytest.fixture(scope="module")
-def rows() -> list[Row]:
-    return table_rows()
-
-
-def test_float64_without_radii_has_the_papers_ticks(rows: list[Row]) -> None:
+def test_the_log_domain_is_finite_and_right_where_printed_forms_have_the_papers_ticks() -> None:
+    rows = table_rows()
     for form, weights in product(PRINTED, ("lumped", "full process")):
         kind = ("no radii", weights, form, "float64")
         (row,) = [row for row in rows if (row.cloud, row.weights, row.form, row.number) == kind]
         assert tuple(cell.num_bad == 0 for cell in row.cells) == PRINTED[form], kind
-
-
-def test_the_log_domain_is_finite_and_right_with_and_without_radii(rows: list[Row]) -> None:
     ours = [row for row in rows if row.form in {"log domain", "GpdfField"}]
     assert {row.cloud for row in ours} == {"no radii", "1 mm to 30 cm"}
     for row in ours:
         for cell in row.cells:
             assert cell.num_bad == 0 and cell.error is not None and cell.error < 1e-6, (row, cell)
-
-
-def test_shifting_by_the_nearest_centre_overflows_with_radii(rows: list[Row]) -> None:
-    with_radii = [row for row in rows if row.cloud != "no radii" and row.form == "eq. 12"]
-    assert len(with_radii) == 2
-    for row in with_radii:
+    shifted = [row for row in rows if row.cloud != "no radii" and row.form == "eq. 12"]  # by the nearest centre
+    assert len(shifted) == 2
+    for row in shifted:
         assert [cell.num_bad > 0 for cell in row.cells] == [False, False, True, True, True, True]
 
 

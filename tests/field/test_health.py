@@ -18,28 +18,21 @@ def square_lattice(spacing: float) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel(), np.zeros(100)], axis=1)
 
 
-def radii(radius: float, **others: float) -> np.ndarray:
-    """Of a lattice's splats, the first ones others."""
-    found = np.full(100, radius)
-    found[: len(others)] = list(others.values())
-    return found
-
-
 FINE = square_lattice(0.01)
 
 
 @pytest.mark.parametrize(
     ("centers", "radii", "length", "words"),
     [
-        (FINE, radii(0.01), 0.02, ()),
-        (FINE, radii(0.005), 0.02, (": the exact field's surface has holes between splats;",)),
-        (FINE, radii(0.008), 0.009, ("spacing", "the sur")),
-        (FINE, radii(0.01), 0.1, ("exceeds the extent of the splats, 0.09 m",)),
-        (FINE, radii(0.01), 0.08, ()),
-        (square_lattice(5.0), radii(5.0), 10.0, ("rounding",)),
-        (square_lattice(5.0), radii(5.0), 9.9, ()),
-        (FINE, radii(0.01, off=0.0), 0.02, ()),
-        (FINE, radii(0.01, off=0.0, small=0.00033), 0.02, ("radii from 0.33 to 10 mm in one set",)),
+        (FINE, np.full(100, 0.01), 0.02, ()),
+        (FINE, np.full(100, 0.005), 0.02, (": the exact field's surface has holes between splats;",)),
+        (FINE, np.full(100, 0.008), 0.009, ("spacing", "the sur")),
+        (FINE, np.full(100, 0.01), 0.1, ("exceeds the extent of the splats, 0.09 m",)),
+        (FINE, np.full(100, 0.01), 0.08, ()),
+        (square_lattice(5.0), np.full(100, 5.0), 10.0, ("rounding",)),
+        (square_lattice(5.0), np.full(100, 5.0), 9.9, ()),
+        (FINE, np.r_[0.0, np.full(99, 0.01)], 0.02, ()),
+        (FINE, np.r_[0.0, 0.00033, np.full(98, 0.01)], 0.02, ("radii from 0.33 to 10 mm in one set",)),
         (np.ones((5, 3)), np.full(5, 0.01), 0.02, ("all 5 splats stand at one place",)),
         (np.ones((1, 3)), np.full(1, 0.01), 0.02, ()),
     ],
@@ -53,7 +46,7 @@ def test_each_ratio_out_of_range_has_its_warning(
 
 
 def test_a_field_is_not_warned_of_kernels_that_it_has_not() -> None:
-    health = [field_health(FINE, radii(0.008), 0.009, kernels=names) for names in ((), ("se",), KERNELS)]
+    health = [field_health(FINE, np.full(100, 0.008), 0.009, kernels=names) for names in ((), ("se",), KERNELS)]
     assert [len(found.warnings) for found in health] == [0, 1, 2]
     assert health[0].radius_per_spacing == pytest.approx(0.8)
     assert [median_spacing(points) for points in (np.zeros((1, 3)), np.zeros((5, 3)))] == [0.0, 0.0]

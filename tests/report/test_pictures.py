@@ -68,89 +68,52 @@ def grid(*, observed: int = 1, distance: float = 0.0, header: str = "from the gr
     return DistanceGrid(origin=np.zeros(3), voxel=0.05, channels=channels, header={"observed": header})
 
 
-def draw_comparison(path: Path) -> None:
-    comparison_picture(path, [row(0.0), row(0.1)])
-
-
 SPHERES = np.array([[0.2, 0.2, 0.5], [0.8, 0.8, 0.9]]), np.array([0.1, 0.1])
-
-
-def draw_slice(path: Path) -> None:
-    field_slice_picture(path, grid(), 2, 0.5, SPHERES, "A ball")
-
-
-def draw_slices(path: Path) -> None:
-    slices_picture(path, grid(), (0.5, 0.5, 0.5))
-
-
-def draw_slices_of_nothing(path: Path) -> None:
-    slices_picture(path, grid(distance=np.nan), (0.5, 0.5, 0.5))
-
-
-def draw_gradient(path: Path) -> None:
-    gradient_picture(path, grid(), [0, 3, 100, 1], 0.5, (0.5, 0.5, 0.5))
-
-
-def draw_gradient_of_nothing_outside(path: Path) -> None:
-    gradient_picture(path, grid(distance=np.nan), [0, 0], 0.5, (-9.0, 99.0, 0.0))
-
-
-def draw_probability(path: Path) -> None:
-    probability_picture(path, grid(), (-9.0, 99.0, 0.0))
-
-
-def draw_large_slice(path: Path) -> None:
-    sdf = np.broadcast_to(np.linspace(-1, 1, 1300, dtype=np.float32)[:, None, None], (1300, 2, 2))
-    large = DistanceGrid(origin=np.zeros(3), voxel=0.001, channels={"sdf": sdf}, header={})
-    slices_picture(path, large, (0.5, 0.0, 0.0))
-
-
-def draw_reliability(path: Path) -> None:
-    curve = reliability(np.array([0.0, 0.95]), np.array([False, True]))  # with empty bins
-    reliability_picture(path, {"calibrated": curve, "paper": curve})
 
 
 NUM = 6000  # states: more than a picture has columns
 SECONDS = np.linspace(0, 5, NUM)
 EVENTS = {"below-margin": [(1.0, 2.0), (4.0, 4.0)], "unknown-space": [(0.0, 5.0)], "stale-map": []}
+CURVES = {
+    "exact": 0.05 * np.cos(SECONDS),
+    "barrier": 0.05 * np.cos(SECONDS) - 0.01,
+    "certified": np.where(SECONDS < 2, np.nan, 0.03),
+    "truth": np.full(NUM, np.nan),
+}
+MOVES = np.where(SECONDS < 0.08, np.nan, [np.sin(SECONDS), 0.001 * np.cos(SECONDS)]).T
+JOINTS, LIMITS, MIDDLE, FAR = ("shoulder", "elbow"), np.array([0.9, 2.0]), (0.5, 0.5, 0.5), (-9.0, 99.0, 0.0)
+LONG = np.broadcast_to(np.linspace(-1, 1, 1300, dtype=np.float32)[:, None, None], (1300, 2, 2))
+LARGE = DistanceGrid(origin=np.zeros(3), voxel=0.001, channels={"sdf": LONG}, header={})
+CURVE = reliability(np.array([0.0, 0.95]), np.array([False, True]))  # with empty bins
 
-
-def draw_clearance(path: Path) -> None:
-    curves = {name: shift + 0.05 * np.cos(SECONDS) for name, shift in (("exact", 0.0), ("barrier", -0.01))}
-    gaps = np.where(SECONDS < 2, np.nan, 0.03)
-    clearance_picture(
-        path, SECONDS, curves | {"certified": gaps, "truth": np.full(NUM, np.nan)}, 0.02, "Clearance", EVENTS
-    )
-
-
-def draw_quiet_clearance(path: Path) -> None:
-    clearance_picture(path, np.zeros(1), {"exact": np.array([0.1])}, 0.02, "Clearance", {})
-
-
-def draw_commands(path: Path) -> None:
-    velocity = np.stack([np.sin(SECONDS), 0.001 * np.cos(SECONDS)], axis=1)
-    velocity[:100] = np.nan
-    joints, limits = ("shoulder", "elbow"), np.array([0.9, 2.0])
-    commands_picture(path, SECONDS, velocity, joints, limits, {"scene": [(1.0, 2.0)], "self": []}, velocity + 0.1)
-
-
-def draw_open_loop(path: Path) -> None:
-    difference = np.stack([np.sin(SECONDS), np.cos(SECONDS)], axis=1)
-    open_loop_picture(path, SECONDS, difference, ("shoulder", "elbow"), np.cos(SECONDS), [(1.0, 1.0)])
-
-
-DRAWN = (
-    *(draw_comparison, draw_slice, draw_slices, draw_slices_of_nothing, draw_gradient),
-    *(draw_gradient_of_nothing_outside, draw_probability, draw_large_slice, draw_reliability),
-    *(draw_clearance, draw_quiet_clearance, draw_commands, draw_open_loop),
-)
+DRAWN: dict[str, Callable[[Path], None]] = {
+    "comparison": lambda path: comparison_picture(path, [row(0.0), row(0.1)]),
+    "slice": lambda path: field_slice_picture(path, grid(), 2, 0.5, SPHERES, "A ball"),
+    "slices": lambda path: slices_picture(path, grid(), MIDDLE),
+    "slices of nothing": lambda path: slices_picture(path, grid(distance=np.nan), MIDDLE),
+    "large slices": lambda path: slices_picture(path, LARGE, (0.5, 0.0, 0.0)),
+    "gradient": lambda path: gradient_picture(path, grid(), [0, 3, 100, 1], 0.5, MIDDLE),
+    "gradient of nothing": lambda path: gradient_picture(path, grid(distance=np.nan), [0, 0], 0.5, FAR),
+    "probability": lambda path: probability_picture(path, grid(), FAR),
+    "reliability": lambda path: reliability_picture(path, {"calibrated": CURVE, "paper": CURVE}),
+    "clearance": lambda path: clearance_picture(path, SECONDS, CURVES, 0.02, "Clearance", EVENTS),
+    "quiet clearance": lambda path: clearance_picture(
+        path, np.zeros(1), {"exact": np.array([0.1])}, 0.02, "Clearance", {}
+    ),
+    "commands": lambda path: commands_picture(
+        path, SECONDS, MOVES, JOINTS, LIMITS, {"scene": [(1.0, 2.0)], "self": []}, MOVES + 0.1
+    ),
+    "open loop": lambda path: open_loop_picture(
+        path, SECONDS, np.nan_to_num(MOVES), JOINTS, np.cos(SECONDS), [(1.0, 1.0)]
+    ),
+}
 
 
 @cache
-def drawn_bytes(draw: Callable[[Path], None]) -> bytes:
+def drawn_bytes(name: str) -> bytes:
     """Of a picture that several tests look at."""
     with TemporaryDirectory() as folder:
-        draw(Path(folder) / "a.png")
+        DRAWN[name](Path(folder) / "a.png")
         return (Path(folder) / "a.png").read_bytes()
 
 
@@ -160,13 +123,13 @@ def picture_of(data: bytes) -> UInt8:
     return np.asarray(image, np.uint8)
 
 
-@pytest.mark.parametrize("draw", DRAWN)
-def test_a_picture_is_1200_pixels_wide_and_the_same_each_time(tmp_path: Path, draw: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize("name", DRAWN)
+def test_a_picture_is_1200_pixels_wide_and_the_same_each_time(tmp_path: Path, name: str) -> None:
     before = dict(mpl.rcParams)
-    draw(tmp_path / "a.png")
+    DRAWN[name](tmp_path / "a.png")
     image = picture(tmp_path / "a.png")
     assert image.shape[1] == 1200 and image.std() > 1.0
-    assert (tmp_path / "a.png").read_bytes() == drawn_bytes(draw)
+    assert (tmp_path / "a.png").read_bytes() == drawn_bytes(name)
     assert dict(mpl.rcParams) == before
 
 
@@ -185,15 +148,15 @@ def test_the_depth_error_saturates_in_the_colour_bar_s_top_colour(tmp_path: Path
 def test_never_seen_space_shows_in_a_slice_where_somebody_looked_and_the_point_that_was_asked_for(
     tmp_path: Path,
 ) -> None:
-    path, point = tmp_path / "a.png", (0.5, 0.5, 0.5)
+    path = tmp_path / "a.png"
     field_slice_picture(path, grid(observed=0), 2, 0.5, SPHERES, "A ball")
-    assert path.read_bytes() != drawn_bytes(draw_slice)
+    assert path.read_bytes() != drawn_bytes("slice")
     never, unknown = grid(observed=0), grid(observed=0, header="no occupancy grid: all never seen")
     others = []
-    for cells, place in ((never, point), (unknown, point), (grid(), (0.0, 0.0, 0.0))):
+    for cells, place in ((never, MIDDLE), (unknown, MIDDLE), (grid(), (0.0, 0.0, 0.0))):
         slices_picture(path, cells, place)
         others.append(picture(path))
-    seen = picture_of(drawn_bytes(draw_slices))
+    seen = picture_of(drawn_bytes("slices"))
     assert np.any(seen != others[0]) and np.any(others[0] != others[1]) and np.any(seen != others[2])
 
 
@@ -254,7 +217,7 @@ def test_the_mask_is_outlined(tmp_path: Path) -> None:
 
 
 def test_each_kind_of_event_that_came_up_has_a_row() -> None:
-    image = picture_of(drawn_bytes(draw_clearance)).astype(int)
+    image = picture_of(drawn_bytes("clearance")).astype(int)
     orange, purple, brown = ((0, 159, 230), (167, 121, 204), (59, 109, 138))
     widths = [int(np.all(np.abs(image - color) < 3, axis=2).sum(axis=1).max()) for color in (orange, purple, brown)]
     assert widths[1] > 3 * widths[0] > 0 and widths[2] == 0
