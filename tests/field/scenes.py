@@ -24,3 +24,9 @@ def queries(num: int = 300, seed: int = 1, extent: float = 0.5) -> Float64:
 def splat_set(centers: Float64, radii: Float64, label: Label = Label.OBJECT) -> SplatSet:
     """Grey splats of one label."""
     return plain_splats(centers, radii, colors=0.5, opacities=0.8, labels=label)
+
+
+def plane(radius: float = 0.0, spacing: float = 0.005, half: float = 0.4) -> tuple[Float64, Float64]:
+    """A square of spheres at z = 0: centers (N, 3), radii (N,)."""
+    x, y = np.meshgrid(np.arange(-half, half, spacing), np.arange(-half, half, spacing))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), np.full(x.size, radius)

@@ -1,44 +1,42 @@
 """Splats and length scales at the edge of what can be: every field is finite and right, or refused in words."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field import weights as weights_module
-from splatctrl_cli.field.distance import DISTANCES, make_field
+from splatctrl_cli.field.distance import DISTANCES, GpdfField, make_field
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.unknown import apply_unknown
 from splatctrl_cli.field.weights import METHODS
-from splatctrl_cli.records import Box, Float64
+from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, queries, splat_set
 from tests.reference import field as reference
 
 LENGTHS = [10.0**exponent for exponent in range(-10, 3)]
+CENTERS, RADII = cloud(80)
+SCENES = {
+    "one": (CENTERS[:1], np.array([0.01])),
+    "duplicates": (np.concatenate([CENTERS[:30]] * 3), np.concatenate([RADII[:30]] * 3)),
+    "zero radii": (CENTERS, np.zeros(80)),
+    "mixed radii": (CENTERS, np.geomspace(0.001, 0.3, 80).astype(np.float32).astype(np.float64)),
+    "one place": (np.zeros((4, 3)), np.full(4, 0.02)),
+}
 KERNELS = [name for name in DISTANCES if name != "hard"]
-
-
-def scene(name: str) -> tuple[Float64, Float64]:
-    centers, radii = cloud(80)
-    if name == "one":
-        return centers[:1], np.array([0.01])
-    if name == "duplicates":
-        return np.concatenate([centers[:30]] * 3), np.concatenate([radii[:30]] * 3)
-    if name == "zero radii":
-        return centers, np.zeros(80)
-    if name == "mixed radii":
-        return centers, np.geomspace(0.001, 0.3, 80).astype(np.float32).astype(np.float64)
-    return np.zeros((4, 3)), np.full(4, 0.02)
 
 
 @pytest.mark.parametrize("weights", METHODS)
 @pytest.mark.parametrize("distance", KERNELS)
-@pytest.mark.parametrize("name", ["one", "duplicates", "zero radii", "mixed radii", "one place"])
+@pytest.mark.parametrize("name", SCENES)
 def test_every_length_scale_gives_finite_distances_or_is_refused_in_words(
     name: str, distance: str, weights: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(weights_module, "NODES", 40)  # smaller blocks, for speed
-    centers, radii = scene(name)
+    centers, radii = SCENES[name]
     points = np.concatenate([queries(40), centers[:10], centers[:10] + 1e-4, 30.0 + queries(3)])
     hard = reference.hard(points, centers, radii)
     between = reference.distances(points, centers)
@@ -66,17 +64,46 @@ def test_every_length_scale_gives_finite_distances_or_is_refused_in_words(
 
 @pytest.mark.parametrize("distance", DISTANCES)
 def test_bad_splats_are_refused_by_every_field(distance: str) -> None:
-    config = FieldConfig(distance=distance)
     centers, radii = cloud(10)
-    centers[4, 2] = np.nan
-    with pytest.raises(InputError, match=r"splat 4: expected a finite centre, got \[.*nan.*1 such"):
-        make_field(centers, radii, config)
-    centers, radii = cloud(10)
-    radii[2] = np.inf
-    with pytest.raises(InputError, match="splat 2: expected a finite radius"):
-        make_field(centers, radii, config)
-    with pytest.raises(NotEvaluableError, match="got none"):
-        make_field(np.empty((0, 3)), np.empty(0), config)
+    odd_center, odd_radius = centers.copy(), radii.copy()
+    odd_center[4, 2], odd_radius[2] = np.nan, np.inf
+    for place, size, words in (
+        (odd_center, radii, r"splat 4: expected a finite centre, got \[.*nan.*1 such"),
+        (centers, odd_radius, "splat 2: expected a finite radius of 0 m or more"),
+        (centers, radii - 1.0, "splat 0: expected a finite radius of 0 m or more"),
+        (centers[:, :2], radii, r"expected centres \(N, 3\)"),
+        (centers[:0], radii[:0], "got none"),
+    ):
+        with pytest.raises((InputError, NotEvaluableError), match=words):
+            make_field(place, size, FieldConfig(distance=distance))
+
+
+@pytest.mark.parametrize(
+    ("distance", "points", "words"),
+    [
+        ("hard", [[0.0, 0, 0], [0, np.inf, 0]], "query point 1: expected finite coordinates"),
+        ("safe", [[0.0, 0, 0], [0, 0, np.nan]], "query point 1: expected finite coordinates"),
+        ("gpdf", [0.0, 0, 0], r"expected shape \(Q, 3\)"),
+    ],
+)
+def test_bad_queries_are_named(distance: str, points: ArrayLike, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make_field(*cloud(10), FieldConfig(distance=distance)).query(np.array(points))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"weights": "mass"}, "weights: expected rowsum, voxel or cg, got 'mass'"),
+        ({"truncation": 0.0}, "truncation"),
+        *[({"length_scale": value}, "length_scale: expected 1e-10 to 1000 m") for value in (0.0, 1e-13, 1e7, np.nan)],
+    ],
+)
+def test_bad_settings_are_named(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        GpdfField(*cloud(10), **settings)
+    with pytest.raises(UsageError, match=words):
+        FieldConfig(**settings)
 
 
 @pytest.mark.parametrize("weights", METHODS)
@@ -96,10 +123,3 @@ def test_a_box_that_holds_no_splat_has_the_distances_to_those_beyond(weights: st
         assert np.isfinite(values).all()
     with pytest.raises(NotEvaluableError, match="expected a cell that some camera saw"):
         apply_unknown(bake(splat_set(centers, radii), box, FieldConfig(voxel=0.1)), "obstacle")
-
-
-@pytest.mark.parametrize("weights", METHODS)
-@pytest.mark.parametrize("length", [0.0, -1.0, 1e-13, 1e7, float("nan")])
-def test_a_length_scale_that_is_none_is_refused(length: float, weights: str) -> None:
-    with pytest.raises(SplatCtrlError, match=r"field.length_scale: expected 1e-10 to 1000 m"):
-        make_field(*cloud(10), FieldConfig(length_scale=length, weights=weights))

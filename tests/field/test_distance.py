@@ -1,11 +1,13 @@
 """Distance fields against their equations, the slope and stability of the kernels' (Table I), and marching."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
-from benchmarks.stability import PRINTED, Row, table_rows
+from benchmarks.stability import PRINTED, table_rows
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.distance import (
     DISTANCES,
     GpdfField,
@@ -18,7 +20,7 @@ from splatctrl_cli.field.distance import (
 )
 from splatctrl_cli.field.health import planar_zero_level
 from splatctrl_cli.records import DistanceField
-from tests.field.scenes import cloud, queries
+from tests.field.scenes import cloud, plane, queries
 from tests.reference import field as reference
 
 LENGTH, NOISE = 0.02, 1e-6
@@ -30,12 +32,13 @@ def fields(centers: np.ndarray, radii: np.ndarray) -> list[DistanceField]:
     return [make_field(centers, radii, FieldConfig(distance=name, length_scale=LENGTH)) for name in DISTANCES]
 
 
-def test_sdf_is_zero_on_an_isolated_sphere() -> None:
-    directions = normalised(queries(50))
-    for field in fields(np.array([[1.0, 2.0, 3.0]]), np.array([0.1])):
-        distance, gradient = field.query(np.array([1.0, 2.0, 3.0]) + 0.1 * directions)
-        np.testing.assert_allclose(distance, 0.0, atol=2e-7)
-        np.testing.assert_allclose(gradient, directions, atol=5e-6)
+def test_an_isolated_sphere_is_as_far_as_it_is_and_the_gradient_points_away() -> None:
+    center, directions = np.array([1.0, 2.0, 3.0]), normalised(queries(50))
+    for field in fields(center[None], np.array([0.1])):
+        for away in (0.1, 0.15, 0.6):
+            distance, gradient = field.query(center + away * directions)
+            np.testing.assert_allclose(distance, away - 0.1, atol=2e-7)
+            np.testing.assert_allclose(gradient, directions, atol=5e-6)
 
 
 def test_hard_is_the_least_distance_to_a_sphere() -> None:
@@ -59,30 +62,22 @@ def test_gpdf_errs_upwards_and_by_no_more_than_its_truncation() -> None:
     expected = reference.gpdf(queries(), centers, radii, LENGTH, NOISE)
     for truncation in (2e-4, 2e-5, 2e-6):
         error = GpdfField(centers, radii, LENGTH, truncation=truncation).query(queries())[0] - expected
-        assert error.min() > -3e-7
-        assert error.max() < truncation + 3e-7
+        assert error.min() > -3e-7 and error.max() < truncation + 3e-7
 
 
-def test_se_is_the_gaussian_log_sum_exp_with_the_mean_radius() -> None:
+@pytest.mark.parametrize("length", [0.005, LENGTH, 0.1])
+def test_se_is_the_gaussian_log_sum_exp_with_the_mean_radius_and_errs_upwards(length: float) -> None:
     centers, radii = cloud()
-    for length in (0.005, LENGTH, 0.1):
-        expected, slope = reference.se(queries(), centers, radii, length, NOISE)
-        distance, gradient = SeField(centers, radii, length, truncation=1e-6).query_raw(queries())
-        np.testing.assert_array_equal(np.isnan(distance), np.isnan(expected))
-        np.testing.assert_allclose(distance, expected, atol=2.5e-6)
-        far = expected > 0.02  # nearer, the root's slope grows without limit
-        np.testing.assert_allclose(gradient[far], slope[far], atol=2e-3)
-
-
-def test_se_errs_upwards_and_by_no_more_than_its_truncation() -> None:
-    centers, radii = cloud()
-    expected, _ = reference.se(queries(), centers, radii, LENGTH, NOISE)
+    expected, slope = reference.se(queries(), centers, radii, length, NOISE)
     has_value = ~np.isnan(expected)
-    for truncation in (2e-3, 2e-4, 2e-5):
-        distance = SeField(centers, radii, LENGTH, truncation=truncation).query_raw(queries())[0]
+    far = has_value & (np.nan_to_num(expected) > 0.02)  # nearer, the root's slope grows without limit
+    for truncation in (1e-6, 2e-5, 2e-4, 2e-3):
+        distance, gradient = SeField(centers, radii, length, truncation=truncation).query_raw(queries())
         error = (distance - expected)[has_value]
-        assert error.min() > -1e-6
-        assert error.max() < truncation + 1e-6
+        assert error.min() > -1.5e-6 and error.max() < truncation + 1.5e-6
+        if truncation == 1e-6:
+            np.testing.assert_array_equal(~np.isnan(distance), has_value)
+            np.testing.assert_allclose(gradient[far], slope[far], atol=2e-3)
 
 
 def test_fields_without_a_value_fall_back_to_the_exact_one() -> None:
@@ -108,9 +103,8 @@ def test_planar_zero_level_is_where_the_planar_field_is_zero() -> None:
 
 
 def test_safe_field_never_exceeds_the_exact_distance() -> None:
-    sparse = np.array([[0.0, 0.0, 0.05]])  # one splat before a dense plane: row sums over-estimate its clearance
-    x, y = np.meshgrid(np.arange(-0.2, 0.2, 0.004), np.arange(-0.2, 0.2, 0.004))
-    centers = np.concatenate([sparse, np.stack([x.ravel(), y.ravel(), np.full(x.size, -0.02)], axis=1)])
+    wall = plane(spacing=0.004, half=0.2)[0] - [0.0, 0.0, 0.02]
+    centers = np.concatenate([[[0.0, 0.0, 0.05]], wall])  # one splat before it: row sums over-estimate its clearance
     radii, points = np.full(len(centers), 0.003), queries(400, extent=0.15)
     hard, kernel = SphereField(centers, radii).query(points)[0], GpdfField(centers, radii, LENGTH).query(points)[0]
     safe, gradient = make_field(centers, radii, FieldConfig(distance="safe_gpdf")).query(points)
@@ -139,13 +133,6 @@ def test_safe_in_one_walk_is_the_smaller_of_two_queries(largest: float, weights:
         np.testing.assert_array_equal(gradient, np.where(is_smooth[:, None], smooth[1], exact[1]))
 
 
-def test_duplicates_do_not_change_the_kernel_field() -> None:
-    centers, radii = cloud(200)
-    once = GpdfField(centers, radii, LENGTH, noise=0.0)
-    twice = GpdfField(np.concatenate([centers] * 2), np.concatenate([radii] * 2), LENGTH, noise=0.0)
-    np.testing.assert_allclose(twice.query(queries())[0], once.query(queries())[0], atol=TRUNCATION_BOUND)
-
-
 def test_one_point_or_none_or_many_can_be_asked() -> None:
     centers, radii = cloud()
     for field in fields(centers, radii):
@@ -161,33 +148,6 @@ def test_threads_do_not_change_a_bit() -> None:
         one, three = kind(centers, radii, threads=1), kind(centers, radii, threads=3)
         for a, b in zip(one.query(queries(1000)), three.query(queries(1000)), strict=True):
             np.testing.assert_array_equal(a, b)
-
-
-def test_bad_splats_are_named() -> None:
-    centers, radii = cloud(10)
-    radii[3] = -0.001
-    with pytest.raises(InputError, match="splat 3: expected a finite radius of 0 m or more"):
-        GpdfField(centers, radii)
-    with pytest.raises(InputError, match=r"expected centres \(N, 3\)"):
-        SphereField(np.zeros((4, 2)), np.zeros(4))
-
-
-def test_bad_queries_and_settings_are_named() -> None:
-    centers, radii = cloud(10)
-    with pytest.raises(InputError, match="query point 1: expected finite coordinates"):
-        SphereField(centers, radii).query(np.array([[0.0, 0, 0], [0, np.inf, 0]]))
-    with pytest.raises(InputError, match="query point 1: expected finite coordinates"):
-        make_field(centers, radii, FieldConfig()).query(np.array([[0.0, 0, 0], [0, 0, np.nan]]))
-    with pytest.raises(InputError, match=r"expected shape \(Q, 3\)"):
-        GpdfField(centers, radii).query(np.zeros(3))
-    with pytest.raises(UsageError, match="length_scale: expected 1e-10 to 1000 m"):
-        GpdfField(centers, radii, 0.0)
-    with pytest.raises(UsageError, match="weights: expected rowsum, voxel or cg, got 'mass'"):
-        GpdfField(centers, radii, weights="mass")
-    with pytest.raises(UsageError, match="distance: expected safe, safe_gpdf, hard, se or gpdf, got 'tsdf'"):
-        make_field(centers, radii, FieldConfig(distance="tsdf"))
-    with pytest.raises(UsageError, match="truncation"):
-        GpdfField(centers, radii, truncation=0.0)
 
 
 def test_normalised_gradients_have_length_one_or_none() -> None:
@@ -211,7 +171,7 @@ def test_the_nearest_sphere_is_the_one_that_gives_the_distance() -> None:
     np.testing.assert_allclose(gaps[np.arange(50), nearest], gaps.min(axis=1), atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_slope_of_the_gaussian_field_exceeds_its_bound_and_some_exceed_one(seed: int) -> None:
     random = np.random.default_rng(seed)
     centers = np.concatenate([random.uniform(-0.1, 0.1, (150, 3)), random.normal(size=(50, 3)) * 0.02])
@@ -235,39 +195,21 @@ def test_no_slope_of_the_gaussian_field_exceeds_its_bound_and_some_exceed_one(se
     assert slope.max() > 1.1
 
 
-@pytest.fixture(scope="module")
-def rows() -> list[Row]:
-    return table_rows()
-
-
-@pytest.mark.parametrize("form", PRINTED)
-@pytest.mark.parametrize("weights", ["lumped", "full process"])
-def test_float64_without_radii_has_the_papers_ticks(rows: list[Row], form: str, weights: str) -> None:
-    kind = ("no radii", weights, form, "float64")
-    (row,) = [row for row in rows if (row.cloud, row.weights, row.form, row.number) == kind]
-    assert tuple(cell.num_bad == 0 for cell in row.cells) == PRINTED[form]
-
-
-def test_the_log_domain_is_finite_and_right_with_and_without_radii(rows: list[Row]) -> None:
+def test_the_log_domain_is_finite_and_right_where_printed_forms_have_the_papers_ticks() -> None:
+    rows = table_rows()
+    for form, weights in product(PRINTED, ("lumped", "full process")):
+        kind = ("no radii", weights, form, "float64")
+        (row,) = [row for row in rows if (row.cloud, row.weights, row.form, row.number) == kind]
+        assert tuple(cell.num_bad == 0 for cell in row.cells) == PRINTED[form], kind
     ours = [row for row in rows if row.form in {"log domain", "GpdfField"}]
     assert {row.cloud for row in ours} == {"no radii", "1 mm to 30 cm"}
     for row in ours:
         for cell in row.cells:
-            assert cell.num_bad == 0
-            assert cell.error is not None
-            assert cell.error < 1e-6, (row, cell)
-
-
-def test_shifting_by_the_nearest_centre_overflows_with_radii(rows: list[Row]) -> None:
-    with_radii = [row for row in rows if row.cloud != "no radii" and row.form == "eq. 12"]
-    assert len(with_radii) == 2
-    for row in with_radii:
+            assert cell.num_bad == 0 and cell.error is not None and cell.error < 1e-6, (row, cell)
+    shifted = [row for row in rows if row.cloud != "no radii" and row.form == "eq. 12"]  # by the nearest centre
+    assert len(shifted) == 2
+    for row in shifted:
         assert [cell.num_bad > 0 for cell in row.cells] == [False, False, True, True, True, True]
-
-
-def plane(radius: float, spacing: float = 0.005) -> tuple[np.ndarray, np.ndarray]:
-    x, y = np.meshgrid(np.arange(-0.4, 0.4, spacing), np.arange(-0.4, 0.4, spacing))
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), np.full(x.size, radius)
 
 
 def test_marching_converges_to_the_level_set_before_a_plane() -> None:
@@ -289,7 +231,7 @@ def test_marching_converges_to_the_level_set_before_a_plane() -> None:
 
 def test_marching_is_the_walk_that_the_reference_takes() -> None:
     centers, radii = cloud(300)
-    points = queries(60)
+    points = queries(30)
     outside = points[reference.hard(points, centers, radii) > 0.02]
     found = march(GpdfField(centers, radii, LENGTH, truncation=1e-8), SphereField(centers, radii), outside, steps=4)
     walked, hit = reference.march(outside, centers, radii, LENGTH, 1e-6, steps=4)
@@ -312,24 +254,16 @@ def test_no_step_goes_through_a_sphere() -> None:
         before = found.hit
 
 
-def test_points_behind_the_level_set_stay_where_they_are() -> None:
-    centers, radii = plane(0.01)
-    field, exact = GpdfField(centers, radii, LENGTH), SphereField(centers, radii)
+def test_points_behind_the_level_set_or_without_a_slope_stay_where_they_are() -> None:
+    field, exact = GpdfField(*plane(0.01), LENGTH), SphereField(*plane(0.01))
     points = np.array([[0.0, 0.0, 0.002], [0.001, 0.0, -0.015]])
     found = march(field, exact, points)
     np.testing.assert_array_equal(found.hit, points)
     np.testing.assert_array_equal(found.distance, field.query(points)[0])
     assert (found.distance < 0).all()
-
-
-def test_a_point_without_a_slope_has_walked_nowhere() -> None:
-    centers, radii = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]), np.zeros(2)
-    found = march(GpdfField(centers, radii, LENGTH), SphereField(centers, radii), np.zeros((1, 3)))
+    two = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]), np.zeros(2)
+    found = march(GpdfField(*two, LENGTH), SphereField(*two), np.zeros((1, 3)))
     np.testing.assert_allclose(found.hit, 0.0, atol=1e-9)
     assert found.distance[0] == pytest.approx(found.rest[0])
-
-
-def test_marching_needs_a_step() -> None:
-    field = SphereField(*cloud(10))
     with pytest.raises(UsageError, match="expected at least 1 step, got 0"):
-        march(field, field, queries(1), steps=0)
+        march(exact, exact, points, steps=0)

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import GridLayout
-from splatctrl_cli.field.incremental import changed_blocks, counts_after
+from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
 from splatctrl_cli.records import Box, Label, SplatSet
 from tests.field.scenes import cloud, splat_set
 
@@ -26,10 +27,6 @@ def lattice() -> SplatSet:
     return replace(splats, labels=labels)
 
 
-def joined(first: SplatSet, second: SplatSet) -> SplatSet:
-    return SplatSet(**{name: np.concatenate([values, vars(second)[name]]) for name, values in vars(first).items()})
-
-
 def edited(splats: SplatSet, kind: str, rng: np.random.Generator, num: int = 4) -> SplatSet:
     """The splats with a few of them changed, near each other."""
     chosen = np.argsort(np.linalg.norm(splats.centers - splats.centers[rng.integers(len(splats))], axis=1))[:num]
@@ -43,7 +40,8 @@ def edited(splats: SplatSet, kind: str, rng: np.random.Generator, num: int = 4) 
         only[chosen] = True
         shift = 0.0 if kind == "duplicate" else rng.normal(0.0, 0.02, (num, 3)).astype(np.float32)
         more = splats.select(only)
-        return joined(replace(more, centers=(more.centers + shift).astype(np.float32)), splats)
+        more = replace(more, centers=(more.centers + shift).astype(np.float32))
+        return SplatSet(**{name: np.concatenate([vars(more)[name], own]) for name, own in vars(splats).items()})
     if kind == "order":
         order = rng.permutation(len(splats))
         return SplatSet(**{name: values[order] for name, values in vars(splats).items()})
@@ -56,32 +54,34 @@ def edited(splats: SplatSet, kind: str, rng: np.random.Generator, num: int = 4) 
     return replace(splats, centers=centers, radii=radii, labels=labels)
 
 
-def whole(baker: Baker) -> dict[str, np.ndarray]:
-    arrays = baker.allocate(LAYOUT.shape[0])
-    baker.bake(0, LAYOUT.shape[0], arrays)
-    return arrays
-
-
-@pytest.mark.parametrize("kind", EDITS)
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("distance", ["safe", "se", "hard"])
-def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distance: str) -> None:
-    rng = np.random.default_rng(seed)
-    before = lattice() if seed % 2 else splat_set(*cloud(400, seed))
-    after = edited(before, kind, rng)
-    config = replace(CONFIG, distance=distance)
-    channels = [name for name in CHANNELS if name != "se" or distance != "hard"]
-    old, new = (Baker(splats, LAYOUT, config, channels=channels, threads=2) for splats in (before, after))
-    arrays = whole(old)
+def updated(
+    before: SplatSet, after: SplatSet, config: FieldConfig, channels: Sequence[str], layout: GridLayout = LAYOUT
+) -> Changes:
+    """What an update bakes, whose channels and counts are those of the full bake to the bit."""
+    of = ((before, 2), (after, 2), (after, 1))
+    old, new, full = (Baker(splats, layout, config, channels=channels, threads=num) for splats, num in of)
+    num = layout.shape[0]
+    arrays, expected = old.allocate(num), full.allocate(num)
+    old.bake(0, num, arrays)
+    full.bake(0, num, expected)
     counts = dict(old.counts)
     changes = changed_blocks(before, old, after, new)
     assert changes.mask is not None
-    new.bake(0, LAYOUT.shape[0], arrays, changes.mask)
-    counts = counts_after(counts, old, new, changes.mask, [(0, 16), (16, LAYOUT.shape[0])])
-    full = Baker(after, LAYOUT, config, channels=channels)
-    for name, values in whole(full).items():
+    new.bake(0, num, arrays, changes.mask)
+    assert counts_after(counts, old, new, changes.mask, [(0, 16), (16, num)]) == full.counts
+    for name, values in expected.items():
         assert arrays[name].tobytes() == values.tobytes(), name
-    assert counts == full.counts
+    return changes
+
+
+@pytest.mark.parametrize("kind", EDITS)
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("distance", ["safe", "se", "hard"])
+def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distance: str) -> None:
+    before = lattice() if seed % 2 else splat_set(*cloud(400, seed))
+    after = edited(before, kind, np.random.default_rng(seed))
+    channels = [name for name in CHANNELS if name != "se" or distance != "hard"]
+    changes = updated(before, after, replace(CONFIG, distance=distance), channels)
     assert changes.num_baked < 0.8 * changes.num_blocks
     if kind != "order" or not seed % 2:
         assert (changes.num_baked > 0) == (kind != "order")
@@ -92,38 +92,16 @@ def test_an_edit_is_baked_as_far_as_its_kernel_reaches() -> None:
     length, voxel, extent = 0.2, 0.005, np.array([2.2, 0.035, 0.035])
     layout = GridLayout.over(Box(lower=np.zeros(3), upper=extent), voxel)
     before = splat_set(np.array([[0.1, 0.015, 0.015], [0.1 + 10 * length, 0.015, 0.015]]), np.full(2, 0.01))
-    after = before.select(np.array([False, True]))
     config = replace(CONFIG, voxel=voxel, distance="se", length_scale=length, truncation=1e-8)
-    channels = ("sdf", "se")
-    old, new, full = (Baker(splats, layout, config, channels=channels) for splats in (before, after, after))
-    arrays, expected = old.allocate(layout.shape[0]), full.allocate(layout.shape[0])
-    old.bake(0, layout.shape[0], arrays)
-    full.bake(0, layout.shape[0], expected)
-    changes = changed_blocks(before, old, after, new)
-    assert changes.mask is not None
+    changes = updated(before, before.select(np.array([False, True])), config, ("sdf", "se"), layout)
     assert 0.5 < changes.num_baked / changes.num_blocks < 1.0
-    new.bake(0, layout.shape[0], arrays, changes.mask)
-    for name, values in expected.items():
-        assert arrays[name].tobytes() == values.tobytes(), name
 
 
-def test_a_far_edit_of_many_bakes_everything_it_must() -> None:
+def test_a_far_edit_of_all_bakes_everything_it_must_and_none_bakes_nothing() -> None:
     before = splat_set(*cloud(300))
-    after = replace(before, centers=(before.centers + np.float32(0.07)).astype(np.float32))
-    old, new = (Baker(splats, LAYOUT, CONFIG, channels=("sdf", "hard")) for splats in (before, after))
-    arrays = whole(old)
-    changes = changed_blocks(before, old, after, new)
-    assert changes.mask is not None
-    new.bake(0, LAYOUT.shape[0], arrays, changes.mask)
-    for name, values in whole(Baker(after, LAYOUT, CONFIG, channels=("sdf", "hard"))).items():
-        assert arrays[name].tobytes() == values.tobytes(), name
-
-
-def test_the_same_splats_change_no_block() -> None:
-    splats = splat_set(*cloud(300))
-    old, new = (Baker(splats, LAYOUT, CONFIG) for _ in range(2))
-    changes = changed_blocks(splats, old, splats, new)
-    assert (changes.num_baked, changes.reason) == (0, "")
+    updated(before, replace(before, centers=before.centers + np.float32(0.07)), CONFIG, ("sdf", "hard"))
+    same = updated(before, before, CONFIG, ("sdf", "hard"))
+    assert (same.num_baked, same.reason) == (0, "")
 
 
 def test_what_reaches_every_cell_bakes_everything_and_says_why() -> None:
@@ -132,8 +110,7 @@ def test_what_reaches_every_cell_bakes_everything_and_says_why() -> None:
     config = replace(CONFIG, distance="safe_gpdf")
     old, new = (Baker(splats, LAYOUT, config) for splats in (before, after))
     changes = changed_blocks(before, old, after, new)
-    assert changes.num_baked == changes.num_blocks
-    assert "gpdf" in changes.reason
+    assert changes.num_baked == changes.num_blocks and "gpdf" in changes.reason
     for config, channels, words in (
         (replace(CONFIG, probability="paper"), ("sdf", "probability"), "the paper's probability"),
         (replace(CONFIG, unknown="obstacle"), ("sdf",), "field.unknown = obstacle"),

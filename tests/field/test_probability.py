@@ -13,16 +13,11 @@ from splatctrl_cli.field.probability import (
 )
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box
-from tests.field.scenes import cloud, queries, splat_set
+from tests.field.scenes import cloud, plane, queries, splat_set
 from tests.reference import field as reference
 
 LENGTH, NOISE = FieldConfig.length_scale, FieldConfig.noise
 BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]))
-
-
-def plane(spacing: float = 0.005) -> tuple[np.ndarray, np.ndarray]:
-    x, y = np.meshgrid(np.arange(-0.12, 0.12, spacing), np.arange(-0.12, 0.12, spacing))
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), np.zeros(x.size)
 
 
 def test_the_papers_probability_is_that_of_its_equations() -> None:
@@ -35,7 +30,7 @@ def test_the_papers_probability_is_that_of_its_equations() -> None:
 
 
 def test_variance_falls_to_three_quarters_on_a_dense_plane_and_far_away_a_score_is_left() -> None:
-    centers, radii = plane()
+    centers, radii = plane(half=0.12)
     on_plane = np.array([[0.001, 0.002, 0.0]])
     assert 1 - reference.explained(on_plane, centers, LENGTH, NOISE)[0] == pytest.approx(0.75, abs=0.01)
     found = PaperProbability(Spheres.of(centers, radii), FieldConfig()).of(np.array([[0.0, 0.0, 5.0], *on_plane]))
@@ -85,32 +80,17 @@ def test_the_baked_channel_is_the_probability_at_the_cell_centres(form: str) -> 
     np.testing.assert_allclose(values.ravel(), expected, atol=5e-3)  # 2e-5 m of truncation over 2 mm
     assert values.max() > 0.3
     assert grid.header["probability"] == form
-    numbers = grid.header["probability_numbers"]
-    assert isinstance(numbers, dict)
-    assert (
-        numbers.get("sigma" if form == "calibrated" else "variance_divisor")
-        == {"calibrated": 0.002, "paper": 9}[form]
-    )
+    name, value = {"calibrated": ("sigma", 0.002), "paper": ("variance_divisor", 9)}[form]
+    assert grid.header["probability_numbers"][name] == value  # type: ignore[call-overload, index]
 
 
-def test_a_grid_without_the_channel_names_no_probability() -> None:
+def test_a_header_names_no_probability_without_the_channel_and_how_a_full_process_was_solved() -> None:
     header = bake(splat_set(*cloud()), BOX, FieldConfig(voxel=0.05)).header
-    assert "probability" not in header
-    assert "weights_solved" not in header
+    assert "probability" not in header and "weights_solved" not in header
+    solved = bake(splat_set(*cloud(200)), BOX, FieldConfig(voxel=0.05, weights="cg", distance="gpdf")).header
+    assert solved["weights_solved"]["gpdf"]["residual"] < 1e-6  # type: ignore[call-overload, index]
 
 
-def test_the_header_tells_how_a_full_process_was_solved() -> None:
-    config = FieldConfig(voxel=0.05, weights="cg", distance="gpdf")
-    solved = bake(splat_set(*cloud(200)), BOX, config).header["weights_solved"]
-    assert isinstance(solved, dict)
-    assert solved["gpdf"]["residual"] < 1e-6
-
-
-def test_bad_settings_are_refused_in_words() -> None:
-    spheres = Spheres.of(*cloud(10))
-    with pytest.raises(UsageError, match=r"field.probability: expected calibrated or paper, got 'sure'"):
-        make_probability(spheres, FieldConfig(probability="sure"))
-    with pytest.raises(UsageError, match=r"field.error: expected 1e-05 to 1 m, got 0.0"):
-        make_probability(spheres, FieldConfig(error=0.0))
+def test_the_probability_of_the_paper_has_no_full_process() -> None:
     with pytest.raises(UsageError, match=r"expected field.weights = rowsum or voxel, got cg"):
-        make_probability(spheres, FieldConfig(probability="paper", weights="cg"))
+        make_probability(Spheres.of(*cloud(10)), FieldConfig(probability="paper", weights="cg"))

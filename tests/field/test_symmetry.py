@@ -6,6 +6,8 @@ kernel's distance by that much and its gradient by the share left out, TRUNCATIO
 """
 
 from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,33 +25,26 @@ CG_NOISE = (
 Make = Callable[[Float64, Float64, float], DistanceField]
 
 
-def hard(centers: Float64, radii: Float64, scale: float = 1.0) -> DistanceField:
-    return SphereField(centers, radii)
+def gpdf(centers: Float64, radii: Float64, scale: float, **more: Any) -> GpdfField:
+    return GpdfField(centers, radii, LENGTH * scale, truncation=TRUNCATION * scale, **more)
 
 
-def gpdf(centers: Float64, radii: Float64, scale: float = 1.0) -> DistanceField:
-    return GpdfField(centers, radii, LENGTH * scale, truncation=TRUNCATION * scale)
+def se(centers: Float64, radii: Float64, scale: float, **more: Any) -> SeField:
+    return SeField(centers, radii, LENGTH * scale, truncation=TRUNCATION * scale, **more)
 
 
-def se(centers: Float64, radii: Float64, scale: float = 1.0) -> DistanceField:
-    return SeField(centers, radii, LENGTH * scale, truncation=TRUNCATION * scale)
+FIELDS: dict[str, Make] = {
+    "hard": lambda centers, radii, scale: SphereField(centers, radii),
+    "gpdf": gpdf,
+    "se": se,
+    "safe": lambda centers, radii, scale: SafeField(SphereField(centers, radii), se(centers, radii, scale)),
+    "gpdf of the full process": partial(gpdf, noise=CG_NOISE, weights="cg"),
+    "se of the full process": partial(se, noise=CG_NOISE, weights="cg"),
+}
+each_field = pytest.mark.parametrize("make", FIELDS.values(), ids=FIELDS)
 
 
-def safe(centers: Float64, radii: Float64, scale: float = 1.0) -> DistanceField:
-    return SafeField(hard(centers, radii), se(centers, radii, scale))
-
-
-def gpdf_of_full_process(centers: Float64, radii: Float64, scale: float = 1.0) -> DistanceField:
-    return GpdfField(centers, radii, LENGTH * scale, noise=CG_NOISE, truncation=TRUNCATION * scale, weights="cg")
-
-
-def se_of_full_process(centers: Float64, radii: Float64, scale: float = 1.0) -> DistanceField:
-    return SeField(centers, radii, LENGTH * scale, noise=CG_NOISE, truncation=TRUNCATION * scale, weights="cg")
-
-
-FIELDS: list[Make] = [hard, gpdf, se, safe, gpdf_of_full_process, se_of_full_process]
-
-
+@cache
 def smooth_points(margin: float) -> Float64:
     """Queries at least 1 cm outside the splats, where no field of the four has a kink within `margin` [m].
 
@@ -70,29 +65,21 @@ def rotation() -> Float64:
     return np.asarray(turned * np.sign(np.linalg.det(turned)))
 
 
-@pytest.mark.parametrize("make", FIELDS)
-def test_a_rigid_motion_leaves_the_distance_and_turns_the_gradient(make: Make) -> None:
+@each_field
+@pytest.mark.parametrize("scale", [1.0, 0.01, 40.0])
+def test_the_distance_scales_with_the_scene_and_the_gradient_turns_with_it(make: Make, scale: float) -> None:
     centers, radii = cloud()
-    points, R, shift = smooth_points(1e-5), rotation(), np.array([3.0, -2.0, 0.7])
+    points, R = smooth_points(1e-5), rotation() if scale == 1.0 else np.eye(3)
+    shift = np.array([3.0, -2.0, 0.7]) if scale == 1.0 else np.zeros(3)
     before, gradient = make(centers, radii, 1.0).query(points)
-    after, turned = make(centers @ R.T + shift, radii, 1.0).query(points @ R.T + shift)
+    moved, there = scale * centers @ R.T + shift, scale * points @ R.T + shift
+    after, turned = make(moved, scale * radii, scale).query(there)
     assert len(points) > 500
-    np.testing.assert_allclose(after, before, atol=DISTANCE)
+    np.testing.assert_allclose(after / scale, before, atol=DISTANCE)
     np.testing.assert_allclose(turned, gradient @ R.T, atol=GRADIENT)
 
 
-@pytest.mark.parametrize("make", FIELDS)
-@pytest.mark.parametrize("scale", [0.01, 3.7, 40.0])
-def test_distance_scales_with_the_scene_and_the_gradient_does_not(make: Make, scale: float) -> None:
-    centers, radii = cloud()
-    points = smooth_points(1e-5)
-    before, gradient = make(centers, radii, 1.0).query(points)
-    after, same = make(scale * centers, scale * radii, scale).query(scale * points)
-    np.testing.assert_allclose(after / scale, before, atol=DISTANCE)
-    np.testing.assert_allclose(same, gradient, atol=GRADIENT)
-
-
-@pytest.mark.parametrize("make", FIELDS)
+@each_field
 def test_the_order_of_the_splats_does_not_matter(make: Make) -> None:
     """To the bit for hard, a least of numbers; a sum rounds by its order, so within the tolerance for the others."""
     centers, radii = cloud()
@@ -100,14 +87,14 @@ def test_the_order_of_the_splats_does_not_matter(make: Make) -> None:
     points = smooth_points(1e-5)
     before, gradient = make(centers, radii, 1.0).query(points)
     after, same = make(centers[order], radii[order], 1.0).query(points)
-    if make is hard:
+    if make is FIELDS["hard"]:
         np.testing.assert_array_equal(after, before)
         np.testing.assert_array_equal(same, gradient)
     np.testing.assert_allclose(after, before, atol=DISTANCE)
     np.testing.assert_allclose(same, gradient, atol=GRADIENT)
 
 
-@pytest.mark.parametrize("make", FIELDS)
+@each_field
 def test_the_gradient_is_the_central_difference_of_the_distance(make: Make) -> None:
     """Of fourth order, from steps of h = 0.5 mm and h / 2.
 
@@ -131,14 +118,3 @@ def test_the_gradient_is_the_central_difference_of_the_distance(make: Make) -> N
 
 def central_difference(field: DistanceField, points: Float64, shift: Float64) -> Float64:
     return (field.query(points + shift)[0] - field.query(points - shift)[0]) / (2 * np.linalg.norm(shift))
-
-
-@pytest.mark.parametrize("make", [hard, gpdf, se, safe])
-def test_each_splat_alone_has_a_gradient_that_points_away_from_it(make: Make) -> None:
-    points = queries(200)
-    away = points - [0.1, 0.0, 0.0]
-    distance, gradient = make(np.array([[0.1, 0.0, 0.0]]), np.array([0.004]), 1.0).query(points)
-    is_outside = distance > 0
-    assert is_outside.sum() > 190
-    unit = away / np.linalg.norm(away, axis=1, keepdims=True)
-    np.testing.assert_allclose(gradient[is_outside], unit[is_outside], atol=GRADIENT)

@@ -39,16 +39,29 @@ def grid() -> DistanceGrid:
     return bake(splat_set(*cloud()), BOX, FieldConfig(voxel=0.04), channels=CHANNELS, occupancy=occupancy)
 
 
-def test_free_leaves_every_channel_as_it_is(grid: DistanceGrid) -> None:
-    free = apply_unknown(grid, "free")
-    assert free.header["unknown"] == "free"
-    for name, values in grid.channels.items():
-        np.testing.assert_array_equal(free.channels[name], values)
+@pytest.fixture(scope="module")
+def is_unknown(grid: DistanceGrid) -> Bool:
+    return np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
 
 
-def test_nan_blanks_never_seen_cells_and_no_other(grid: DistanceGrid) -> None:
+@pytest.fixture(scope="module")
+def solid(grid: DistanceGrid) -> DistanceGrid:
+    return apply_unknown(grid, "obstacle")
+
+
+@pytest.mark.parametrize("policy", ["free", "obstacle", "nan"])
+def test_nothing_changes_where_the_unknown_is_free_or_all_was_seen(grid: DistanceGrid, policy: str) -> None:
+    seen = {**grid.channels, "observed": np.ones_like(grid.channels["observed"])}
+    before = grid if policy == "free" else replace(grid, channels=seen)
+    after = apply_unknown(before, policy)
+    assert after.header["unknown"] == policy
+    assert policy == "free" or after.header["unknown_cells"] == {"never_seen": 0, "changed": 0}
+    for name, values in before.channels.items():
+        np.testing.assert_array_equal(after.channels[name], values)
+
+
+def test_nan_blanks_never_seen_cells_and_no_other(grid: DistanceGrid, is_unknown: Bool) -> None:
     blanked = apply_unknown(grid, "nan")
-    is_unknown = grid.channels["observed"] == VoxelState.NEVER_SEEN
     assert 0 < is_unknown.sum() < is_unknown.size
     for name in ("sdf", "probability"):
         np.testing.assert_array_equal(np.isnan(blanked.channels[name]), is_unknown)
@@ -59,9 +72,9 @@ def test_nan_blanks_never_seen_cells_and_no_other(grid: DistanceGrid) -> None:
     assert blanked.header["unknown_cells"] == {"never_seen": int(is_unknown.sum()), "changed": int(is_unknown.sum())}
 
 
-def test_an_obstacle_distance_is_never_beyond_the_nearest_never_seen_cube(grid: DistanceGrid) -> None:
-    solid = apply_unknown(grid, "obstacle")
-    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
+def test_an_obstacle_distance_is_never_beyond_the_nearest_never_seen_cube(
+    grid: DistanceGrid, is_unknown: Bool, solid: DistanceGrid
+) -> None:
     cubes = cell_centers(grid, is_unknown)
     exact = cube_distance(cell_centers(grid, ~is_unknown)[::7], cubes, grid.voxel)
     sdf = solid.channels["sdf"][~is_unknown][::7]
@@ -76,8 +89,9 @@ def test_an_obstacle_distance_is_never_beyond_the_nearest_never_seen_cube(grid: 
     assert solid.header["unknown_cells"] == {"never_seen": int(is_unknown.sum()), "changed": changed}
 
 
-def test_inside_the_unknown_the_distance_is_at_least_as_deep_as_the_way_out(grid: DistanceGrid) -> None:
-    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
+def test_inside_the_unknown_the_distance_is_at_least_as_deep_as_the_way_out(
+    grid: DistanceGrid, is_unknown: Bool
+) -> None:
     found = Cubes.of(is_unknown, grid.voxel)
     depth = cube_distance(cell_centers(grid, is_unknown)[::3], cell_centers(grid, ~is_unknown), grid.voxel)
     assert (found.distance[is_unknown][::3] <= -depth).all()
@@ -86,10 +100,10 @@ def test_inside_the_unknown_the_distance_is_at_least_as_deep_as_the_way_out(grid
     np.testing.assert_allclose(found.away[10, 10, 5], [0, 0, 1], atol=1e-6)
 
 
-def test_the_bound_certifies_splats_and_never_seen_cells(grid: DistanceGrid) -> None:
-    solid = apply_unknown(grid, "obstacle")
+def test_the_bound_certifies_splats_and_never_seen_cells(
+    grid: DistanceGrid, is_unknown: Bool, solid: DistanceGrid
+) -> None:
     points = queries(1500, extent=0.4)
-    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
     hard, _ = SphereField(*cloud()).query(points)
     cubes = cube_distance(points, cell_centers(grid, is_unknown), grid.voxel)
     certified = GridField(solid).certified(points)
@@ -100,22 +114,10 @@ def test_the_bound_certifies_splats_and_never_seen_cells(grid: DistanceGrid) -> 
         assert np.isfinite(solid.channels[name]).all()
 
 
-def test_a_slab_of_cubes_is_what_the_whole_is_there(grid: DistanceGrid) -> None:
-    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
-    found = Cubes.of(is_unknown, grid.voxel)
-    whole = apply_unknown(grid, "obstacle")
-    margin = grid.header["bound_margin"]
-    assert isinstance(margin, float)
-    part, _ = found.planes(8, 16).joined({n: v[8:16] for n, v in grid.channels.items()}, margin)
-    for name, values in part.items():
-        np.testing.assert_array_equal(values, whole.channels[name][8:16])
-
-
-def test_a_grid_with_blank_cells_says_so_at_every_point_beside_one(grid: DistanceGrid) -> None:
+def test_a_grid_with_blank_cells_says_so_at_every_point_beside_one(grid: DistanceGrid, is_unknown: Bool) -> None:
     field, before = GridField(apply_unknown(grid, "nan")), GridField(grid)
     points = queries(2000, extent=0.4)
     corner = np.floor((points - grid.origin) / grid.voxel).astype(int)
-    is_unknown = grid.channels["observed"] == VoxelState.NEVER_SEEN
     steps = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(8, 3)
     beside = np.any([is_unknown[tuple((corner + step).T)] for step in steps], axis=0)
     assert 0 < beside.sum() < len(points)
@@ -136,11 +138,3 @@ def test_what_cannot_be_applied_is_refused_in_words(grid: DistanceGrid) -> None:
     never = {**grid.channels, "observed": np.zeros_like(grid.channels["observed"])}
     with pytest.raises(NotEvaluableError, match="expected a cell that some camera saw, got none of 9261"):
         apply_unknown(replace(grid, channels=never), "obstacle")
-
-
-def test_where_all_was_seen_nothing_changes(grid: DistanceGrid) -> None:
-    seen = {**grid.channels, "observed": np.ones_like(grid.channels["observed"])}
-    for policy in ("obstacle", "nan"):
-        after = apply_unknown(replace(grid, channels=seen), policy)
-        assert after.header["unknown_cells"] == {"never_seen": 0, "changed": 0}
-        np.testing.assert_array_equal(after.channels["sdf"], grid.channels["sdf"])

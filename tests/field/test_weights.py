@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from splatctrl_cli.config.fixed import VOXELS_PER_LENGTH
 from splatctrl_cli.errors import NotEvaluableError, UsageError
@@ -60,13 +61,6 @@ def test_voxel_weights_give_nearly_the_field_of_the_row_sums() -> None:
         assert np.abs(voxel - exact).max() > 0
 
 
-def test_too_many_blocks_are_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    centers, radii = cloud()
-    monkeypatch.setattr(weights_module, "MAX_BLOCKS", 0)
-    with pytest.raises(UsageError, match=r"at most 0 blocks of voxels with splats, got .*; set"):
-        GpdfField(centers, radii, LENGTH, weights="voxel")
-
-
 @pytest.mark.parametrize("is_matern", [True, False])
 def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
     centers, radii = cloud(400)
@@ -79,7 +73,6 @@ def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
     assert (dense < 0).any()
     assert solution.residual < 1e-6
     weights = weights_named("cg", Spheres.of(centers, radii), kernel, NOISE, 1)
-    assert weights.sign is not None
     assert weights.num_iterations
     size = np.exp(weights.log_size + log_values)
     np.testing.assert_allclose(weights.sign * size, dense, atol=3e-3)
@@ -124,24 +117,32 @@ def test_groups_of_splats_far_apart_do_not_drown_each_other() -> None:
     np.testing.assert_allclose(distance, [0.197, 0.4], atol=1e-5)
 
 
-def test_what_cannot_be_solved_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("kind", "change", "weights", "length", "words"),
+    [
+        (GpdfField, {}, "cg", 0.005, r"radii that differ by at most 16 length scales .*, got 60\.0; set a larger"),
+        (SeField, {"CG_ITERATIONS": 20}, "cg", LENGTH, r"after 20 iterations, got .*; set a larger field.noise"),
+        (SeField, {"available_memory": lambda: 1000}, "cg", LENGTH, r"pairs of splats within 8 .* GiB is free"),
+        (GpdfField, {"MAX_BLOCKS": 0}, "voxel", LENGTH, r"at most 0 blocks of voxels with splats, got .*; set"),
+    ],
+)
+def test_what_cannot_be_solved_is_refused_in_words(
+    kind: type[GpdfField] | type[SeField],
+    change: dict[str, object],
+    weights: str,
+    length: float,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     centers, radii = cloud(300)
     radii[0] = 0.3
-    with pytest.raises(
-        UsageError, match=r"radii that differ by at most 16 length scales .*, got 60\.0; set a larger"
-    ):
-        GpdfField(centers, radii, 0.005, weights="cg")
-    monkeypatch.setattr(weights_module, "CG_ITERATIONS", 20)
-    with pytest.raises(NotEvaluableError, match=r"after 20 iterations, got .*; set a larger field.noise"):
-        SeField(centers, radii, LENGTH, weights="cg")
-    monkeypatch.setattr(weights_module, "available_memory", lambda: 1000)
-    with pytest.raises(UsageError, match=r"pairs of splats within 8 length scales need .* GiB is free"):
-        SeField(centers, radii, LENGTH, weights="cg")
+    for name, value in change.items():
+        monkeypatch.setattr(weights_module, name, value)
+    with pytest.raises((UsageError, NotEvaluableError), match=words):
+        kind(centers, radii, length, weights=weights)
 
 
 def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
-    from scipy.sparse import csr_array
-
     with pytest.raises(NotEvaluableError, match="not positive definite"):
         conjugate_gradients(csr_array(np.array([[1.0, 3.0], [3.0, 1.0]])), np.array([1.0, -0.5]), 1e-9)
 

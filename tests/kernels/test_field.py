@@ -8,18 +8,6 @@ from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, queries
 
 
-def test_a_kernel_of_one_entry_is_its_score() -> None:
-    points = cluster_points(np.array([[1.0, 2.0, 3.0]]))
-    at = points.relative(np.array([[1.0, 2.0, 5.0]]))
-    offset = points.offsets(np.array([0.25]))
-    score, gradient = native.matern(points.clusters, offset, None, 0.02, 1e-3, at)
-    assert (score[0], gradient[0].tolist()) == (1.75, [0.0, 0.0, 1.0])
-    radii = points.laid_out(np.array([0.25]), spare=0.0).astype(np.float32)
-    none = points.offsets(np.zeros(1))
-    score, gradient = native.gaussian(points.clusters, none, radii, None, 0.0, 0.02, 1e-5, at)
-    np.testing.assert_allclose([score[0], *gradient[0]], [1.75, 0.0, 0.0, 1.0], atol=2e-7)
-
-
 @pytest.mark.parametrize("num", [1, 15, 16, 17, 33, 257])
 def test_spare_entries_are_never_taken(num: int) -> None:
     centers, radii = cloud(num)
@@ -30,29 +18,6 @@ def test_spare_entries_are_never_taken(num: int) -> None:
     assert points.is_point[entry].all()
     np.testing.assert_allclose(each[np.arange(len(each)), points.source[entry]], each.min(axis=1), atol=2e-7)
     assert points.num_points == num
-
-
-def test_every_point_is_in_the_box_of_its_cluster_and_group() -> None:
-    points = cluster_points(cloud(500)[0])
-    is_point = points.is_point.view(np.bool_)
-    assert sorted(points.source[is_point]) == list(range(500))
-    place, boxes = points.clusters.centers[:, is_point], points.clusters.boxes
-    cluster = np.flatnonzero(is_point) // native.LANES
-    group = len(points.source) // native.LANES + cluster // native.LANES
-    for box in (cluster, group):
-        assert (boxes[:3, box] <= place).all()
-        assert (place <= boxes[3:, box]).all()
-
-
-def test_points_that_two_sets_share_keep_their_order_and_bits_in_one_frame() -> None:
-    centers, _ = cloud(500)
-    frame = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.6))
-    whole, half = cluster_points(centers, frame), cluster_points(centers[::2], frame)
-    kept = np.flatnonzero(whole.is_point.view(np.bool_) & (whole.source % 2 == 0))
-    np.testing.assert_array_equal(whole.source[kept], 2 * half.source[half.is_point.view(np.bool_)])
-    np.testing.assert_array_equal(
-        whole.clusters.centers[:, kept], half.clusters.centers[:, half.is_point.view(np.bool_)]
-    )
 
 
 @pytest.mark.parametrize("is_matern", [True, False])
@@ -80,24 +45,18 @@ def test_at_a_centre_the_gradient_is_zero_or_finite() -> None:
     assert np.isfinite(native.matern(points.clusters, points.offsets(np.zeros(50)), None, 1e-10, 1e-3, at)[1]).all()
 
 
-def test_another_dtype_is_refused_not_converted() -> None:
-    points = cluster_points(cloud(50)[0])
-    with pytest.raises(TypeError):
-        native.nearest(points.clusters, points.offsets(np.zeros(50)), queries())  # float64
-
-
-def test_arrays_that_do_not_fit_are_refused() -> None:
+def test_arrays_that_do_not_fit_are_refused_and_another_dtype_not_converted() -> None:
     points = cluster_points(cloud(50)[0])
     clusters, offsets = points.clusters, points.offsets(np.zeros(50))
-    at, score, gradient = np.zeros((2, 3), np.float32), np.zeros(2, np.float32), np.zeros((1, 3), np.float32)
-    entry = np.zeros(2, np.int32)
+    with pytest.raises(TypeError):
+        native.nearest(clusters, offsets, queries())  # float64
+    given = [clusters.centers, clusters.boxes, offsets.values, offsets.maxima, np.zeros((2, 3), np.float32), 1]
+    found = np.zeros(2, np.float32), np.zeros((1, 3), np.float32), np.zeros(2, np.int32)
     with pytest.raises(ValueError, match="one entry per point"):
-        module.field_nearest(
-            clusters.centers, clusters.boxes, offsets.values, offsets.maxima, at, 1, score, gradient, entry
-        )
-    short = offsets.values[:16].copy()
+        module.field_nearest(*given, *found)
+    given[2] = offsets.values[:16].copy()
     with pytest.raises(ValueError, match=r"expected \(16 C\)"):
-        module.field_nearest(clusters.centers, clusters.boxes, short, offsets.maxima, at, 1, score, gradient, entry)
+        module.field_nearest(*given, *found)
     span = native.GridSpan(origin=np.zeros(3), voxel=0.1, shape=(20, 4, 4), first=4, last=12)
     with pytest.raises(ValueError, match="whole blocks"):
         native.bake_hard(clusters, offsets, span, np.zeros((8, 4, 4), np.float32))

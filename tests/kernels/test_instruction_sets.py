@@ -22,8 +22,7 @@ from splatctrl_cli.kernels.raster import (
     optimiser_step,
 )
 from tests.field.scenes import cloud, queries
-from tests.kernels.test_points import points_bytes
-from tests.kernels.test_raster import camera, splats
+from tests.kernels.scenes import camera, points_bytes, splats
 
 
 def fit_bytes(width: int, height: int) -> bytes:

@@ -1,7 +1,9 @@
 """The compiled edge check: the same shares as the one in NumPy, to the bit for any number of threads."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,47 +85,31 @@ def test_an_edge_of_no_length_is_free_or_not_as_its_posture_is(arm: RobotModel) 
 
 def test_shares_do_not_depend_on_threads(arm: RobotModel) -> None:
     room, start, end = room_of(arm, KINDS, 5)
-    assert room.compiled is not None
-    results = [
-        room.compiled.advance(
-            start,
-            end,
-            contact=CONTACT,
-            give_up=0.05,
-            rounding=ROUNDING,
-            still=STILL_ROW,
-            only_whole=False,
-            threads=threads,
-        )
-        for threads in (1, 2, 7)
-    ]
-    for share, num_checks in results[1:]:
-        np.testing.assert_array_equal(share, results[0][0])
-        np.testing.assert_array_equal(num_checks, results[0][1])
+    asked = {"contact": CONTACT, "give_up": 0.05, "rounding": ROUNDING, "still": STILL_ROW}
+    one, *others = (room.compiled.advance(start, end, **asked, only_whole=False, threads=num) for num in (1, 2, 7))
+    for other in others:
+        np.testing.assert_array_equal(other, one)
 
 
-def test_arrays_that_do_not_fit_are_refused(arm: RobotModel) -> None:
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (lambda good: {"taken": good.taken[1:]}, "expected taken"),
+        (lambda good: {"pairs": good.pairs + 1000}, "pairs: expected spheres that are there"),
+        (lambda good: {"boxes": good.boxes[:, :14].copy()}, "solids: expected a row of numbers"),
+        (lambda good: {"groups": good.groups + 1000}, "groups: expected parts that are there"),
+        (
+            lambda good: {name: getattr(good, name)[:-1] for name in ("groups", "group_taken", "group_levers")},
+            "groups: expected every row in one of them",
+        ),
+        (lambda good: {"contact": 0.0}, "contact and still above 0"),
+        (lambda good: {"num_joints": 6}, "expected start and end"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(arm: RobotModel, changed: Callable[[Any], Any], words: str) -> None:
     room, start, end = room_of(arm, KINDS, 6)
-    good = room.compiled
-    assert good is not None
-
-    def advance(edges: object = None, contact: float = CONTACT, **changes: object) -> None:
-        other = replace(good, **changes)
-        to = end[:, :6] if edges else end
-        other.advance(start, to, contact=contact, give_up=0.1, rounding=0.0, still=STILL_ROW, only_whole=True)
-
-    advance()
-    with pytest.raises(ValueError, match="expected start and end"):
-        advance(edges="short")
-    with pytest.raises(ValueError, match="contact and still above 0"):
-        advance(contact=0.0)
-    with pytest.raises(ValueError, match="expected taken"):
-        advance(taken=good.taken[1:])
-    with pytest.raises(ValueError, match="pairs: expected spheres that are there"):
-        advance(pairs=good.pairs + 1000)
-    with pytest.raises(ValueError, match="solids: expected a row of numbers"):
-        advance(boxes=good.boxes[:, :14].copy())
-    with pytest.raises(ValueError, match="groups: expected parts that are there"):
-        advance(groups=good.groups + 1000)
-    with pytest.raises(ValueError, match="groups: expected every row in one of them"):
-        advance(groups=good.groups[:-1], group_taken=good.group_taken[:-1], group_levers=good.group_levers[:-1])
+    changes = changed(room.compiled)
+    asked = {"contact": changes.pop("contact", CONTACT), "give_up": 0.1, "rounding": 0.0, "still": STILL_ROW}
+    end = end[:, : changes.pop("num_joints", 7)]
+    with pytest.raises(ValueError, match=words):
+        replace(room.compiled, **changes).advance(start, end, **asked, only_whole=True)

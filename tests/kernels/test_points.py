@@ -1,7 +1,5 @@
 """What is asked of many points has NumPy's bytes, at any thread count."""
 
-import hashlib
-
 import numpy as np
 import pytest
 
@@ -117,20 +115,3 @@ def test_distances_to_solids_are_the_least_of_each() -> None:
         np.testing.assert_array_equal(found, np.min(wanted, axis=0))
     assert (np.min(wanted, axis=0) < 0).any()
     assert np.all(kernels.solid_distance(points, np.zeros((0, 16))) == np.inf)
-
-
-def points_bytes() -> bytes:
-    """For another instruction set: all of the above on one crowd."""
-    rng = np.random.default_rng(3)
-    points, colors = rng.normal(size=(9000, 3)).astype(np.float32), rng.random((9000, 3)).astype(np.float32)
-    T, cubes = look_at([2.0, 0.1, 0.3], [0.0, 0.0, 0.0]), kernels.Cubes(points, 0.2, 2)
-    camera, depth = pack_camera(50.3, 51.7, 31.5, 24.1, 64, 48, T), rng.uniform(0.5, 4.0, (48, 64)).astype(np.float32)
-    means, solid = cubes.means(colors), np.array([[1.0, *T[:3, :3].ravel(), *T[:3, 3], 0.3, 0.4, 0.5]])
-    arrays = [
-        kernels.back_projected(camera, depth),
-        kernels.seen_through(points, [camera], [depth], 0.01),
-        *(means.count, means.center, means.color, means.square, means.covariance, means.nearest),
-        kernels.SplatTree(points, colors[:, 0] * np.float32(0.1), 2).are_further(colors.astype(float), 0.05),
-        kernels.solid_distance(points, solid),
-    ]
-    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).digest()

@@ -77,7 +77,7 @@ def rendered(scene: SurfaceScene, measured: np.ndarray | None = None, threads: i
     return render_surface(scene, K, image, tolerance=TOLERANCE, quadratic=0.0, num_threads=threads)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_depth_link_and_inside_are_those_of_one_ray_at_a_time(seed: int) -> None:
     rng = np.random.default_rng(seed)
     solids = random_solids(rng)
@@ -124,9 +124,8 @@ def mesh_scene(triangles: Float64, links: Sequence[int]) -> SurfaceScene:
     return replace(scene_of([]), mesh=SurfaceMesh(np.ascontiguousarray(triangles), np.array(links, np.int16)))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_nearest_triangle_shows_from_whichever_side(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_the_nearest_triangle_shows_from_whichever_side() -> None:
+    rng = np.random.default_rng(0)
     sides = rng.normal(0.0, 0.15, (60, 3, 3))
     triangles = rng.uniform([-0.3, -0.2, 0.6], [0.3, 0.2, 1.2], (60, 1, 3)) + sides
     links = rng.integers(0, 8, 60)

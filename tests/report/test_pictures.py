@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import matplotlib as mpl
@@ -37,14 +39,16 @@ from splatctrl_cli.report.replay_pictures import (
     spans,
 )
 
+H, W = 30, 40
 
-def row(depth_error: float) -> ComparisonRow:
-    depth = np.full((30, 40), 1.0, np.float32)
+
+def row(depth_error: float = 0.0, color_error: float = 0.0) -> ComparisonRow:
+    depth = np.ones((H, W), np.float32)
     return ComparisonRow(
         title="cam0-0000",
         figures="20.0 dB",
-        photo=np.full((30, 40, 3), 90, np.uint8),
-        render=np.full((30, 40, 3), 0.5, np.float32),
+        photo=np.full((H, W, 3), 102, np.uint8),
+        render=np.full((H, W, 3), 0.4 + color_error, np.float32),
         photo_depth=depth,
         render_depth=depth + np.float32(depth_error),
     )
@@ -64,98 +68,73 @@ def grid(*, observed: int = 1, distance: float = 0.0, header: str = "from the gr
     return DistanceGrid(origin=np.zeros(3), voxel=0.05, channels=channels, header={"observed": header})
 
 
-def draw_comparison(path: Path) -> None:
-    comparison_picture(path, [row(0.0), row(0.1)])
-
-
-def draw_slice(path: Path) -> None:
-    spheres = np.array([[0.2, 0.2, 0.5], [0.8, 0.8, 0.9]]), np.array([0.1, 0.1])
-    field_slice_picture(path, grid(), 2, 0.5, spheres, "A ball")
-
-
-def draw_slices(path: Path) -> None:
-    slices_picture(path, grid(), (0.5, 0.5, 0.5))
-
-
-def draw_slices_of_nothing(path: Path) -> None:
-    slices_picture(path, grid(distance=np.nan), (0.5, 0.5, 0.5))
-
-
-def draw_gradient(path: Path) -> None:
-    gradient_picture(path, grid(), [0, 3, 100, 1], 0.5, (0.5, 0.5, 0.5))
-
-
-def draw_gradient_of_nothing_outside(path: Path) -> None:
-    gradient_picture(path, grid(distance=np.nan), [0, 0], 0.5, (-9.0, 99.0, 0.0))
-
-
-def draw_probability(path: Path) -> None:
-    probability_picture(path, grid(), (-9.0, 99.0, 0.0))
-
-
-def draw_large_slice(path: Path) -> None:
-    sdf = np.broadcast_to(np.linspace(-1, 1, 1300, dtype=np.float32)[:, None, None], (1300, 2, 2))
-    large = DistanceGrid(origin=np.zeros(3), voxel=0.001, channels={"sdf": sdf}, header={})
-    slices_picture(path, large, (0.5, 0.0, 0.0))
-
-
-def draw_reliability(path: Path) -> None:
-    curve = reliability(np.array([0.0, 0.95]), np.array([False, True]))  # with empty bins
-    reliability_picture(path, {"calibrated": curve, "paper": curve})
+SPHERES = np.array([[0.2, 0.2, 0.5], [0.8, 0.8, 0.9]]), np.array([0.1, 0.1])
 
 
 NUM = 6000  # states: more than a picture has columns
 SECONDS = np.linspace(0, 5, NUM)
 EVENTS = {"below-margin": [(1.0, 2.0), (4.0, 4.0)], "unknown-space": [(0.0, 5.0)], "stale-map": []}
+CURVES = {
+    "exact": 0.05 * np.cos(SECONDS),
+    "barrier": 0.05 * np.cos(SECONDS) - 0.01,
+    "certified": np.where(SECONDS < 2, np.nan, 0.03),
+    "truth": np.full(NUM, np.nan),
+}
+MOVES = np.where(SECONDS < 0.08, np.nan, [np.sin(SECONDS), 0.001 * np.cos(SECONDS)]).T
+JOINTS, LIMITS, MIDDLE, FAR = ("shoulder", "elbow"), np.array([0.9, 2.0]), (0.5, 0.5, 0.5), (-9.0, 99.0, 0.0)
+LONG = np.broadcast_to(np.linspace(-1, 1, 1300, dtype=np.float32)[:, None, None], (1300, 2, 2))
+LARGE = DistanceGrid(origin=np.zeros(3), voxel=0.001, channels={"sdf": LONG}, header={})
+CURVE = reliability(np.array([0.0, 0.95]), np.array([False, True]))  # with empty bins
+
+DRAWN: dict[str, Callable[[Path], None]] = {
+    "comparison": lambda path: comparison_picture(path, [row(0.0), row(0.1)]),
+    "slice": lambda path: field_slice_picture(path, grid(), 2, 0.5, SPHERES, "A ball"),
+    "slices": lambda path: slices_picture(path, grid(), MIDDLE),
+    "slices of nothing": lambda path: slices_picture(path, grid(distance=np.nan), MIDDLE),
+    "large slices": lambda path: slices_picture(path, LARGE, (0.5, 0.0, 0.0)),
+    "gradient": lambda path: gradient_picture(path, grid(), [0, 3, 100, 1], 0.5, MIDDLE),
+    "gradient of nothing": lambda path: gradient_picture(path, grid(distance=np.nan), [0, 0], 0.5, FAR),
+    "probability": lambda path: probability_picture(path, grid(), FAR),
+    "reliability": lambda path: reliability_picture(path, {"calibrated": CURVE, "paper": CURVE}),
+    "clearance": lambda path: clearance_picture(path, SECONDS, CURVES, 0.02, "Clearance", EVENTS),
+    "quiet clearance": lambda path: clearance_picture(
+        path, np.zeros(1), {"exact": np.array([0.1])}, 0.02, "Clearance", {}
+    ),
+    "commands": lambda path: commands_picture(
+        path, SECONDS, MOVES, JOINTS, LIMITS, {"scene": [(1.0, 2.0)], "self": []}, MOVES + 0.1
+    ),
+    "open loop": lambda path: open_loop_picture(
+        path, SECONDS, np.nan_to_num(MOVES), JOINTS, np.cos(SECONDS), [(1.0, 1.0)]
+    ),
+}
 
 
-def draw_clearance(path: Path) -> None:
-    curves = {name: shift + 0.05 * np.cos(SECONDS) for name, shift in (("exact", 0.0), ("barrier", -0.01))}
-    gaps = np.where(SECONDS < 2, np.nan, 0.03)
-    clearance_picture(
-        path, SECONDS, curves | {"certified": gaps, "truth": np.full(NUM, np.nan)}, 0.02, "Clearance", EVENTS
-    )
+@cache
+def drawn_bytes(name: str) -> bytes:
+    """Of a picture that several tests look at."""
+    with TemporaryDirectory() as folder:
+        DRAWN[name](Path(folder) / "a.png")
+        return (Path(folder) / "a.png").read_bytes()
 
 
-def draw_quiet_clearance(path: Path) -> None:
-    clearance_picture(path, np.zeros(1), {"exact": np.array([0.1])}, 0.02, "Clearance", {})
+def picture_of(data: bytes) -> UInt8:
+    """Blue, green and red of each pixel."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    return np.asarray(image, np.uint8)
 
 
-def draw_commands(path: Path) -> None:
-    velocity = np.stack([np.sin(SECONDS), 0.001 * np.cos(SECONDS)], axis=1)
-    velocity[:100] = np.nan
-    joints, limits = ("shoulder", "elbow"), np.array([0.9, 2.0])
-    commands_picture(path, SECONDS, velocity, joints, limits, {"scene": [(1.0, 2.0)], "self": []}, velocity + 0.1)
-
-
-def draw_open_loop(path: Path) -> None:
-    difference = np.stack([np.sin(SECONDS), np.cos(SECONDS)], axis=1)
-    open_loop_picture(path, SECONDS, difference, ("shoulder", "elbow"), np.cos(SECONDS), [(1.0, 1.0)])
-
-
-DRAWN = (
-    *(draw_comparison, draw_slice, draw_slices, draw_slices_of_nothing, draw_gradient),
-    *(draw_gradient_of_nothing_outside, draw_probability, draw_large_slice, draw_reliability),
-    *(draw_clearance, draw_quiet_clearance, draw_commands, draw_open_loop),
-)
-
-
-@pytest.mark.parametrize("draw", DRAWN)
-def test_a_picture_is_1200_pixels_wide_and_the_same_each_time(tmp_path: Path, draw: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize("name", DRAWN)
+def test_a_picture_is_1200_pixels_wide_and_the_same_each_time(tmp_path: Path, name: str) -> None:
     before = dict(mpl.rcParams)
-    draw(tmp_path / "a.png")
-    draw(tmp_path / "b.png")
+    DRAWN[name](tmp_path / "a.png")
     image = picture(tmp_path / "a.png")
-    assert image.shape[1] == 1200
-    assert image.std() > 1.0
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert image.shape[1] == 1200 and image.std() > 1.0
+    assert (tmp_path / "a.png").read_bytes() == drawn_bytes(name)
     assert dict(mpl.rcParams) == before
 
 
 def picture(path: Path) -> UInt8:
-    image = cv2.imread(str(path))
-    assert image is not None
-    return np.asarray(image, np.uint8)
+    return picture_of(path.read_bytes())
 
 
 def test_the_depth_error_saturates_in_the_colour_bar_s_top_colour(tmp_path: Path) -> None:
@@ -166,22 +145,19 @@ def test_the_depth_error_saturates_in_the_colour_bar_s_top_colour(tmp_path: Path
     assert exact.astype(int).max() < 120, "dark blue: no error"
 
 
-def test_never_seen_space_shows_in_a_slice_where_somebody_looked(tmp_path: Path) -> None:
-    field_slice_picture(tmp_path / "seen.png", grid(), 2, 0.5)
-    field_slice_picture(tmp_path / "never.png", grid(observed=0), 2, 0.5)
-    assert (tmp_path / "seen.png").read_bytes() != (tmp_path / "never.png").read_bytes()
-    point = (0.5, 0.5, 0.5)
-    slices_picture(tmp_path / "seen.png", grid(), point)
-    slices_picture(tmp_path / "never.png", grid(observed=0), point)
-    slices_picture(tmp_path / "unknown.png", grid(observed=0, header="no occupancy grid: all never seen"), point)
-    seen, never, unknown = (picture(tmp_path / f"{name}.png") for name in ("seen", "never", "unknown"))
-    assert np.any(seen != never) and np.any(never != unknown)
-
-
-def test_slices_show_the_point_that_they_are_asked_for(tmp_path: Path) -> None:
-    slices_picture(tmp_path / "a.png", grid(), (0.5, 0.5, 0.5))
-    slices_picture(tmp_path / "b.png", grid(), (0.0, 0.0, 0.0))
-    assert np.any(picture(tmp_path / "a.png") != picture(tmp_path / "b.png"))
+def test_never_seen_space_shows_in_a_slice_where_somebody_looked_and_the_point_that_was_asked_for(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "a.png"
+    field_slice_picture(path, grid(observed=0), 2, 0.5, SPHERES, "A ball")
+    assert path.read_bytes() != drawn_bytes("slice")
+    never, unknown = grid(observed=0), grid(observed=0, header="no occupancy grid: all never seen")
+    others = []
+    for cells, place in ((never, MIDDLE), (unknown, MIDDLE), (grid(), (0.0, 0.0, 0.0))):
+        slices_picture(path, cells, place)
+        others.append(picture(path))
+    seen = picture_of(drawn_bytes("slices"))
+    assert np.any(seen != others[0]) and np.any(others[0] != others[1]) and np.any(seen != others[2])
 
 
 def test_a_sphere_is_drawn_as_the_circle_of_the_cut(tmp_path: Path) -> None:
@@ -190,7 +166,6 @@ def test_a_sphere_is_drawn_as_the_circle_of_the_cut(tmp_path: Path) -> None:
         sphere = np.array([[0.2, 0.2, height]]), np.array([0.1])
         field_slice_picture(tmp_path / "a.png", grid(), 2, 0.5, sphere)
         areas.append(num_orange(picture(tmp_path / "a.png")))
-        (tmp_path / "a.png").unlink()
     whole, small = areas[0] - areas[2], areas[1] - areas[2]
     assert whole > 1000
     assert small / whole == pytest.approx(0.6**2, rel=0.05), "sqrt(0.1^2 - 0.08^2) = 0.06"
@@ -201,39 +176,6 @@ def num_orange(image: UInt8) -> int:
     return int(np.count_nonzero(red - blue > 100))
 
 
-def test_a_slice_outside_the_grid_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(NotEvaluableError, match=r"slice z = 2 m: expected 0\.000 to 0\.950 m"):
-        field_slice_picture(tmp_path / "a.png", grid(), 2, 2.0)
-
-
-def test_a_comparison_of_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(NotEvaluableError, match="no view to draw"):
-        comparison_picture(tmp_path / "a.png", [])
-
-
-H, W = 30, 40
-
-
-def scored_row(color_error: float) -> ComparisonRow:
-    depth = np.ones((H, W), np.float32)
-    return ComparisonRow(
-        title="holdout-0000",
-        figures="dB: 20.0 all",
-        photo=np.full((H, W, 3), 102, np.uint8),
-        render=np.full((H, W, 3), 0.4 + color_error, np.float32),
-        photo_depth=depth,
-        render_depth=depth.copy(),
-    )
-
-
-def drawn(path: Path, row: ComparisonRow) -> UInt8:
-    view_picture(path, row)
-    image = cv2.imread(str(path))
-    assert image is not None
-    assert image.shape[1] == 1200
-    return np.asarray(image[:, :, ::-1])
-
-
 def panel(image: UInt8, right: bool) -> UInt8:
     """The middle of an error's panel."""
     height = image.shape[0]
@@ -241,46 +183,50 @@ def panel(image: UInt8, right: bool) -> UInt8:
     return image[int(0.7 * height) : int(0.8 * height), x - 60 : x + 60]
 
 
+def shown(path: Path, row: ComparisonRow) -> UInt8:
+    view_picture(path, row)
+    assert picture(path).shape[1] == 1200
+    return picture(path)[:, :, ::-1]
+
+
 def test_errors_have_one_scale_whatever_the_view(tmp_path: Path) -> None:
     small, large, larger = (
-        panel(drawn(tmp_path / "a.png", scored_row(e)), right=False).mean((0, 1)) for e in (0.05, 0.1, 0.3)
+        panel(shown(tmp_path / "a.png", row(color_error=e)), right=False).mean((0, 1)) for e in (0.05, 0.1, 0.3)
     )
     assert np.abs(small - large).max() > 50
     assert np.abs(large - larger).max() < 1, "10% and more have the top colour"
 
 
 def test_what_was_not_rendered_is_orange_and_what_was_not_recorded_grey(tmp_path: Path) -> None:
-    hole, unknown = scored_row(0.0), scored_row(0.0)
+    hole, unknown = row(), row()
     hole.render_depth[:] = 0.0
     unknown.photo_depth[:] = 0.0
-    assert panel(drawn(tmp_path / "a.png", hole), right=True).mean((0, 1)) == pytest.approx([0xD5, 0x5E, 0], abs=2)
-    assert panel(drawn(tmp_path / "b.png", unknown), right=True).mean((0, 1)) == pytest.approx([0xD9] * 3, abs=2)
+    assert panel(shown(tmp_path / "a.png", hole), right=True).mean((0, 1)) == pytest.approx([0xD5, 0x5E, 0], abs=2)
+    assert panel(shown(tmp_path / "b.png", unknown), right=True).mean((0, 1)) == pytest.approx([0xD9] * 3, abs=2)
 
 
 def test_the_mask_is_outlined(tmp_path: Path) -> None:
     mask = np.zeros((H, W), np.bool_)
     mask[10:20, 10:30] = True
     plain, outlined, whole = (
-        drawn(tmp_path / "a.png", replace(scored_row(0.0), mask=m)) for m in (None, mask, np.ones((H, W), np.bool_))
+        shown(tmp_path / "a.png", replace(row(), mask=m)) for m in (None, mask, np.ones((H, W), np.bool_))
     )
     height = plain.shape[0] // 2
     assert not np.array_equal(plain[60 : height - 30], outlined[60 : height - 30])
     assert np.array_equal(plain[60 : height - 30], whole[60 : height - 30]), "nothing to outline"
 
 
-def test_each_kind_of_event_that_came_up_has_a_row(tmp_path: Path) -> None:
-    draw_clearance(tmp_path / "two.png")
-    image = np.asarray(cv2.imread(str(tmp_path / "two.png")), dtype=np.int64)
+def test_each_kind_of_event_that_came_up_has_a_row() -> None:
+    image = picture_of(drawn_bytes("clearance")).astype(int)
     orange, purple, brown = ((0, 159, 230), (167, 121, 204), (59, 109, 138))
     widths = [int(np.all(np.abs(image - color) < 3, axis=2).sum(axis=1).max()) for color in (orange, purple, brown)]
     assert widths[1] > 3 * widths[0] > 0 and widths[2] == 0
 
 
 def test_a_short_series_is_drawn_as_it_is() -> None:
-    seconds, values = np.linspace(0, 1, 20), np.arange(20.0)
-    of = envelope(seconds, values, columns=10)
+    of = envelope(np.linspace(0, 1, 20), np.arange(20.0), columns=10)
     assert of.is_exact
-    np.testing.assert_array_equal(of.lowest, values)
+    np.testing.assert_array_equal(of.lowest, np.arange(20.0))
 
 
 @pytest.mark.parametrize("block", [1, 3, 7, 50])
@@ -333,8 +279,8 @@ def test_a_picture_of_trials_has_a_colour_for_each_group_and_leaves_out_what_a_m
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     trials_picture(tmp_path / "c.png", ["one", "other"], panels, ["near"] * 3, "Trials")
     for name, num in (("a", 2), ("c", 1)):  # without other groups there is no legend
-        image = cv2.imread(str(tmp_path / f"{name}.png"))
-        assert image is not None and image.shape[1] == 1200
+        image = picture(tmp_path / f"{name}.png")
+        assert image.shape[1] == 1200
         for color in CURVE_COLORS[:num]:
             ink = 255.0 - np.array([int(color[k : k + 2], 16) for k in (5, 3, 1)])
             share = (255.0 - image) @ ink / (ink @ ink)  # of the colour on white: lines and marks let shine through
@@ -360,10 +306,19 @@ def test_bins_hold_what_they_say() -> None:
     assert curve.calibration_error == pytest.approx((2 * 0.45 + 1 * 0.4 + 2 * 0.4) / 5)
 
 
-def test_what_is_no_probability_is_refused() -> None:
-    with pytest.raises(NotEvaluableError, match="at least one point"):
-        reliability(np.empty(0), np.empty(0, bool))
-    with pytest.raises(UsageError, match=r"point 1: expected a probability in \[0, 1\], got nan"):
-        reliability(np.array([0.5, np.nan]), np.ones(2, bool))
-    with pytest.raises(UsageError, match=r"point 0: .* got 1.5"):
-        reliability(np.array([1.5]), np.ones(1, bool))
+@pytest.mark.parametrize(
+    ("draw", "words"),
+    [
+        (lambda path: field_slice_picture(path, grid(), 2, 2.0), r"slice z = 2 m: expected 0\.000 to 0\.950 m"),
+        (lambda path: comparison_picture(path, []), "no view to draw"),
+        (lambda path: reliability(np.empty(0), np.empty(0, bool)), "at least one point"),
+        (
+            lambda path: reliability(np.array([0.5, np.nan]), np.ones(2, bool)),
+            r"point 1: expected a probability in \[0, 1\], got nan",
+        ),
+        (lambda path: reliability(np.array([1.5]), np.ones(1, bool)), r"point 0: .* got 1.5"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(tmp_path: Path, draw: Callable[[Path], object], words: str) -> None:
+    with pytest.raises((NotEvaluableError, UsageError), match=words):
+        draw(tmp_path / "a.png")

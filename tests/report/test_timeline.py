@@ -37,12 +37,9 @@ def test_a_curve_runs_over_the_whole_axis_and_breaks_where_there_is_no_value() -
     margin = float(re.search(r'class="margin" d="M\d+ ([\d.]+)', svg)[1])  # type: ignore[index]
     assert first[1][1] == pytest.approx(margin, abs=0.06)  # 2 cm, drawn to a tenth of a pixel
     assert second[1][1] < first[0][1] < margin  # more clearance is higher up
-
-
-def test_contact_has_room_below_the_line_of_zero() -> None:
     svg = timeline(SECONDS, {"exact": np.linspace(0.05, -0.01, 5)}, 0.02, {})
     zero = float(re.search(r'class="contact" d="M\d+ ([\d.]+)', svg)[1])  # type: ignore[index]
-    assert zero < points(svg, "to the splats")[0][-1][1] <= TOP + HEIGHT
+    assert zero < points(svg, "to the splats")[0][-1][1] <= TOP + HEIGHT  # contact has room below
 
 
 def test_a_long_series_keeps_its_least_value() -> None:
@@ -65,8 +62,7 @@ def test_events_and_rungs_are_strips_in_time() -> None:
 
 def test_names_are_no_markup() -> None:
     bad = "<b>&"
-    svg = timeline(SECONDS, {bad: np.full(5, 0.1)}, 0.02, {bad: [(0.0, 1.0)]}, [bad] * 5)
-    assert "<b>" not in svg
+    assert "<b>" not in timeline(SECONDS, {bad: np.full(5, 0.1)}, 0.02, {bad: [(0.0, 1.0)]}, [bad] * 5)
 
 
 def test_the_legend_has_the_least_value_of_each_measure() -> None:
@@ -102,10 +98,7 @@ def test_unknown_space_is_its_border_and_in_larger_cubes_where_that_is_too_much(
     coarse, edge = coarsened(is_unknown, np.zeros(3), 0.1, 500)
     assert (len(coarse), edge) == (10**3 - 8**3, pytest.approx(0.2))
     np.testing.assert_allclose(coarse.min(axis=0) - edge / 2, 10 * 0.1 - 0.05, atol=1e-6)  # the same lower corner
-
-
-def test_unknown_space_around_the_grid_has_no_border_there() -> None:
-    assert len(coarsened(np.ones((5, 5, 5), bool), np.zeros(3), 0.1, 100)[0]) == 0
+    assert len(coarsened(np.ones((5, 5, 5), bool), np.zeros(3), 0.1, 100)[0]) == 0  # there is none around the grid
 
 
 def test_splats_are_packed_to_a_hundredth_of_a_per_cent_of_their_box() -> None:

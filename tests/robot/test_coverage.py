@@ -10,8 +10,9 @@ from splatctrl_cli.config.fixed import DEFICIT_GAP
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at, transform_points
 from splatctrl_cli.records import SphereSet
-from splatctrl_cli.robot.coverage import areas, largest_deficit, refined, uncovered_area
+from splatctrl_cli.robot.coverage import largest_deficit, uncovered_area
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 from tests.robot.shapes import BALL, BOX, arm_of, coverage_deficit, written
 
@@ -28,20 +29,16 @@ def samples(triangles: np.ndarray, count: int, seed: int) -> np.ndarray:
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
 
 
-def test_one_ball_in_a_cube_leaves_the_corners_by_a_known_distance() -> None:
+def test_one_ball_in_a_cube_leaves_corners_by_a_known_distance_and_six_squares_less_discs() -> None:
     found = largest_deficit(CUBE, np.zeros((1, 3)), np.array([0.12]))
     expected = np.sqrt(3) * 0.1 - 0.12
     assert found.found == pytest.approx(expected, abs=1e-12)
     assert expected <= found.proven <= expected + 1e-5
     np.testing.assert_allclose(np.abs(found.place), 0.1)
-
-
-def test_the_uncovered_area_of_a_cube_with_one_ball_is_that_of_six_squares_less_discs() -> None:
-    disc = np.pi * (0.12**2 - 0.1**2)
+    area = 6 * (0.04 - np.pi * (0.12**2 - 0.1**2))
     best, lower, upper = uncovered_area(CUBE, np.zeros((1, 3)), np.array([0.12]))
-    assert lower <= 6 * (0.04 - disc) <= upper
-    assert upper - lower < 0.03 * 0.24
-    assert best == pytest.approx(6 * (0.04 - disc), rel=2e-3)
+    assert lower <= area <= upper < lower + 0.03 * 0.24
+    assert best == pytest.approx(area, rel=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -100,12 +97,6 @@ def test_coverage_moves_rigidly_and_scales() -> None:
     assert double.proven == pytest.approx(2 * here.proven, rel=1e-12)
 
 
-def test_refined_triangles_are_the_same_surface() -> None:
-    parts, area = refined(CUBE, 0.03)
-    assert np.linalg.norm(parts - np.roll(parts, 1, axis=1), axis=2).max() <= 0.03
-    assert area.sum() == pytest.approx(areas(CUBE).sum(), rel=1e-12)
-
-
 def spheres(*rows: tuple[str, list[float], float]) -> SphereSet:
     return SphereSet(
         links=tuple(row[0] for row in rows),
@@ -119,7 +110,6 @@ def test_a_report_says_deficit_share_and_protrusion_of_each_link(tmp_path: Path)
     half = np.array([0.15, 0.1, 0.05])
     report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.15), ("tip", [0.01, 0, 0], 0.1)))
     base, tip = report.links
-    assert base.deficit is not None
     assert base.deficit.proven == pytest.approx(np.linalg.norm(half) - 0.15, abs=1e-4)
     assert base.protrusion == pytest.approx(0.1)
     assert 0 < base.uncovered_share < 1
@@ -129,41 +119,15 @@ def test_a_report_says_deficit_share_and_protrusion_of_each_link(tmp_path: Path)
     assert (report.max_protrusion, report.num_spheres, report.stray_spheres) == (base.protrusion, 2, 0)
 
 
-def test_a_ball_in_a_sphere_of_its_size_is_covered_exactly(tmp_path: Path) -> None:
+def test_a_ball_in_its_own_sphere_is_covered_exactly_and_a_link_without_one_has_no_bound(tmp_path: Path) -> None:
     urdf = read_urdf(written(tmp_path, arm_of(BALL, BALL)))
     exact = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.08), ("tip", [0, 0, 0], 0.08 - 1e-6)))
-    assert exact.links[0].is_covered
-    assert not exact.links[1].is_covered
-    assert exact.links[1].deficit is not None
-    assert exact.links[1].deficit.proven == pytest.approx(1e-6)
-
-
-def test_a_link_without_a_sphere_has_no_bound(tmp_path: Path) -> None:
-    urdf = read_urdf(written(tmp_path, arm_of(BALL, BALL)))
+    assert [link.is_covered for link in exact.links] == [True, False]
+    assert exact.max_deficit == pytest.approx(1e-6)
     report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.08)))
     assert report.bare_links == ("tip",)
     assert (report.worst, report.max_deficit) == (None, None)
     assert report.uncovered_share == pytest.approx(0.5)
-
-
-def test_spheres_of_a_link_fixed_to_another_cover_it(tmp_path: Path) -> None:
-    text = arm_of(BALL, BALL).replace(
-        "</robot>",
-        '<link name="pad"><collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
-        '<joint name="glue" type="fixed"><parent link="tip"/><child link="pad"/>'
-        '<origin xyz="0 0 0.05" rpy="0 1 0"/></joint></robot>',
-    )
-    urdf = read_urdf(written(tmp_path, text))
-    report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.1), ("tip", [0, 0, 0.02], 0.101)))
-    assert report.bare_links == ()
-    assert all(link.is_covered for link in report.links)
-    assert [link.num_spheres for link in report.links] == [1, 1, 0]
-
-
-def test_spheres_on_unknown_links_are_refused(tmp_path: Path) -> None:
-    urdf = read_urdf(written(tmp_path, arm_of(BALL, BALL)))
-    with pytest.raises(InputError, match=r"sphere set: link 'wing' is not in .*; links there: base, tip"):
-        coverage_deficit(urdf, spheres(("wing", [0, 0, 0], 0.1)))
 
 
 @pytest.mark.parametrize(
@@ -177,8 +141,6 @@ def test_spheres_on_unknown_links_are_refused(tmp_path: Path) -> None:
 def test_public_panda_sets_leave_much_of_the_collision_hulls_uncovered(
     real_data: Path, name: str, share: float, deficit: float
 ) -> None:
-    from splatctrl_cli.robot.sphere_files import read_spheres
-
     urdf = read_urdf(real_data / "vamp_panda/resources/panda/panda.urdf")
     report = coverage_deficit(urdf, read_spheres(real_data / name), resolution=5e-3)
     assert report.uncovered_share == pytest.approx(share, abs=0.005)
@@ -186,13 +148,18 @@ def test_public_panda_sets_leave_much_of_the_collision_hulls_uncovered(
     assert report.open_links == ("panda_link6",)
 
 
-def test_the_worst_link_of_a_rigid_body_counts_for_all_of_its_spheres(tmp_path: Path) -> None:
+def test_spheres_of_a_rigid_body_cover_all_of_it_and_its_worst_link_counts_for_them_all(tmp_path: Path) -> None:
     pad = '<link name="pad"><collision><geometry><sphere radius="0.05"/></geometry></collision></link>'
     glue = '<joint name="glue" type="fixed"><parent link="tip"/><child link="pad"/><origin xyz="0 0 0.02"/></joint>'
     path = written(tmp_path, arm_of(BALL, BALL).replace("</robot>", f"{pad}{glue}</robot>"))
-    spheres = SphereSet(links=("base", "tip", "pad"), centers=np.zeros((3, 3)), radii=np.array([0.08, 0.07, 0.05]))
-    model = RobotModel.from_urdf(path, spheres)
+    report = coverage_deficit(read_urdf(path), spheres(("base", [0, 0, 0], 0.1), ("tip", [0, 0, 0.02], 0.101)))
+    assert report.bare_links == () and all(link.is_covered for link in report.links)
+    assert [link.num_spheres for link in report.links] == [1, 1, 0]
+    three = spheres(("base", [0, 0, 0], 0.08), ("tip", [0, 0, 0], 0.07), ("pad", [0, 0, 0], 0.05))
+    model = RobotModel.from_urdf(path, three)
     assert np.isnan(model.sphere_deficit).all() and "not read" in model.coverage_unknown
-    measured = model.with_coverage(coverage_deficit(model.urdf, spheres))
+    measured = model.with_coverage(coverage_deficit(model.urdf, three))
     np.testing.assert_allclose(measured.sphere_deficit, [0.0, 0.01, 0.01], atol=1e-9)
     assert np.isnan(model.sphere_deficit).all()
+    with pytest.raises(InputError, match=r"sphere set: link 'wing' is not in .*; links there: base, tip"):
+        coverage_deficit(model.urdf, spheres(("wing", [0, 0, 0], 0.1)))

@@ -52,15 +52,17 @@ def test_a_contact_is_expected_at_its_link_place_and_time_alone(tmp_path: Path) 
 
 def test_what_nothing_used_is_known(tmp_path: Path) -> None:
     entries = declared(tmp_path)
-    assert entries.unused() == [("carried", 0), ("expected_contact", 0)]
-    entries.expects("hand", np.array([0.9, 0.0, 0.1]), 3.5)
-    entries.is_carried("hand", np.array([[0.0, 0.0, 0.9]]), 2.0)
-    assert entries.unused() == [("carried", 0), ("expected_contact", 0)]
-    entries.expects("hand", np.array([0.5, 0.0, 0.1]), 3.5)
-    assert entries.unused() == [("carried", 0)]
-    entries.is_carried("hand", np.array([[0.0, 0.0, 0.2]]), 2.0)
-    assert entries.unused() == []
+    for contact, carried, left in (
+        ([0.9, 0.0, 0.1], [0.0, 0.0, 0.9], [("carried", 0), ("expected_contact", 0)]),
+        ([0.5, 0.0, 0.1], [0.0, 0.0, 0.9], [("carried", 0)]),
+        ([0.9, 0.0, 0.1], [0.0, 0.0, 0.2], []),
+    ):
+        entries.expects("hand", np.array(contact), 3.5)
+        entries.is_carried("hand", np.array([carried]), 2.0)
+        assert entries.unused() == left
     assert Declarations().unused() == []
+    with pytest.raises(InputError, match="cannot be read"):
+        read_declarations(tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize(
@@ -85,8 +87,3 @@ def test_what_is_wrong_is_refused_in_one_line_with_a_remedy(tmp_path: Path, old:
     with pytest.raises(InputError, match=words) as caught:
         declared(tmp_path, GOOD.replace(old, new, 1))
     assert "contact.toml" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
-        read_declarations(tmp_path / "none.toml")

@@ -41,30 +41,24 @@ def robot(folder: Path, *joints: tuple[str, str, str, str, str]) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("hand", "fingers"),
+    ("joints", "moved", "fingers"),
     [
-        (FRANKA, ("left", "right")),
-        (WSG, ("left", "right")),
-        (ROBOTIQ, ("knuckle", "other", "tip")),
-        (SCARA, ()),
-        (TWO_ARMS, ()),
+        ((*ARM, *FRANKA), ["shoulder", "wrist"], ("left", "right")),
+        ((*ARM, *WSG), ["shoulder", "wrist"], ("left", "right")),
+        ((*ARM, *ROBOTIQ), ["shoulder", "wrist"], ("knuckle", "other", "tip")),
+        ((*ARM, *SCARA), ["shoulder", "wrist"], ()),
+        ((*ARM, *TWO_ARMS), ["shoulder", "wrist"], ()),
+        (GANTRY, ["a", "arm_a"], ()),
+        ((*ARM, *FRANKA), ["shoulder", "wrist", "left"], ()),
+        ((*ARM, *FRANKA), ["shoulder", "wrist", "right"], ()),
+        ((*ARM, *FRANKA), [], ()),
+        ((*ARM, *FRANKA), ["left"], ()),
     ],
 )
-def test_a_log_that_moves_the_arm_leaves_fingers_and_nothing_else(
-    tmp_path: Path, hand: tuple[tuple[str, str, str, str, str], ...], fingers: tuple[str, ...]
+def test_fingers_are_what_a_log_leaves_that_moves_the_arm_and_nothing_else(
+    tmp_path: Path, joints: tuple[tuple[str, str, str, str, str], ...], moved: list[str], fingers: tuple[str, ...]
 ) -> None:
-    assert read_urdf(robot(tmp_path, *ARM, *hand)).fingers(["shoulder", "wrist"]) == fingers
-
-
-def test_an_arm_on_a_carriage_is_no_finger(tmp_path: Path) -> None:
-    assert read_urdf(robot(tmp_path, *GANTRY)).fingers(["a", "arm_a"]) == ()
-
-
-@pytest.mark.parametrize("moved", [["shoulder", "wrist", "left"], ["shoulder", "wrist", "right"], [], ["left"]])
-def test_fingers_that_the_log_knows_or_whose_arm_it_does_not_move_are_left_to_it(
-    tmp_path: Path, moved: list[str]
-) -> None:
-    assert read_urdf(robot(tmp_path, *ARM, *FRANKA)).fingers(moved) == ()
+    assert read_urdf(robot(tmp_path, *joints)).fingers(moved) == fingers
 
 
 def test_fingers_are_locked_in_their_middle_and_what_mimics_them_follows(tmp_path: Path) -> None:

@@ -95,39 +95,38 @@ def test_mesh_paths_are_found(tmp_path: Path, filename: str, place: str, folder:
     assert len(read_solids(urdf, folders)["base"][0].surface.faces) == 20
 
 
-def test_a_missing_mesh_is_named_with_its_link(tmp_path: Path) -> None:
-    urdf = read_urdf(written(tmp_path, arm_of('<mesh filename="none.stl"/>', BALL)))
-    with pytest.raises(
-        InputError, match=r"robot.urdf: link 'base': mesh none.stl was not found; expected .*none.stl"
-    ):
-        read_solids(urdf)
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            arm_of('<mesh filename="none.stl"/>', BALL),
+            "link 'base': mesh none.stl was not found; expected .*none",
+        ),
+        (
+            arm_of('<mesh filename="a.stl" scale="1 0 1"/>', BALL),
+            "mesh: scale: expected three numbers that are not",
+        ),
+        (arm_of('<cone radius="0.1"/>', BALL), "expected mesh, box, cylinder, capsule or sphere, got <cone>"),
+        (arm_of(BALL, BALL).replace("collision>", "visual>"), "expected collision geometry, got none"),
+    ],
+)
+def test_shapes_that_cannot_be_read_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError, match=f"robot.urdf.*{words}"):
+        read_solids(read_urdf(written(tmp_path, text)))
 
 
-def test_shapes_of_another_kind_and_no_shapes_are_refused(tmp_path: Path) -> None:
-    urdf = read_urdf(written(tmp_path, arm_of('<cone radius="0.1" length="1"/>', BALL)))
-    with pytest.raises(InputError, match="link 'base': expected mesh, box, cylinder, capsule or sphere, got <cone>"):
-        read_solids(urdf)
-    bare = arm_of(BALL, BALL).replace("collision>", "visual>")
-    with pytest.raises(InputError, match="expected collision geometry, got none"):
-        read_solids(read_urdf(written(tmp_path, bare)))
-
-
-def test_an_open_mesh_is_taken_apart_and_its_open_part_measured_by_its_hull(tmp_path: Path) -> None:
+def test_an_open_mesh_is_taken_apart_and_its_open_part_measured_by_its_hull_where_it_has_one(tmp_path: Path) -> None:
     closed, opened = trimesh.creation.box(extents=(0.1, 0.1, 0.1)), trimesh.creation.box(extents=(0.2, 0.2, 0.2))
     opened = trimesh.Trimesh(opened.vertices + np.array([1, 0, 0]), opened.faces[1:], process=False)
     trimesh.util.concatenate([closed, opened]).export(tmp_path / "two.stl")
-    solids = read_solids(read_urdf(written(tmp_path, arm_of('<mesh filename="two.stl"/>', BALL))))["base"]
-    assert [solid.is_closed for solid in solids] == [True, False]
-    distance = SolidDistance(solids)(np.array([[0.0, 0, 0], [1.0, 0, 0], [0.5, 0, 0]]))
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False).export(tmp_path / "sheet.stl")
+    text = arm_of('<mesh filename="two.stl"/>', '<mesh filename="sheet.stl"/>')
+    solids = read_solids(read_urdf(written(tmp_path, text)))
+    assert [solid.is_closed for solid in solids["base"]] == [True, False]
+    distance = SolidDistance(solids["base"])(np.array([[0.0, 0, 0], [1.0, 0, 0], [0.5, 0, 0]]))
     np.testing.assert_allclose(distance, [-0.05, -0.1, 0.4], atol=1e-6)
-
-
-def test_a_flat_open_mesh_has_no_inside(tmp_path: Path) -> None:
-    sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
-    sheet.export(tmp_path / "sheet.stl")
-    (solid,) = read_solids(read_urdf(written(tmp_path, arm_of('<mesh filename="sheet.stl"/>', BALL))))["base"]
-    assert solid.body is None
-    np.testing.assert_allclose(SolidDistance([solid])(np.array([[0.2, 0.2, 0.3]])), [0.3])
+    assert solids["tip"][0].body is None
+    np.testing.assert_allclose(SolidDistance(solids["tip"])(np.array([[0.2, 0.2, 0.3]])), [0.3])
 
 
 def test_a_visual_mesh_is_read_from_collada_in_its_unit(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """RobotModel: kinematics against published poses and finite differences, files that must and must not load."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.arm import arm_urdf
+from tests.robot.shapes import written
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 T_WORLD_BASE = look_at([0.3, -0.2, 0.1], [1.0, 2.0, 3.0])
@@ -22,22 +24,13 @@ PRISMATIC = """<robot name="rail"><link name="a"><collision><geometry><sphere ra
 
 
 @pytest.fixture(scope="module")
-def arm_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    folder = tmp_path_factory.mktemp("arm")
-    (folder / "robot.urdf").write_text(arm_urdf())
-    (folder / "robot_spheres.yaml").write_text(arm_spheres_yaml())
-    return folder / "robot.urdf", folder / "robot_spheres.yaml"
+def arm_files(plain_arm: Path) -> tuple[Path, Path]:
+    return plain_arm / "tabletop" / "robot.urdf", plain_arm / "tabletop" / "robot_spheres.yaml"
 
 
 @pytest.fixture(scope="module")
 def arm(arm_files: tuple[Path, Path]) -> RobotModel:
     return RobotModel.from_urdf(*arm_files, T_world_base=T_WORLD_BASE)
-
-
-def written(folder: Path, text: str, name: str = "robot.urdf") -> Path:
-    path = folder / name
-    path.write_text(text)
-    return path
 
 
 def test_ready_posture_puts_the_flange_where_the_maker_publishes_it(arm_files: tuple[Path, Path]) -> None:
@@ -87,29 +80,22 @@ def test_joint_order_sorts_a_log_into_the_model(arm: RobotModel) -> None:
     np.testing.assert_array_equal(np.array(log)[arm.joint_columns(log)[0]], arm.joint_names)
 
 
-def test_joint_order_names_the_joints_a_log_lacks(arm: RobotModel) -> None:
-    with pytest.raises(InputError, match=r"joints not in the log: joint7; the log has: .*--lock joint7=VALUE"):
-        arm.joint_columns(arm.joint_names[:6])
-
-
-def test_continuous_and_prismatic_joints_take_one_number_each(tmp_path: Path) -> None:
+def test_continuous_and_prismatic_joints_take_one_number_each_and_a_locked_one_none(tmp_path: Path) -> None:
     rail = RobotModel.from_urdf(written(tmp_path, PRISMATIC))
     assert rail.joint_names == ("turn", "slide")
     np.testing.assert_array_equal(rail.lower, [-np.inf, -0.5])
     np.testing.assert_allclose(rail.sphere_centers(np.array([np.pi / 2, 1.5]))[1], [0, 1.5, 1], atol=1e-12)
     assert rail.reach() == pytest.approx(1 + 2 + 0.2)
-
-
-def test_a_locked_joint_stays_where_it_was_put(tmp_path: Path) -> None:
-    rail = RobotModel.from_urdf(written(tmp_path, PRISMATIC), locked={"slide": 0.25})
-    assert rail.joint_names == ("turn",)
-    np.testing.assert_allclose(rail.sphere_centers(np.array([0.0]))[1], [0.25, 0, 1], atol=1e-12)
+    locked = RobotModel.from_urdf(tmp_path / "robot.urdf", locked={"slide": 0.25})
+    assert locked.joint_names == ("turn",)
+    np.testing.assert_allclose(locked.sphere_centers(np.array([0.0]))[1], [0.25, 0, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("no xml", "broken XML"),
+        ("", "none.urdf.*No such file"),
+        ("no xml", "robot.urdf.*broken XML"),
         ("<sdf/>", "expected a URDF with root <robot>, got <sdf>"),
         ('<robot name="x"><link name="a"/></robot>', "expected movable joints, got none; an unexpanded xacro"),
         (PRISMATIC.replace('child link="b"', 'child link="c"'), "joint 'slide': child link 'c' does not exist"),
@@ -121,21 +107,29 @@ def test_a_locked_joint_stays_where_it_was_put(tmp_path: Path) -> None:
     ],
 )
 def test_unusable_urdfs_are_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+    written(tmp_path, text)
     with pytest.raises(InputError, match=message) as caught:
-        RobotModel.from_urdf(written(tmp_path, text))
-    assert "robot.urdf" in str(caught.value)
+        RobotModel.from_urdf(tmp_path / ("robot.urdf" if text else "none.urdf"))
+    assert ".urdf" in str(caught.value)
 
 
-def test_a_missing_urdf_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="No such file"):
-        RobotModel.from_urdf(tmp_path / "none.urdf")
-
-
-def test_postures_of_the_wrong_length_and_unknown_frames_are_refused(arm: RobotModel) -> None:
-    with pytest.raises(InputError, match=r"joint positions: expected shape \(7,\), got \(6,\)"):
-        arm.sphere_centers(np.zeros(6))
-    with pytest.raises(InputError, match="no frame 'tool'; frames there: link0, "):
-        arm.frame_pose(READY, "tool")
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (lambda arm: arm.sphere_centers(np.zeros(6)), r"joint positions: expected shape \(7,\), got \(6,\)"),
+        (lambda arm: arm.sphere_centers_batch(np.zeros((7, 2))), r"expected shape \(T, 7\), got \(7, 2\)"),
+        (lambda arm: arm.frame_pose(READY, "tool"), "no frame 'tool'; frames there: link0, "),
+        (
+            lambda arm: arm.joint_columns(arm.joint_names[:6]),
+            "joints not in the log: joint7; the log has: .*--lock joint7=VALUE",
+        ),
+    ],
+)
+def test_postures_of_the_wrong_length_and_what_is_not_there_are_refused(
+    arm: RobotModel, asked: Callable[[RobotModel], object], words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        asked(arm)
 
 
 def test_a_real_spherized_urdf_brings_its_own_spheres(real_data: Path) -> None:
@@ -170,8 +164,7 @@ def test_links_without_a_sphere_are_said(plain_arm: Path, real_data: Path, tmp_p
     assert any("same robot" in doubt for doubt in RobotModel.from_urdf(urdf, foreign).doubts)
 
 
-def test_frames_and_spheres_stand_and_move_as_pinocchio_says(arm_files: tuple[Path, Path]) -> None:
-    arm = RobotModel.from_urdf(*arm_files, T_world_base=T_WORLD_BASE)
+def test_frames_and_spheres_stand_and_move_as_pinocchio_says(arm: RobotModel, arm_files: tuple[Path, Path]) -> None:
     np.testing.assert_allclose(arm.base_position, T_WORLD_BASE[:3, 3])
     model = pinocchio.buildModelFromUrdf(str(arm_files[0]))
     data, base = model.createData(), T_WORLD_BASE[:3, :3]
@@ -194,15 +187,12 @@ def test_frames_and_spheres_stand_and_move_as_pinocchio_says(arm_files: tuple[Pa
         np.testing.assert_array_equal(jacobians, arm.sphere_jacobians(q))
 
 
-def test_batches_are_the_same_at_any_thread_count(arm_files: tuple[Path, Path]) -> None:
-    arm = RobotModel.from_urdf(*arm_files)
+def test_batches_are_the_same_at_any_thread_count(arm: RobotModel) -> None:
     q = np.random.default_rng(1).uniform(-1, 1, (500, arm.num_joints))
     one = arm.sphere_centers_batch(q)
     np.testing.assert_array_equal(arm.sphere_centers_batch(q, threads=3), one)
     np.testing.assert_array_equal(one[123], arm.sphere_centers(q[123]))
     assert arm.sphere_centers_batch(q[:0]).shape == (0, len(arm.sphere_set.radii), 3)
-    with pytest.raises(InputError, match=r"expected shape \(T, 7\), got \(7, 2\)"):
-        arm.sphere_centers_batch(np.zeros((7, 2)))
 
 
 def test_what_a_robot_carries_is_part_of_it_and_moves_with_its_link(arm: RobotModel) -> None:

@@ -2,7 +2,6 @@
 surfaces of links are from each other.
 """
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import LEAST_OVERLAP
 from splatctrl_cli.control.qp import Rung
-from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
+from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.formats.mesh import TriangleMesh
-from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.geometry import pose_at, transform_points
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.solid_scene import Solids
 from splatctrl_cli.records import Float64, SphereSet
@@ -24,6 +23,7 @@ from splatctrl_cli.robot.mesh_distance import MeshDistance
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import DisabledPair, random_postures
 from splatctrl_cli.robot.self_margins import (
+    KeptMargin,
     LinkSurface,
     SelfSurfaces,
     depth_in,
@@ -48,6 +48,10 @@ from tests.robot.shapes import (
 )
 
 
+def turned(rng: np.random.Generator) -> Float64:
+    return np.asarray(Rotation.random(rng=rng).as_matrix())
+
+
 def solids_of(folder: Path, shape: str) -> tuple[Solid, ...]:
     return read_solids(read_urdf(written(folder, arm_of(shape, '<sphere radius="0.1"/>'))))["base"]
 
@@ -56,56 +60,49 @@ def box(folder: Path, x: float, y: float, z: float) -> LinkSurface:
     return LinkSurface(solids_of(folder, f'<box size="{x} {y} {z}"/>'))
 
 
-def turned(rng: np.random.Generator) -> Float64:
-    return np.asarray(Rotation.random(rng=rng).as_matrix())
+def hook() -> Solid:
+    mesh = l_shape()
+    shape = TriangleMesh(vertices=np.array(mesh.vertices), faces=np.array(mesh.faces), is_closed=True)
+    return Solid(link="a", surface=shape, slack=0.0, body=shape)
 
 
-def at(shift: ArrayLike, rotation: Float64 | None = None) -> Float64:
-    return pose_at(shift, np.eye(3) if rotation is None else rotation)
-
-
-def test_boxes_are_as_far_apart_as_their_faces_edges_and_corners(tmp_path: Path) -> None:
-    one = box(tmp_path, 0.2, 0.2, 0.2)
-    for shift, gap in (((0.3, 0.05, 0), 0.1), ((0.3, 0.4, 0), np.hypot(0.1, 0.2)), ((0.3, 0.3, 0.3), 0.1 * 3**0.5)):
-        assert surface_gap(one, one, at(shift)) == pytest.approx(gap, abs=1e-12)
+def test_boxes_are_as_far_apart_as_their_faces_edges_and_corners_at_any_scale(tmp_path: Path) -> None:
+    gaps = {(0.3, 0.05, 0): 0.1, (0.3, 0.4, 0): np.hypot(0.1, 0.2), (0.3, 0.3, 0.3): 0.1 * 3**0.5}
+    for scale in (1.0, 2.0, 4.0):
+        one = box(tmp_path, *np.full(3, 0.2 * scale))
+        for shift, gap in gaps.items():
+            assert surface_gap(one, one, pose_at(scale * np.array(shift))) == pytest.approx(scale * gap, rel=1e-9)
 
 
 def test_the_gap_is_that_of_the_reference_and_the_same_from_either_side(tmp_path: Path) -> None:
-    mesh = l_shape()
-    shape = TriangleMesh(vertices=np.array(mesh.vertices), faces=np.array(mesh.faces), is_closed=True)
-    hook = LinkSurface([Solid(link="a", surface=shape, slack=0.0, body=shape)])
     (plate,) = solids_of(tmp_path, '<box size="0.2 0.3 0.02"/>')
+    a, b = LinkSurface([hook()]), LinkSurface([plate])
     rng, found = np.random.default_rng(2), []
-    for _ in range(30):
-        T = at(rng.uniform([-0.25, -0.25, -0.35], [0.55, 0.55, 0.45]), turned(rng))
-        moved = plate.surface.corners @ T[:3, :3].T + T[:3, 3]
-        expected = surface_distance(shape.corners, moved)
-        gap = surface_gap(hook, LinkSurface([plate]), T)
-        found.append(gap)
-        assert gap == pytest.approx(expected, abs=1e-9) if expected > 0 else gap < 0
-        assert surface_gap(LinkSurface([plate]), hook, np.linalg.inv(T)) == pytest.approx(gap, abs=1e-9)
-    assert 3 < sum(gap < 0 for gap in found) < 27
+    for _ in range(12):
+        T = pose_at(rng.uniform([-0.25, -0.25, -0.35], [0.55, 0.55, 0.45]), turned(rng))
+        expected = surface_distance(hook().surface.corners, transform_points(T, plate.surface.corners))
+        found.append(surface_gap(a, b, T))
+        assert found[-1] == pytest.approx(expected, abs=1e-9) if expected > 0 else found[-1] < 0
+        assert surface_gap(b, a, np.linalg.inv(T)) == pytest.approx(found[-1], abs=1e-9)
+    assert 1 < sum(gap < 0 for gap in found) < 11
 
 
 def test_surfaces_that_cross_without_a_vertex_inside_overlap(tmp_path: Path) -> None:
     rod, other = box(tmp_path, 0.02, 0.02, 0.4), box(tmp_path, 0.4, 0.03, 0.03)
     assert surface_gap(rod, other, np.eye(4)) == -LEAST_OVERLAP
-    assert surface_gap(rod, other, at((0, 0.03, 0))) == pytest.approx(0.005, abs=1e-12)
+    assert surface_gap(rod, other, pose_at((0, 0.03, 0))) == pytest.approx(0.005, abs=1e-12)
 
 
 def test_a_link_inside_another_overlaps_it_by_its_depth(tmp_path: Path) -> None:
     large, small = box(tmp_path, 0.4, 0.4, 0.4), box(tmp_path, 0.02, 0.02, 0.02)
     for a, b in ((large, small), (small, large)):
         assert surface_gap(a, b, np.eye(4)) == pytest.approx(-0.19, abs=1e-9)
-    assert surface_gap(large, small, at((0.195, 0, 0))) == pytest.approx(-0.015, abs=1e-9)
+    assert surface_gap(large, small, pose_at((0.195, 0, 0))) == pytest.approx(-0.015, abs=1e-9)
 
 
 def test_the_depth_in_a_solid_is_the_distance_to_its_surface(tmp_path: Path) -> None:
-    mesh, rng = l_shape(), np.random.default_rng(3)
-    bent = TriangleMesh(vertices=np.array(mesh.vertices), faces=np.array(mesh.faces), is_closed=True)
-    hook = Solid(link="a", surface=bent, slack=0.0, body=bent)
-    rod = '<cylinder radius="0.05" length="0.3"/>'
-    for solid in (*solids_of(tmp_path, rod), *solids_of(tmp_path, '<box size="0.2 0.3 0.02"/>'), hook):
+    rng, rod = np.random.default_rng(3), '<cylinder radius="0.05" length="0.3"/>'
+    for solid in (*solids_of(tmp_path, rod), *solids_of(tmp_path, '<box size="0.2 0.3 0.02"/>'), hook()):
         corners = solid.surface.vertices
         points = rng.uniform(corners.min(axis=0), corners.max(axis=0), (300, 3))
         expected = -MeshDistance(solid.surface).signed(points)
@@ -117,9 +114,9 @@ def test_round_shapes_are_never_said_to_be_farther_apart_than_they_are(tmp_path:
     ball = LinkSurface(solids_of(tmp_path, '<sphere radius="0.1"/>'))
     rng = np.random.default_rng(1)
     for direction in rng.normal(size=(20, 3)):
-        gap = surface_gap(ball, ball, at(0.25 * direction / np.linalg.norm(direction), turned(rng)))
+        gap = surface_gap(ball, ball, pose_at(0.25 * direction / np.linalg.norm(direction), turned(rng)))
         assert 0.05 - 4 * ball.slack < gap <= 0.05
-    assert surface_gap(ball, ball, at((0.1999, 0, 0))) < 0
+    assert surface_gap(ball, ball, pose_at((0.1999, 0, 0))) < 0
 
 
 def test_an_open_surface_is_crossed_and_has_no_inside(tmp_path: Path) -> None:
@@ -128,7 +125,7 @@ def test_an_open_surface_is_crossed_and_has_no_inside(tmp_path: Path) -> None:
     tray = LinkSurface([Solid(link="a", surface=sheet, slack=0.0, body=whole)])
     pin = box(tmp_path, 0.02, 0.02, 0.02)
     assert surface_gap(tray, pin, np.eye(4)) == pytest.approx(0.09)
-    assert surface_gap(tray, pin, at((0, 0, 0.1))) < 0
+    assert surface_gap(tray, pin, pose_at((0, 0, 0.1))) < 0
 
 
 def nearest(model: RobotModel, surfaces: SelfSurfaces, *postures: Float64, enough: float = 0.05) -> Float64:
@@ -146,18 +143,22 @@ def test_bounds_from_spheres_never_exceed_the_gap_of_the_surfaces(tmp_path: Path
         np.testing.assert_array_equal(nearest(model, surfaces, *postures, enough=np.inf), exact)
 
 
-@pytest.mark.parametrize("scale", [1.0, 1.6, 0.6, 0.1])
-def test_spheres_that_stick_out_or_leave_much_uncovered_fool_nobody(tmp_path: Path, scale: float) -> None:
-    model, surfaces = folding_arm(tmp_path, covering_spheres(scale))
+NO_SPHERES = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
+
+
+@pytest.mark.parametrize(
+    "spheres",
+    [*map(covering_spheres, (1.0, 1.6, 0.6, 0.1)), covering_spheres(parts=("block", "neck")), NO_SPHERES],
+    ids=["covering", "large", "small", "tiny", "none of the drum", "none"],
+)
+def test_spheres_that_stick_out_or_leave_much_or_all_uncovered_fool_nobody(
+    tmp_path: Path, spheres: SphereSet
+) -> None:
+    model, surfaces = folding_arm(tmp_path, spheres)
     assert surfaces.pairs == (("block", "drum"),)
     found = nearest(model, surfaces, OPEN, FOLDED, CROSSED)
     assert found[0] == pytest.approx(GAP, abs=1e-4)
     assert found[1] < -0.004 and found[2] < 0
-
-
-def test_a_body_without_spheres_is_judged_by_its_surface(tmp_path: Path) -> None:
-    model, surfaces = folding_arm(tmp_path, covering_spheres(parts=("block", "neck")))
-    assert nearest(model, surfaces, FOLDED)[0] < -0.004 < 0 < nearest(model, surfaces, OPEN)[0]
 
 
 def test_a_body_without_geometry_is_judged_by_its_spheres(tmp_path: Path) -> None:
@@ -178,23 +179,24 @@ def test_pairs_of_an_srdf_or_that_no_posture_parts_are_not_judged(tmp_path: Path
     assert folding_arm(tmp_path, covering_spheres(), low)[1].pairs == ()
 
 
-def test_the_gap_grows_with_the_scale_of_everything(tmp_path: Path) -> None:
-    gaps = []
-    for scale in (1.0, 2.0, 4.0):
-        a, b = (box(tmp_path, *(scale * np.array(size))) for size in ((0.2, 0.1, 0.1), (0.1, 0.3, 0.1)))
-        T = at(scale * np.array([0.3, 0.2, 0.1]), turned(np.random.default_rng(0)))
-        gaps.append(surface_gap(a, b, T))
-    assert all(after == pytest.approx(2 * before, rel=1e-9) for before, after in pairwise(gaps))
-
-
-def test_spheres_of_no_link_make_no_pair(tmp_path: Path) -> None:
-    none = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
-    model, surfaces = folding_arm(tmp_path, none)
-    assert nearest(model, surfaces, FOLDED)[0] < 0
-
-
 MARGIN = 0.02
 FAR = Balls([[9.0, 9.0, 9.0]], [0.1])
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[RobotModel, SelfSurfaces]:
+    return folding_arm(tmp_path_factory.mktemp("arm"), covering_spheres())
+
+
+@pytest.fixture(scope="module")
+def kept(arm: tuple[RobotModel, SelfSurfaces]) -> KeptMargin:
+    (kept,) = kept_margins(arm[0], MARGIN, arm[1])
+    return kept
+
+
+@pytest.fixture(scope="module")
+def eased(arm: tuple[RobotModel, SelfSurfaces], kept: KeptMargin) -> RobotModel:
+    return with_kept_margins(arm[0], MARGIN, [kept])
 
 
 def sphere_gaps(model: RobotModel, postures: Float64) -> Float64:
@@ -213,9 +215,10 @@ def test_a_margin_that_the_spheres_keep_stays_as_it_was_asked_for(tmp_path: Path
     assert kept_margins(far, MARGIN, surfaces) == ()
 
 
-def test_a_pair_that_is_never_apart_keeps_what_keeps_its_surfaces_apart(tmp_path: Path) -> None:
-    model, surfaces = folding_arm(tmp_path, covering_spheres())
-    (kept,) = kept_margins(model, MARGIN, surfaces)
+def test_a_pair_that_is_never_apart_keeps_what_keeps_its_surfaces_apart(
+    arm: tuple[RobotModel, SelfSurfaces], kept: KeptMargin, tmp_path: Path
+) -> None:
+    model, surfaces = arm
     assert kept.links == ("block", "drum") and kept.margin is not None and kept.surface_gap is not None
     postures = random_postures(model, 800, seed=1)  # others than those it was chosen by
     spheres = sphere_gaps(model, postures)
@@ -223,62 +226,54 @@ def test_a_pair_that_is_never_apart_keeps_what_keeps_its_surfaces_apart(tmp_path
     assert np.mean(surface < 0) > 0.05 and kept.surface_gap > 0.4 * GAP
     assert surface[spheres >= kept.margin].min() > 0.3 * GAP
     assert np.mean(spheres[surface > 0.9 * GAP] >= kept.margin) > 0.9
+    bare, surfaces = folding_arm(tmp_path, covering_spheres(parts=("block", "neck", "drum")))
+    (told,) = kept_margins(bare, MARGIN, surfaces)  # spheres that do not tell when surfaces meet are known for it
+    assert told.margin is not None and told.surface_gap is not None
+    assert 0 < told.margin < 0.01 and told.surface_gap < 0
 
 
-def test_spheres_that_do_not_tell_when_surfaces_meet_are_known_for_it(tmp_path: Path) -> None:
-    model, surfaces = folding_arm(tmp_path, covering_spheres(parts=("block", "neck", "drum")))
-    (kept,) = kept_margins(model, MARGIN, surfaces)
-    assert kept.margin is not None and kept.surface_gap is not None
-    assert 0 < kept.margin < 0.01 and kept.surface_gap < 0
-
-
-def test_without_surfaces_spheres_are_never_let_overlap(tmp_path: Path) -> None:
-    model, _ = folding_arm(tmp_path, covering_spheres())
-    (kept,) = kept_margins(model, MARGIN, None)
+def test_without_surfaces_spheres_are_never_let_overlap(arm: tuple[RobotModel, SelfSurfaces], tmp_path: Path) -> None:
+    (kept,) = kept_margins(arm[0], MARGIN, None)
     assert kept.margin is not None and 0 <= kept.margin < 0.01 and kept.surface_gap is None
     fat = covering_spheres(1.2)
     every = np.array([(a, b) for a in range(8) for b in range(9, len(fat.links))], dtype=np.int64)
-    model = folding_arm(tmp_path, fat)[0].with_self_pairs(every)
-    (kept,) = kept_margins(model, MARGIN, None)
+    (kept,) = kept_margins(folding_arm(tmp_path, fat)[0].with_self_pairs(every), MARGIN, None)
     assert kept.margin is None and kept.surface_gap is None
 
 
-def test_rows_and_planner_keep_the_margin_of_their_pair(tmp_path: Path) -> None:
-    model, surfaces = folding_arm(tmp_path, covering_spheres())
-    kept = kept_margins(model, MARGIN, surfaces)
-    eased = with_kept_margins(model, MARGIN, kept)
-    assert kept[0].margin is not None
-    np.testing.assert_allclose(MARGIN - eased.self_allowance, kept[0].margin)
+def test_rows_and_planner_keep_the_margin_of_their_pair(
+    arm: tuple[RobotModel, SelfSurfaces], kept: KeptMargin, eased: RobotModel
+) -> None:
+    model, _ = arm
+    np.testing.assert_allclose(MARGIN - eased.self_allowance, kept.margin)
     np.testing.assert_array_equal(model.self_allowance, 0.0)
-    q = random_postures(model, 5, seed=0)
     moving = int(model.moving_spheres.sum())
-    nothing = Solids(solids=())
-    before, after = (Clearance.of(m, nothing, self_margin=MARGIN).rows(q) for m in (model, eased))
+    before, after = (
+        Clearance.of(m, Solids(solids=()), self_margin=MARGIN).rows(random_postures(model, 5, seed=0))
+        for m in (model, eased)
+    )
     np.testing.assert_array_equal(before[:, :moving], after[:, :moving])
-    np.testing.assert_allclose(after[:, moving:] - before[:, moving:], MARGIN - kept[0].margin)
+    np.testing.assert_allclose(after[:, moving:] - before[:, moving:], MARGIN - kept.margin)
 
 
-def test_the_controller_reaches_its_goal_where_the_pair_can_keep_its_margin(tmp_path: Path) -> None:
-    model, surfaces = folding_arm(tmp_path, covering_spheres())
-    eased = with_kept_margins(model, MARGIN, kept_margins(model, MARGIN, surfaces))
-    config = ControlConfig(solver="daqp", max_time=6.0)
-    task = ReplayTask(
-        start=np.array([0.6, 0.9]), T_world_goal=model.frame_pose(np.array([-0.6, -0.9]), "drum"), frame="drum"
-    )
-    outcomes = {}
-    for name, arm in (("asked", model), ("kept", eased)):
-        trace = closed_loop(arm, config, task, lambda _: FAR)
-        outcomes[name] = trace.outcome, num_on_rung(trace, Rung.RELAXED) / len(trace.steps)
-    assert outcomes["asked"][1] == 1.0
-    assert outcomes["kept"] == (Outcome.GOAL_REACHED, 0.0)
+def moved(arm: RobotModel, start: ArrayLike, goal: ArrayLike) -> ReplayTrace:
+    """The closed loop from one posture towards where the drum is in another."""
+    goal_pose = arm.frame_pose(np.array(goal), "drum")
+    task = ReplayTask(start=np.array(start), T_world_goal=goal_pose, frame="drum")
+    return closed_loop(arm, ControlConfig(solver="daqp", max_time=6.0), task, lambda _: FAR)
 
 
-def test_the_controller_stops_before_the_surfaces_meet(tmp_path: Path) -> None:
-    model, surfaces = folding_arm(tmp_path, covering_spheres())
-    eased = with_kept_margins(model, MARGIN, kept_margins(model, MARGIN, surfaces))
-    task = ReplayTask(
-        start=np.array([0.3, 1.0]), T_world_goal=model.frame_pose(np.array([0.3, 2.3]), "drum"), frame="drum"
-    )
-    trace = closed_loop(eased, ControlConfig(solver="daqp", max_time=6.0), task, lambda _: FAR)
+def test_the_controller_reaches_its_goal_where_the_pair_can_keep_its_margin(
+    arm: tuple[RobotModel, SelfSurfaces], eased: RobotModel
+) -> None:
+    asked, kept = (moved(model, [0.6, 0.9], [-0.6, -0.9]) for model in (arm[0], eased))
+    assert num_on_rung(asked, Rung.RELAXED) == len(asked.steps)
+    assert (kept.outcome, num_on_rung(kept, Rung.RELAXED)) == (Outcome.GOAL_REACHED, 0)
+
+
+def test_the_controller_stops_before_the_surfaces_meet(
+    arm: tuple[RobotModel, SelfSurfaces], eased: RobotModel
+) -> None:
+    trace = moved(eased, [0.3, 1.0], [0.3, 2.3])
     assert trace.outcome is Outcome.STALLED
-    assert min(surfaces.gap(q, ("block", "drum")) for q in trace.position[::10]) > 0.3 * GAP
+    assert min(arm[1].gap(q, ("block", "drum")) for q in trace.position[::10]) > 0.3 * GAP

@@ -54,10 +54,6 @@ def shapes(*, has_bracket: bool = True) -> list[Shape]:
     ]
 
 
-def scene(*, has_bracket: bool = True) -> RobotSurface:
-    return RobotSurface.from_parts(shapes(has_bracket=has_bracket))
-
-
 def poses(turn: float, lift: float) -> dict[str, Float64]:
     """Of base, world, and arm with its fingers: the arm turns about z and, at its shoulder 0.36 m up, lifts."""
     c, s = np.cos(lift), np.sin(lift)
@@ -95,30 +91,19 @@ MOVES = [(0.9 * np.sin(0.5 * k), 0.35 * np.sin(0.9 * k + 1.0)) for k in range(15
 
 
 @cache
-def learned(*, has_bracket: bool = True, noise: float = 0.0) -> SelfModel:
-    frames, at = recorded(MOVES, scene(has_bracket=has_bracket), noise)
-    return learn(ROBOT, LINKS, frames, at)
-
-
-def from_bracket(points: Float64) -> Float64:
-    """Signed distance [m] of points in the arm's frame."""
-    alone = RobotSurface.from_parts([BRACKET])
-    return alone.distance(np.eye(4)[None], points)
+def learned(noise: float = 0.0) -> SelfModel:
+    return learn(ROBOT, LINKS, *recorded(MOVES, RobotSurface.from_parts(shapes()), noise))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 def test_a_bracket_that_the_urdf_lacks_is_found_within_a_voxel_and_nothing_else_is(noise: float) -> None:
-    ((link, triangles),) = learned(noise=noise).pieces()
+    ((link, triangles),) = learned(noise).pieces()
     assert link == "arm"
-    assert from_bracket(triangles.reshape(-1, 3)).max() < VOXEL
+    alone = RobotSurface.from_parts([BRACKET])
+    assert alone.distance(np.eye(4)[None], triangles.reshape(-1, 3)).max() < VOXEL
     sides = [(0.2 + x, y, 0.08) for x in (-0.01, 0, 0.01) for y in (-0.02, 0.0, 0.02)]
     sides += [(0.2 + x, y, 0.07) for x in (-0.015, 0.015) for y in (-0.02, 0.0, 0.02)]
     assert TriangleTree(triangles).closest(np.array(sides))[0].max() < VOXEL
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.003])
-def test_an_arm_as_its_urdf_draws_it_gets_no_parts(noise: float) -> None:
-    assert learned(has_bracket=False, noise=noise).pieces() == []
 
 
 def test_a_cable_narrower_than_a_thinned_pixel_is_found_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,25 +136,28 @@ def test_what_two_fingers_hold_between_them_is_robot() -> None:
 
 def test_links_that_do_not_move_are_named() -> None:
     assert [*learned().unknown] == ["base"] and "moves too little" in learned().unknown["base"]
-    frames, at = recorded([(0.1, 0.0)] * 6, scene())
+    frames, at = recorded([(0.1, 0.0)] * 6, RobotSurface.from_parts(shapes()))
     with pytest.raises(InputError, match=r"base, arm.* moves? too little \(1 of 5 configurations\)"):
         learn(ROBOT, LINKS, frames, at)
 
 
-def test_a_plate_that_the_arm_moves_along_stays_in_the_world() -> None:
-    """Level under the arm, 20 mm from it, it has one place in the frame of an arm that only turns."""
-    plate = Shape(link="world", kind="box", size=(1.2, 1.2, 0.02), T_link_shape=pose_at((0.0, 0.0, 0.285)))
-    truth = RobotSurface.from_parts([*shapes(has_bracket=False), plate])
-    frames, at = recorded([(-0.9 + 0.12 * k, 0.0) for k in range(15)], truth)
-    assert learn(ROBOT, LINKS, frames, at).pieces() == []
+PLATE = Shape(link="world", kind="box", size=(1.2, 1.2, 0.02), T_link_shape=pose_at((0.0, 0.0, 0.285)))
+ROD = Shape(link="world", kind="capsule", size=(0.006, 0.6), T_link_shape=pose_at((0.42, 0.0, 0.4)))
+TURNS = [(-0.9 + 0.12 * k, 0.0) for k in range(15)]
+NODS = [(0.0, float(lift)) for lift in np.linspace(-0.45, 0.45, 19)]
 
 
-def test_a_rod_along_which_the_arm_moves_stays_in_the_world() -> None:
-    """The arm nods at a rod 2 cm before its tip: in the arm's frame it stays, but for its slant."""
-    rod = Shape(link="world", kind="capsule", size=(0.006, 0.6), T_link_shape=pose_at((0.42, 0.0, 0.4)))
-    truth = RobotSurface.from_parts([*shapes(has_bracket=False), rod])
-    nods = [(0.0, float(lift)) for lift in np.linspace(-0.45, 0.45, 19)]
-    assert learn(ROBOT, LINKS, *recorded(nods, truth)).pieces() == []
+@pytest.mark.parametrize(
+    ("beside", "moves", "noise"),
+    [([], MOVES, 0.0), ([], MOVES, 0.003), ([PLATE], TURNS, 0.0), ([ROD], NODS, 0.0)],
+    ids=["nothing", "noise", "plate", "rod"],
+)
+def test_an_arm_as_its_urdf_draws_it_gets_no_parts_of_what_it_moves_along(
+    beside: list[Shape], moves: list[tuple[float, float]], noise: float
+) -> None:
+    """Both have one place in the arm's frame: a plate level under an arm that turns, a rod at which it nods."""
+    truth = RobotSurface.from_parts([*shapes(has_bracket=False), *beside])
+    assert learn(ROBOT, LINKS, *recorded(moves, truth, noise)).pieces() == []
 
 
 def test_a_rib_goes_on_beside_the_joint_where_it_hardly_moves() -> None:

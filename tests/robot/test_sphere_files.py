@@ -29,11 +29,22 @@ THREE = """
 """
 
 
-def test_a_plain_file_is_read_and_spheres_of_no_size_are_off(tmp_path: Path) -> None:
+def test_a_plain_file_and_a_urdf_of_spheres_are_read_and_spheres_of_no_size_are_off(tmp_path: Path) -> None:
     file = read_sphere_file(written(tmp_path, "collision_spheres:" + THREE, "s.yaml"))
     assert (file.layout, file.spheres.links, file.num_off) == ("YAML", ("a", "b"), 1)
     np.testing.assert_array_equal(file.spheres.centers, [[0.1, 0, 0], [0, 0.3, 0]])
     np.testing.assert_array_equal(file.spheres.radii, [0.05, 0.01])
+    file = read_sphere_file(written(tmp_path, arm_of(BALL, BALL)))
+    assert (file.layout, file.spheres.links, file.num_off) == ("URDF", ("base", "tip"), 0)
+
+
+def test_what_is_written_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
+    centers = np.random.default_rng(0).normal(size=(2, 3))
+    spheres = SphereSet(links=("a", "b"), centers=centers, radii=np.array([1 / 3, 1e-6]))
+    again = read_sphere_file(written(tmp_path, spheres_yaml(spheres, ["of a test"]), "t.yaml")).spheres
+    assert again.links == spheres.links
+    np.testing.assert_array_equal(again.centers, centers)
+    np.testing.assert_array_equal(again.radii, spheres.radii)
 
 
 @pytest.mark.parametrize(
@@ -47,21 +58,6 @@ def test_curobo_adds_its_buffer_and_may_keep_spheres_elsewhere(
     file = read_sphere_file(written(tmp_path, CUROBO.format(buffer=buffer, spheres="spheres/arm.yml"), "arm.yml"))
     assert (file.layout, file.num_off) == ("cuRobo YAML", num_off)
     np.testing.assert_allclose(file.spheres.radii, radii, rtol=1e-12)
-
-
-def test_a_urdf_of_spheres_is_a_sphere_file(tmp_path: Path) -> None:
-    file = read_sphere_file(written(tmp_path, arm_of(BALL, BALL)))
-    assert (file.layout, file.spheres.links, file.num_off) == ("URDF", ("base", "tip"), 0)
-
-
-def test_what_is_written_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
-    file = read_sphere_file(written(tmp_path, "collision_spheres:" + THREE, "s.yaml"))
-    centers = np.random.default_rng(0).normal(size=(2, 3))
-    spheres = type(file.spheres)(links=("a", "b"), centers=centers, radii=np.array([1 / 3, 1e-6]))
-    again = read_sphere_file(written(tmp_path, spheres_yaml(spheres, ["of a test"]), "t.yaml")).spheres
-    assert again.links == spheres.links
-    np.testing.assert_array_equal(again.centers, centers)
-    np.testing.assert_array_equal(again.radii, spheres.radii)
 
 
 @pytest.mark.parametrize(
@@ -92,18 +88,12 @@ def test_public_sets_are_read(real_data: Path, name: str, layout: str, count: in
         ("collision_spheres: {a: [{center: [0, 0, 0], radius: -1}]}", "got none, all 1 of radius 0 or less"),
         ("collision_spheres: {}", "expected collision spheres, got none"),
         (CUROBO.format(buffer="wide", spheres="{a: []}"), "collision_sphere_buffer: expected numbers .* got 'wide'"),
+        (arm_of(BOX, BALL), "spheres only, got 1 other shapes; .* fit one with: splatctrl robot spheres"),
     ],
 )
 def test_other_files_are_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        read_sphere_file(written(tmp_path, text, "s.yaml"))
-
-
-def test_a_urdf_with_other_shapes_is_no_sphere_file(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"spheres only, got 1 other shapes; .* fit one with: splatctrl robot spheres"
-    ):
-        read_sphere_file(written(tmp_path, arm_of(BOX, BALL)))
+        read_sphere_file(written(tmp_path, text, "s.urdf" if text.startswith("<") else "s.yaml"))
 
 
 def random_chain(seed: int, num_joints: int = 6) -> tuple[Chain, np.ndarray, np.ndarray]:
@@ -141,13 +131,8 @@ def test_no_centre_moves_more_per_radian_than_its_lever_arm(seed: int) -> None:
     assert np.all(travel <= levers + 1e-12)
     assert np.all((travel > 0) == (levers > 0))
     assert np.min(travel[levers > 0] / levers[levers > 0]) > 0.4  # bounds, but not idle ones
-
-
-def test_the_lever_of_a_spheres_own_joint_is_its_distance_to_the_axis() -> None:
-    chain, lower, upper = random_chain(0)
-    levers = lever_arms(chain, lower, upper)
     for s, body in enumerate(chain.sphere_body):
-        if body > 0 and chain.kind[body] == REVOLUTE:
+        if body > 0 and chain.kind[body] == REVOLUTE:  # by its own joint, it is its distance to the axis
             across = np.linalg.norm(np.cross(chain.axis[body], chain.offset[s]))
             assert levers[s, body - 1] == pytest.approx(across, abs=1e-12)
 

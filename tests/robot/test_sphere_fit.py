@@ -1,5 +1,6 @@
 """Fitted spheres: the cover is complete, proven and sampled; more spheres stick out less; the seed decides all."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -7,27 +8,20 @@ import pytest
 import trimesh
 
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.coverage import coverage_of_solids
-from splatctrl_cli.robot.link_meshes import read_solids
+from splatctrl_cli.robot.link_meshes import Solid, read_solids
 from splatctrl_cli.robot.sphere_files import read_spheres, spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 from tests.robot.shapes import BOX, ROD, arm_of, l_shape, written
 
+Solids = Mapping[str, tuple[Solid, ...]]
 
-def rough(
-    *, max_spheres: int | None = None, max_protrusion: float | None = None, max_deficit: float = 0.0, seed: int = 0
-) -> FitOptions:
+
+def rough(**options: float) -> FitOptions:
     """Options with few patches and candidates: as complete a cover, sooner found."""
-    return FitOptions(
-        max_spheres=max_spheres,
-        max_protrusion=max_protrusion,
-        max_deficit=max_deficit,
-        seed=seed,
-        restarts=2,
-        num_patches=400,
-        num_candidates=300,
-    )
+    return FitOptions(restarts=2, num_patches=400, num_candidates=300, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -37,46 +31,53 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> UrdfFile:
     return read_urdf(written(folder, arm_of('<mesh filename="ell.stl"/>', ROD)))
 
 
-def test_every_point_of_the_surface_is_in_a_sphere_of_its_link(urdf: UrdfFile, tmp_path: Path) -> None:
-    solids = read_solids(urdf)
-    fitted = fit_spheres(solids, rough(max_spheres=9))
-    (tmp_path / "s.yaml").write_text(spheres_yaml(fitted))
+@pytest.fixture(scope="module")
+def solids(urdf: UrdfFile) -> Solids:
+    return read_solids(urdf)
+
+
+@pytest.fixture(scope="module")
+def six(solids: Solids) -> SphereSet:
+    return fit_spheres(solids, rough(max_spheres=6))
+
+
+def test_every_point_of_the_surface_and_of_the_true_cylinder_is_in_a_sphere_of_its_link(
+    urdf: UrdfFile, solids: Solids, six: SphereSet, tmp_path: Path
+) -> None:
+    (tmp_path / "s.yaml").write_text(spheres_yaml(six))
     spheres = read_spheres(tmp_path / "s.yaml")
-    np.testing.assert_array_equal(spheres.radii, fitted.radii)
+    np.testing.assert_array_equal(spheres.radii, six.radii)
     report = coverage_of_solids(urdf, solids, spheres)
-    assert len(spheres.radii) <= 9
+    assert len(spheres.radii) <= 6
     assert all(link.is_covered for link in report.links)
     assert (report.max_deficit, report.uncovered_share) == (0.0, 0.0)
-    for link, (solid,) in solids.items():
+
+    def outside(points: Float64, link: str) -> float:
         member = np.array([owner == link for owner in spheres.links])
+        away = np.linalg.norm(points[:, None] - spheres.centers[member][None], axis=2) - spheres.radii[member]
+        return float(away.min(axis=1).max())
+
+    for link, (solid,) in solids.items():
         mesh = trimesh.Trimesh(solid.surface.vertices, solid.surface.faces, process=False)
         dense = np.asarray(trimesh.sample.sample_surface(mesh, 40_000, seed=3)[0])
         edges = solid.surface.corners.reshape(-1, 3)
         for points in (dense, edges, 0.5 * (edges + np.roll(edges, 1, axis=0))):
-            away = np.linalg.norm(points[:, None] - spheres.centers[member][None], axis=2) - spheres.radii[member]
-            assert away.min(axis=1).max() <= -solid.slack
-
-
-def test_the_true_cylinder_and_not_only_its_prism_is_covered(urdf: UrdfFile) -> None:
-    spheres = fit_spheres(read_solids(urdf), rough(max_spheres=6))
+            assert outside(points, link) <= -solid.slack
     angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, 2000), np.linspace(-0.2, 0.2, 41))
-    surface = np.stack([0.05 * np.cos(angle), 0.05 * np.sin(angle), height], axis=-1).reshape(-1, 3)
-    member = np.array([owner == "tip" for owner in spheres.links])
-    away = np.linalg.norm(surface[:, None] - spheres.centers[member][None], axis=2) - spheres.radii[member]
-    assert away.min(axis=1).max() <= 0
+    true = np.stack([0.05 * np.cos(angle), 0.05 * np.sin(angle), height], axis=-1).reshape(-1, 3)
+    assert outside(true, "tip") <= 0
 
 
-def test_more_spheres_stick_out_less_and_one_each_is_the_least(urdf: UrdfFile) -> None:
-    solids = read_solids(urdf)
+def test_more_spheres_stick_out_less_and_one_each_is_the_least(
+    urdf: UrdfFile, solids: Solids, six: SphereSet
+) -> None:
+    two, sixteen = (fit_spheres(solids, rough(max_spheres=count)) for count in (2, 16))
     protrusions = []
-    for count in (2, 6, 16):
-        spheres = fit_spheres(solids, rough(max_spheres=count))
+    for count, spheres in ((2, two), (6, six), (16, sixteen)):
         assert len(spheres.radii) <= count
         assert set(spheres.links) == {"base", "tip"}
         protrusions.append(coverage_of_solids(urdf, solids, spheres).max_protrusion)
     assert protrusions[0] > 1.5 * protrusions[1] > 2 * protrusions[2]
-    with pytest.raises(UsageError, match=r"1 spheres for 2 links .*; allow at least 2, one for each"):
-        fit_spheres(solids, rough(max_spheres=1))
 
 
 def test_one_ball_around_a_box_is_the_smallest_there_is(tmp_path: Path) -> None:
@@ -87,31 +88,24 @@ def test_one_ball_around_a_box_is_the_smallest_there_is(tmp_path: Path) -> None:
     np.testing.assert_allclose(spheres.radii, smallest, atol=5e-3)
 
 
-def test_a_protrusion_is_kept_by_few_spheres(urdf: UrdfFile) -> None:
-    solids = read_solids(urdf)
+def test_a_protrusion_is_kept_by_few_spheres(urdf: UrdfFile, solids: Solids) -> None:
     spheres = fit_spheres(solids, rough(max_protrusion=0.04))
     report = coverage_of_solids(urdf, solids, spheres)
     assert report.max_protrusion <= 0.04
     assert report.max_deficit == 0
     assert 3 <= len(spheres.radii) <= 30
-    with pytest.raises(UsageError, match=r"link 'base': largest protrusion: expected at least .* mm, got 0.1 mm"):
-        fit_spheres(solids, rough(max_protrusion=0.0001))
 
 
-def test_an_allowed_deficit_is_used_and_not_exceeded(urdf: UrdfFile) -> None:
-    solids = read_solids(urdf)
-    tight = coverage_of_solids(urdf, solids, fit_spheres(solids, rough(max_spheres=6)))
+def test_an_allowed_deficit_is_used_and_not_exceeded(urdf: UrdfFile, solids: Solids, six: SphereSet) -> None:
     loose = coverage_of_solids(urdf, solids, fit_spheres(solids, rough(max_spheres=6, max_deficit=0.01)))
-    assert loose.max_deficit is not None
     assert 0.008 < loose.max_deficit <= 0.01
-    assert loose.max_protrusion < tight.max_protrusion - 0.008
+    assert loose.max_protrusion < coverage_of_solids(urdf, solids, six).max_protrusion - 0.008
 
 
-def test_the_same_seed_gives_the_same_spheres(urdf: UrdfFile) -> None:
-    solids = read_solids(urdf)
-    one, again = (fit_spheres(solids, rough(max_spheres=7, seed=4)) for _ in range(2))
-    np.testing.assert_array_equal(one.centers, again.centers)
-    np.testing.assert_array_equal(one.radii, again.radii)
+def test_the_same_seed_gives_the_same_spheres(solids: Solids, six: SphereSet) -> None:
+    again = fit_spheres(solids, rough(max_spheres=6))
+    np.testing.assert_array_equal(six.centers, again.centers)
+    np.testing.assert_array_equal(six.radii, again.radii)
 
 
 def test_thin_and_open_shapes_are_covered_too(tmp_path: Path) -> None:
@@ -134,8 +128,10 @@ def test_thin_and_open_shapes_are_covered_too(tmp_path: Path) -> None:
         (FitOptions(max_spheres=5, max_protrusion=0.1), "not both"),
         (FitOptions(max_protrusion=float("nan")), "largest protrusion: expected 0 m or more, got nan"),
         (FitOptions(max_spheres=5, max_deficit=-1.0), "largest deficit: expected 0 m or more, got -1"),
+        (rough(max_spheres=1), "1 spheres for 2 links .*; allow at least 2, one for each"),
+        (rough(max_protrusion=0.0001), "link 'base': largest protrusion: expected at least .* mm, got 0.1 mm"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(urdf: UrdfFile, options: FitOptions, message: str) -> None:
+def test_options_that_make_no_sense_are_refused(solids: Solids, options: FitOptions, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        fit_spheres(read_solids(urdf), options)
+        fit_spheres(solids, options)

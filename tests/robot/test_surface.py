@@ -1,6 +1,7 @@
 """What a robot's own surface is made of: a capsule's parts, and meshes of packages elsewhere."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,9 +24,10 @@ TURNED = '<origin xyz="0.1 0.2 0.3" rpy="0.4 0.7 -0.5"/>'
 SPHERES = SphereSet(links=("base", "tip"), centers=np.zeros((2, 3)), radii=np.full(2, 0.3))
 
 
-def distance(model: RobotModel, points: Float64) -> Float64:
+def distance(model: RobotModel, points: Float64, **only: Any) -> Float64:
     surface, q = model.surface, np.zeros(1)
-    return surface.distance(surface.poses({link: model.frame_pose(q, link) for link in surface.links}), points)
+    poses = surface.poses({link: model.frame_pose(q, link) for link in surface.links})
+    return surface.distance(poses, points, **only)
 
 
 def test_a_capsule_is_a_cylinder_with_round_ends(tmp_path: Path) -> None:
@@ -99,19 +101,21 @@ def test_a_mesh_in_another_unit_is_refused_with_the_unit_that_it_looks_like(
 
 
 def test_what_stands_for_a_link_without_its_visual_geometry_is_said_with_the_reason(tmp_path: Path) -> None:
-    mesh = '<mesh filename="none.stl"/>'
-    urdf = written(tmp_path, seen_as(arm_of(BALL, BALL), mesh))
-    lost = f"{urdf}: link 'base': mesh none.stl was not found"
-    assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == (f"collision geometry stands for base: {lost}",)
-    urdf = written(tmp_path, arm_of(mesh, BALL))
-    assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == (f"spheres stand for base: {lost}",)
+    mesh, balls = '<mesh filename="none.stl"/>', arm_of(BALL, BALL)
+    lost = f"{tmp_path / 'robot.urdf'}: link 'base': mesh none.stl was not found"
     alone = SphereSet(links=("tip",), centers=np.zeros((1, 3)), radii=np.full(1, 0.3))
-    assert RobotModel.from_urdf(urdf, alone).surface.notes == (f"nothing stands for base: {lost}",)
-    urdf = written(tmp_path, arm_of(BALL, BALL).replace("collision>", "inertial>"))
-    bare = "spheres stand for base, tip: no visual or collision geometry in the URDF"
-    assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == (bare,)
-    urdf = written(tmp_path, arm_of(BALL, BALL))
-    assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == ()
+    for text, spheres, notes in (
+        (seen_as(balls, mesh), SPHERES, (f"collision geometry stands for base: {lost}",)),
+        (arm_of(mesh, BALL), SPHERES, (f"spheres stand for base: {lost}",)),
+        (arm_of(mesh, BALL), alone, (f"nothing stands for base: {lost}",)),
+        (
+            balls.replace("collision>", "inertial>"),
+            SPHERES,
+            ("spheres stand for base, tip: no visual or collision geometry in the URDF",),
+        ),
+        (balls, SPHERES, ()),
+    ):
+        assert RobotModel.from_urdf(written(tmp_path, text), spheres).surface.notes == notes
 
 
 def with_visual(folder: Path, visual: str) -> RobotModel:
@@ -124,32 +128,26 @@ def with_visual(folder: Path, visual: str) -> RobotModel:
     return RobotModel.from_urdf(written(folder, text.replace('<link name="tip">', drawn)), spheres)
 
 
-def test_a_link_is_as_it_is_seen_and_as_it_collides_where_that_cannot_be_read(tmp_path: Path) -> None:
-    l_shape().export(tmp_path / "ell.stl")
-    seen, gone = with_visual(tmp_path, "ell.stl").surface, with_visual(tmp_path, "gone.stl").surface
-    assert len(seen.triangles) == len(l_shape().faces) and len(seen.kinds) == 1
-    assert not len(gone.triangles) and len(gone.kinds) == 2
-    assert seen.by_spheres == gone.by_spheres == ()
-
-
 def test_the_distance_to_a_mesh_is_exact_and_negative_inside(tmp_path: Path) -> None:
+    """A link is as it is seen, and as it collides where that cannot be read."""
     l_shape().export(tmp_path / "ell.stl")
-    model = with_visual(tmp_path, "ell.stl")
+    model, gone = with_visual(tmp_path, "ell.stl"), with_visual(tmp_path, "gone.stl").surface
+    assert len(model.surface.triangles) == len(l_shape().faces) and len(model.surface.kinds) == 1
+    assert not len(gone.triangles) and len(gone.kinds) == 2
+    assert model.surface.by_spheres == gone.by_spheres == ()
     points = np.random.default_rng(3).uniform(-0.1, 0.4, (400, 3)) + np.array([0, 0, 0.3])
     arms = [trimesh.creation.box(bounds=b) for b in ([[0, 0, 0], [0.3, 0.1, 0.1]], [[0, 0, 0], [0.1, 0.3, 0.1]])]
     gaps = []
     for arm in arms:
-        beyond = np.maximum(arm.bounds[0] - (points - [0, 0, 0.3]), (points - [0, 0, 0.3]) - arm.bounds[1])
+        there = points - [0, 0, 0.3]
+        beyond = np.maximum(arm.bounds[0] - there, there - arm.bounds[1])
         gaps.append(np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0))
     to_ball = np.linalg.norm(points, axis=1) - 0.02
     outside = np.min(gaps, axis=0) > 0
     found = distance(model, points)
     np.testing.assert_allclose(found[outside], np.minimum(np.min(gaps, axis=0), to_ball)[outside], atol=1e-6)
     assert (found[~outside] < 0).all() and np.sum(~outside) > 10
-    near = model.surface.distance(
-        model.surface.poses({link: model.frame_pose(np.zeros(1), link) for link in model.surface.links}),
-        points, within=0.05, without=["base"],
-    )  # fmt: skip
+    near = distance(model, points, within=0.05, without=["base"])
     is_far = np.min(gaps, axis=0) > 0.05 + 1e-6
     assert np.isinf(near[is_far]).all() and np.isfinite(near[~is_far]).all()
 

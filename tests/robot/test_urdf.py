@@ -34,11 +34,6 @@ def test_joints_without_proper_limits_are_refused(tmp_path: Path, limit: str, me
         read_urdf(path)
 
 
-def test_a_mesh_of_no_size_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="link 'base': mesh: scale: expected three numbers that are not 0"):
-        read_urdf(written(tmp_path, arm_of('<mesh filename="a.stl" scale="1 0 1"/>', BALL)))
-
-
 def test_a_joint_that_mimics_is_locked_with_its_leader(tmp_path: Path) -> None:
     text = arm_of(BALL, BALL).replace(
         "</robot>",

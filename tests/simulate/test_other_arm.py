@@ -28,22 +28,26 @@ from tests.simulate.limits import DURATIONS, assert_keeps_limits
 TEXTURE = Texture(pattern="noise", feature=0.05, dark=(0.1, 0.2, 0.3), bright=(0.9, 0.8, 0.7), seed=3)
 
 
+@pytest.fixture(autouse=True)
+def few_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turns of the tip that are tried, for speed."""
+    monkeypatch.setattr(fixed, "SIMULATED_TURNS", 2)
+
+
+def meshes(folder: Path, shape: str, T: Float64) -> Meshes:
+    """Of one link with that shape, at a pose."""
+    (solid,) = read_solids(read_urdf(written(folder, arm_of(shape, '<sphere radius="0.1"/>'))))["base"]
+    owners = np.zeros(len(solid.surface.faces), np.int16)
+    return Meshes(
+        links=("base",), triangles=solid.surface.corners, owners=owners, textures=(TEXTURE,), T_world_link=T[None]
+    )
+
+
 def test_a_mesh_is_seen_as_the_solid_of_the_same_shape(tmp_path: Path) -> None:
-    camera = tabletop.cameras(160, 120)[0]
     T = pose_at([0.4, 0.0, 0.2], [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
-    size = (0.2, 0.3, 0.25)
-    box = Primitive(name="box", kind="box", size=size, T_world_shape=T, texture=TEXTURE)
-    urdf = written(tmp_path, arm_of(f'<box size="{size[0]} {size[1]} {size[2]}"/>', '<sphere radius="0.1"/>'))
-    (solid,) = read_solids(read_urdf(urdf))["base"]
-    triangles = solid.surface.corners
-    mesh = Meshes(
-        links=("base",),
-        triangles=triangles,
-        owners=np.zeros(len(triangles), np.int16),
-        textures=(TEXTURE,),
-        T_world_link=np.eye(4)[None],
-    ).at({"base": T})
-    renderer = Renderer(camera, tabletop.furniture())
+    box = Primitive(name="box", kind="box", size=(0.2, 0.3, 0.25), T_world_shape=T, texture=TEXTURE)
+    mesh = meshes(tmp_path, '<box size="0.2 0.3 0.25"/>', np.eye(4)).at({"base": T})
+    renderer = Renderer(tabletop.cameras(160, 120)[0], tabletop.furniture())
     color, depth = renderer.image([box])
     color_mesh, depth_mesh = renderer.image([], mesh)
     is_box = depth != renderer.depth([])
@@ -55,23 +59,12 @@ def test_a_mesh_is_seen_as_the_solid_of_the_same_shape(tmp_path: Path) -> None:
 
 
 def test_faces_beyond_what_16_bits_number_are_seen_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    urdf = written(tmp_path, arm_of('<sphere radius="0.2"/>', '<sphere radius="0.1"/>'))
-    (ball,) = read_solids(read_urdf(urdf))["base"]
-    triangles = ball.surface.corners
-    T = pose_at([0.4, 0.0, 0.2])
-    mesh = Meshes(
-        links=("base",),
-        triangles=triangles,
-        owners=np.zeros(len(triangles), np.int16),
-        textures=(TEXTURE,),
-        T_world_link=T[None],
-    )
+    mesh = meshes(tmp_path, '<sphere radius="0.2"/>', pose_at([0.4, 0.0, 0.2]))
     renderer = Renderer(tabletop.cameras(80, 60)[1], [])
     whole = renderer.image([], mesh)
     monkeypatch.setattr("splatctrl_cli.simulate.render.FACES_AT_ONCE", 100)
-    parted = renderer.image([], mesh)
-    np.testing.assert_array_equal(whole[0], parted[0])
-    np.testing.assert_array_equal(whole[1], parted[1])
+    for before, after in zip(whole, renderer.image([], mesh), strict=True):
+        np.testing.assert_array_equal(before, after)
 
 
 def test_the_hand_is_where_the_model_of_the_arm_has_it(plain_arm: Path) -> None:
@@ -88,9 +81,12 @@ def ur10e(folder: Path, text: str = "") -> RobotModel:
 
 
 @pytest.mark.parametrize(
-    ("scene", "duration"), [(Scene.of(RecordingOptions()), 7.0), (scene_of("near-goal", 0), 24.0)]
+    ("scene", "duration", "turns"), [(Scene.of(RecordingOptions()), 7.0, 2), (scene_of("near-goal", 0), 24.0, 4)]
 )
-def test_an_arm_of_six_joints_goes_where_ours_goes(tmp_path: Path, scene: Scene, duration: float) -> None:
+def test_an_arm_of_six_joints_goes_where_ours_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: Scene, duration: float, turns: int
+) -> None:
+    monkeypatch.setattr(fixed, "SIMULATED_TURNS", turns)
     model = ur10e(tmp_path)
     motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
     np.testing.assert_array_equal(motion.times, scene.motion.times)
@@ -98,8 +94,7 @@ def test_an_arm_of_six_joints_goes_where_ours_goes(tmp_path: Path, scene: Scene,
         hand, tip = hand_pose(ours), model.frame_pose(theirs, "tool0")
         np.testing.assert_allclose(tip[:3, 3], hand[:3, 3], atol=2e-3)
         assert tip[:3, 2] @ hand[:3, 2] > 0.999
-    seconds = np.linspace(0, duration, 200)
-    velocity = np.array([motion.at(second)[1] for second in seconds])
+    velocity = np.array([motion.at(second)[1] for second in np.linspace(0, duration, 200)])
     assert np.all(np.abs(velocity) <= model.velocity_limit)
 
 
@@ -124,8 +119,7 @@ def test_a_small_arm_goes_as_far_as_it_reaches_and_a_tiny_one_is_refused(tmp_pat
         adapted_motion(scene, tiny, SelfSurfaces(tiny, {}))
 
 
-def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fixed, "SIMULATED_TURNS", 2)
+def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path) -> None:
     model, scene = ur10e(tmp_path), Scene.of(RecordingOptions(is_free=True))
     motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
     seconds = np.linspace(0, 7, 300)
@@ -148,11 +142,8 @@ def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path, monkeypatch
         adapted_motion(scene, model, meeting)
 
 
-@pytest.mark.parametrize("duration", DURATIONS)
-def test_another_arm_keeps_its_velocity_limits_in_any_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, duration: float
-) -> None:
-    monkeypatch.setattr(fixed, "SIMULATED_TURNS", 2)
+@pytest.mark.parametrize("duration", DURATIONS[::2])
+def test_another_arm_keeps_its_velocity_limits_in_any_time(tmp_path: Path, duration: float) -> None:
     model, options = ur10e(tmp_path), RecordingOptions(duration_s=duration, fps=10.0)
     scene = Scene.of(options)
     motion = adapted_motion(scene, model, SelfSurfaces(model, {}))

@@ -34,7 +34,7 @@ def solid(kind: str, T_world_shape: Float64 | None = None) -> Primitive:
     return Primitive(name=kind, kind=kind, size=SIZES[kind], T_world_shape=pose, texture=PLAIN)
 
 
-def surface_samples(kind: str, rng: np.random.Generator, count: int = 200_000) -> Float64:
+def surface_samples(kind: str, rng: np.random.Generator, count: int = 100_000) -> Float64:
     """Points on the surface, in the solid's own frame."""
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -93,20 +93,14 @@ def test_distance_agrees_with_dense_samples_of_the_surface(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_closest_point_lies_on_the_surface_at_the_distance(kind: str) -> None:
-    points = np.random.default_rng(2).uniform(-0.7, 0.7, (500, 3)) + TILTED[:3, 3]
+def test_the_closest_point_lies_on_the_surface_at_the_distance_which_moves_with_the_solid(kind: str) -> None:
+    local = np.random.default_rng(2).uniform(-0.7, 0.7, (500, 3))
+    points = transform_points(TILTED, local)
     distance, surface = closest_point(solid(kind, TILTED), points)
+    np.testing.assert_allclose(distance, signed_distance(solid(kind), local), atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(points - surface, axis=1), np.abs(distance), atol=1e-12)
     np.testing.assert_allclose(signed_distance(solid(kind, TILTED), surface), 0, atol=1e-12)
-    assert (distance < 0).any()
-    assert (distance > 0).any()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_distance_moves_with_the_solid(kind: str) -> None:
-    points = np.random.default_rng(3).uniform(-0.7, 0.7, (100, 3))
-    moved = signed_distance(solid(kind, TILTED), transform_points(TILTED, points))
-    np.testing.assert_allclose(moved, signed_distance(solid(kind), points), atol=1e-12)
+    assert (distance < 0).any() and (distance > 0).any()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -124,11 +118,7 @@ def test_a_ray_stops_where_the_distance_first_becomes_zero(kind: str) -> None:
     assert signed_distance(shape, before.reshape(-1, 3)).min() > 0
     along = origin + np.linspace(0, 2, 400)[:, None, None] * directions[~is_hit]
     assert signed_distance(shape, along.reshape(-1, 3)).min() > -1e-3
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_nothing_behind_the_camera_is_hit(kind: str) -> None:
-    assert np.isinf(hit(solid(kind), np.array([2.0, 0, 0]), np.array([[1.0, 0, 0]]))[0])
+    assert np.isinf(hit(shape, origin, -directions)).all(), "behind the camera"
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -151,20 +141,6 @@ def test_a_solid_is_present_from_its_first_stamp_to_before_its_last() -> None:
         name="a", kind="sphere", size=(1.0,), T_world_shape=np.eye(4), texture=PLAIN, from_ns=10, to_ns=20
     )
     assert [shape.is_present(t) for t in (9, 10, 19, 20)] == [False, True, True, False]
-
-
-def test_a_capsule_is_as_far_as_the_nearest_place_of_its_axis() -> None:
-    """Against the minimum over the axis in float64, found by ternary search."""
-    points = np.random.default_rng(6).uniform(-0.7, 0.7, (300, 3))
-    low, high = np.full(300, -0.15), np.full(300, 0.15)
-    for _ in range(120):
-        a, b = low + (high - low) / 3, high - (high - low) / 3
-        is_lower = np.hypot(np.hypot(*points[:, :2].T), points[:, 2] - a) < np.hypot(
-            np.hypot(*points[:, :2].T), points[:, 2] - b
-        )
-        low, high = np.where(is_lower, low, a), np.where(is_lower, b, high)
-    expected = np.hypot(np.hypot(*points[:, :2].T), points[:, 2] - low) - 0.2
-    np.testing.assert_allclose(signed_distance(solid("capsule"), points), expected, atol=1e-12)
 
 
 def track() -> Track:
