@@ -45,13 +45,6 @@ def test_a_gate_that_fails_leaves_the_scores_and_exits_1(scored: Path, capsys: p
     assert (scored / "score" / "score.json").is_file()
 
 
-def test_a_gate_on_an_unknown_metric_is_refused_before_anything_is_rendered(
-    scored: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(FakeScene, "splats_at", lambda scene, stamp_ns: pytest.fail("rendered"))
-    assert run(scored, "--require", "num_skipped<=1", "--require", "sharpness>=1") == 2
-
-
 def test_damaged_input_exits_3(scored: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     set_up(monkeypatch, FakeScene(), FakeSource(frames=FRAMES, loss=LossReport(damaged=1)))
     assert run(scored) == 3

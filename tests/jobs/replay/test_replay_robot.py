@@ -221,14 +221,14 @@ def test_blocks_of_any_size_give_the_same_files(
 ) -> None:
     move = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     desk.source.states = [
-        JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=move) for s in logged(START + move, num=24)
+        JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=move) for s in logged(START + move, num=13)
     ]
     near = ((0.45, 0.1, 0.6), 0.05)
     scene = write_scene(
         desk.folder / "scene",
         (SECOND // 5, splats_of(BALL)),
-        (SECOND, splats_of(BALL, near)),
-        (SECOND * 2, splats_of(BALL)),
+        (SECOND // 2, splats_of(BALL, near)),
+        (SECOND, splats_of(BALL)),
     )
     document = json.loads((sample_data / "tabletop" / "truth.json").read_text())
     stamps = [state.stamp_ns for state in desk.source.states]

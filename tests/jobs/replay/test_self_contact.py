@@ -17,6 +17,7 @@ from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, close
 from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, measured_robot
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.records import Float64, JointState, SphereSet
+from splatctrl_cli.robot import self_margins
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import spheres_yaml
@@ -54,6 +55,7 @@ def desk_of(
     folder: Path, monkeypatch: pytest.MonkeyPatch, spheres: SphereSet, *postures: Float64, urdf: str = URDF
 ) -> Desk:
     """A replay of the folding arm from posture to posture, 20 states on each way."""
+    monkeypatch.setattr(self_margins, "SELF_POSTURES", 1000)
     ways = [a + (b - a) * t for a, b in pairwise(postures) for t in np.linspace(0, 1, 20)]
     states = [JointState(stamp_ns=k * SECOND // 50, position=q, velocity=0 * q) for k, q in enumerate(ways)]
     source = FakeSource(states=states, joint_names=tuple(re.findall(r'joint name="(\w+)"', urdf)))
