@@ -203,33 +203,23 @@ FILE_WRITERS = ("calibrate", "export", "query", "report", "view", "robot")  # th
 
 
 @pytest.mark.parametrize("command", WRITERS)
-def test_an_output_that_exists_is_kept_without_force(work: Work, tmp_path: Path, command: str) -> None:
-    out = tmp_path / "out"
-    file = out if command in FILE_WRITERS else out / "run.json"
+@pytest.mark.parametrize("what", ["there already", "of somebody else", "below a file"])
+def test_an_output_that_exists_or_cannot_be_written_is_refused(
+    work: Work, tmp_path: Path, command: str, what: str
+) -> None:
+    """Also with --force what no command wrote is kept."""
+    is_file = command in FILE_WRITERS
+    not_ours = "is a folder, expected a file" if is_file else "was not written by splatctrl (no run.json)"
+    there, out, force, said = {
+        "there already": ("out" if is_file else "out/run.json", "out", [], ["out: already exists; give --force"]),
+        "of somebody else": ("out/precious", "out", ["--force"], [not_ours, "another --out"]),
+        "below a file": ("file", "file/out", [], ["cannot be written", "another --out"]),
+    }[what]
+    file = tmp_path / there
     file.parent.mkdir(exist_ok=True)
     file.write_text("precious")
-    done = splatctrl(*work.arguments(command, out), "-q")
-    assert_refused(done, 2, "out: already exists; give --force")
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file]
-    assert file.read_text() == "precious"
-
-
-@pytest.mark.parametrize("command", WRITERS)
-def test_force_keeps_what_no_command_wrote(work: Work, tmp_path: Path, command: str) -> None:
-    precious = tmp_path / "out" / "precious"
-    precious.parent.mkdir()
-    precious.write_text("mine")
-    said = "is a folder, expected a file" if command in FILE_WRITERS else "was not written by splatctrl (no run.json)"
-    assert_refused(splatctrl(*work.arguments(command, precious.parent), "-q", "--force"), 2, said, "another --out")
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [precious]
-
-
-@pytest.mark.parametrize("command", WRITERS)
-def test_an_output_below_a_file_cannot_be_written(work: Work, tmp_path: Path, command: str) -> None:
-    (tmp_path / "file").write_text("no folder")
-    done = splatctrl(*work.arguments(command, tmp_path / "file" / "out"), "-q")
-    assert_refused(done, 2, "cannot be written", "another --out")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert_refused(splatctrl(*work.arguments(command, tmp_path / out), "-q", *force), 2, *said)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file] and file.read_text() == "precious"
 
 
 @pytest.mark.parametrize(

@@ -20,17 +20,9 @@ from tests.scene.wall import INTRINSICS, frame
 FAST = ["--max-splats", "800", "--set", "scene.first_iterations=30", "--set", "scene.iterations_per_step=5", "-q"]
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recording") / "small"
-    size = ["--duration", "0.7", "--width", "96", "--height", "72"]
-    assert main(["simulate", "-o", str(folder), *size, "--dtu", "-q"]) == 0
-    return folder
-
-
-def reconstruct(recording: Path, out: Path, *options: str) -> int:
-    robot = ["--urdf", str(recording / "robot.urdf"), "--spheres", str(recording / "robot_spheres.yaml")]
-    log = [str(recording / "log.mcap"), "--cameras", "cam0,cam1"]
+def reconstruct(small_recording: Path, out: Path, *options: str) -> int:
+    robot = ["--urdf", str(small_recording / "robot.urdf"), "--spheres", str(small_recording / "robot_spheres.yaml")]
+    log = [str(small_recording / "log.mcap"), "--cameras", "cam0,cam1"]
     return main(["reconstruct", *log, *robot, "-o", str(out), *FAST, *options])
 
 
@@ -42,20 +34,20 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_one_thread_and_two_give_the_same_bytes(recording: Path, tmp_path: Path) -> None:
+def test_one_thread_and_two_give_the_same_bytes(small_recording: Path, tmp_path: Path) -> None:
     for name, threads in (("one", "1"), ("two", "2")):
-        assert reconstruct(recording, tmp_path / name, "--threads", threads) == 0
+        assert reconstruct(small_recording, tmp_path / name, "--threads", threads) == 0
     one = contents(tmp_path / "one")
     assert set(one) > {"splats.ply", "occupancy.npz", "audit.jsonl", "snapshots.csv", "checkpoint/state.npz"}
     assert one == contents(tmp_path / "two")
-    assert reconstruct(recording, tmp_path / "other", "--seed", "1") == 0
+    assert reconstruct(small_recording, tmp_path / "other", "--seed", "1") == 0
     assert contents(tmp_path / "other")["splats.ply"] != one["splats.ply"]
 
 
 def test_views_that_trained_a_scene_are_not_scored_as_held_out(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    small_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scene, dtu = str(tmp_path / "scene"), str(recording / "dtu")
+    scene, dtu = str(tmp_path / "scene"), str(small_recording / "dtu")
     fast = [*FAST, "--set", "scene.refine_iterations=20"]
     assert main(["reconstruct", "--dtu", dtu, "--holdout", "1", "-o", scene, *fast]) == 0
     assert main(["score", scene, "--dtu", dtu, "--holdout", "1", "-q"]) == 0

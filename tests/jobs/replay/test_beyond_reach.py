@@ -133,16 +133,14 @@ def test_a_score_shows_the_shell_and_keeps_its_depth(tmp_path: Path, monkeypatch
     assert [views[True][name] for name in kept] == [views[False][name] for name in kept]
 
 
-def test_a_recording_with_a_robot_has_a_shell_and_counts_it_apart(tmp_path: Path) -> None:
-    small = ["--duration", "0.8", "--width", "96", "--height", "72", "-q"]
-    assert main(["simulate", "-o", str(tmp_path / "log"), *small]) == 0
+def test_a_recording_with_a_robot_has_a_shell_and_counts_it_apart(small_recording: Path, tmp_path: Path) -> None:
     fast = ["--max-splats", "400", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4", "-q"]
-    log = [str(tmp_path / "log" / "log.mcap"), "--cameras", "cam1,cam2", *fast]
+    log = [str(small_recording / "log.mcap"), "--cameras", "cam1,cam2", *fast]
     robot = [
         "--urdf",
-        str(tmp_path / "log" / "robot.urdf"),
+        str(small_recording / "robot.urdf"),
         "--spheres",
-        str(tmp_path / "log" / "robot_spheres.yaml"),
+        str(small_recording / "robot_spheres.yaml"),
     ]
     found = {}
     for name, more in (("with", robot), ("without", [*robot, "--set", "scene.shell=0"])):

@@ -86,6 +86,13 @@ def scene(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ["--scene", str(folder), *FAR, "-q"]
 
 
+def judged(desk: Desk, scene: list[str], frames: list[RgbdFrame], code: int = 0) -> Any:
+    """The metrics of an audit that ends with this code, where cam9 recorded these frames."""
+    desk.source = FilmedSource(states=logged(), frames=frames)
+    assert desk.replay(*scene, "--evidence", "cam9", "--force", is_judged=True) == code
+    return desk.metrics()
+
+
 def reason(desk: Desk, criterion: str = "map error") -> dict[str, Any]:
     (found,) = [reason for reason in desk.verdict()["reasons"] if reason["criterion"] == criterion]
     return found
@@ -117,10 +124,9 @@ def test_a_bound_larger_than_the_clearance_alone_turns_the_verdict(
     least = clearance(arm, START)
     misses = MISSES.copy()
     misses[6] = least + 0.02
-    desk.source = FilmedSource(states=logged(), frames=showing(misses))
     assert desk.replay(*scene, is_judged=True) == 0
-    assert desk.replay(*scene, "--evidence", "cam9", out="with", is_judged=True) == 5
-    verdict = desk.verdict("with")
+    judged(desk, scene, showing(misses), 5)
+    verdict = desk.verdict()
     assert verdict["label"] == "not evaluable"
     (broken,) = [reason for reason in verdict["reasons"] if reason["outcome"] != "passed"]
     assert broken["criterion"] == "map error"
@@ -128,8 +134,7 @@ def test_a_bound_larger_than_the_clearance_alone_turns_the_verdict(
     assert broken["place"] == pytest.approx([*BALL[0][:2], BALL[0][2] + BALL[1] + misses[6]], abs=2e-3)
     assert broken["value"] == pytest.approx(-0.02, abs=1e-3)
     misses[6] = least - 0.005
-    desk.source = FilmedSource(states=logged(), frames=showing(misses))
-    assert desk.replay(*scene, "--evidence", "cam9", out="less", is_judged=True) == 0
+    judged(desk, scene, showing(misses))
 
 
 def test_a_contact_outranks_it(desk: Desk, scene: list[str], arm: RobotModel) -> None:
@@ -154,10 +159,8 @@ def test_without_evidence_the_sentence_says_so_and_a_request_can_ask_for_it(desk
 
 
 def test_too_few_stretches_are_no_bound(desk: Desk, scene: list[str]) -> None:
-    desk.source = FilmedSource(states=logged(), frames=showing(MISSES)[:1])
-    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 5
+    assert judged(desk, scene, showing(MISSES)[:1], 5)["map_error_bound"] is None
     assert "of 1 held-out frame sets in the judged time 1 show surface" in reason(desk)["sentence"]
-    assert desk.metrics()["map_error_bound"] is None
     assert "map error not measured" in desk.verdict()["notes"]
 
 
@@ -178,22 +181,19 @@ def test_what_shows_the_robot_is_no_surface_that_the_map_misses(
     centers, radii = arm.sphere_centers(START), arm.sphere_set.radii
     top = int(np.argmax(centers[:, 2] + radii))
     eye = centers[top] + [0.0, 0.0, 1.0]
-    frames = [view(k * SECOND // 10, 1.0 - radii[top] - 0.02, eye=eye) for k in range(11)]
-    desk.source = FilmedSource(states=logged(), frames=frames)
-    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 5
+    on, beside = (
+        [view(k * SECOND // 10, 1.0 - radii[top] - gap, eye=eye) for k in range(11)] for gap in (0.02, 0.05)
+    )
+    judged(desk, scene, on, 5)
     assert "0 show surface" in desk.verdict()["sentence"]
-    beside = [view(k * SECOND // 10, 1.0 - radii[top] - 0.05, eye=eye) for k in range(11)]
-    desk.source = FilmedSource(states=logged(), frames=beside)
-    assert desk.replay(*scene, "--evidence", "cam9", out="beside") == 0
-    assert desk.metrics("beside")["map_error_bound"] > 0.2
+    assert judged(desk, scene, beside, 5)["map_error_bound"] > 0.2
 
 
 def test_pixels_at_an_edge_of_depth_are_left_out(desk: Desk, scene: list[str]) -> None:
     depth = np.full(SIZE[::-1], 1.0 - BALL[1] - 0.004)
     depth[:, 3] = 0.7  # flies between two surfaces, 25 cm before the ball
-    desk.source = FilmedSource(states=logged(), frames=[view(k * SECOND // 10, depth) for k in range(11)])
-    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
-    assert desk.metrics()["map_error_bound"] == pytest.approx(0.004, abs=1e-4)
+    metrics = judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])
+    assert metrics["map_error_bound"] == pytest.approx(0.004, abs=1e-4)
     assert reason(desk)["count"] == 11 * SIZE[1] * (SIZE[0] - 3)
 
 
@@ -201,13 +201,10 @@ def test_the_largest_miss_of_a_view_counts_and_a_map_that_is_too_fat_misses_noth
     desk: Desk, scene: list[str]
 ) -> None:
     depth = np.full(SIZE[::-1], 1.0 - BALL[1] + 0.002)  # within the ball
-    desk.source = FilmedSource(states=logged(), frames=[view(k * SECOND // 10, depth) for k in range(11)])
-    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
-    assert desk.metrics()["map_error_bound"] == 0.0
+    assert judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])["map_error_bound"] == 0.0
     depth[4, 5] = 1.0 - BALL[1] - 0.013
-    desk.source = FilmedSource(states=logged(), frames=[view(k * SECOND // 10, depth) for k in range(11)])
-    assert desk.replay(*scene, "--evidence", "cam9", out="one", is_judged=True) == 0
-    assert desk.metrics("one")["map_error_bound"] == pytest.approx(0.013, abs=1e-4)
+    metrics = judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])
+    assert metrics["map_error_bound"] == pytest.approx(0.013, abs=1e-4)
 
 
 def test_what_spheres_leave_of_the_robot_uncovered_is_the_robot_as_well(
@@ -319,9 +316,7 @@ def test_the_map_of_evidence_is_the_one_that_states_before_it_were_judged_by(des
         desk.folder / "grown", (0, splats_of(low)), (SECOND // 2, splats_of(BALL)), (SECOND, splats_of(BALL))
     )
     frames = [view(k * SECOND // 10, 1.0 - BALL[1]) for k in (5, 6, 8, 10)]  # from 0.5 s on, as it is then
-    desk.source = FilmedSource(states=logged(), frames=frames)
-    assert desk.replay("--scene", str(grown), *scene[2:], "--evidence", "cam9") == 0
-    assert desk.metrics()["map_error_bound"] == pytest.approx(0.03, abs=1e-4)
-    desk.source = FilmedSource(states=logged(), frames=frames[1:])
-    assert desk.replay("--scene", str(grown), *scene[2:], "--evidence", "cam9", out="later") == 0
-    assert desk.metrics("later")["map_error_bound"] == pytest.approx(0.0, abs=1e-4)
+    for shown, bound in ((frames, 0.03), (frames[1:], 0.0)):
+        desk.source = FilmedSource(states=logged(), frames=shown)
+        assert desk.replay("--scene", str(grown), *scene[2:], "--evidence", "cam9", "--force") == 0
+        assert desk.metrics()["map_error_bound"] == pytest.approx(bound, abs=1e-4)
