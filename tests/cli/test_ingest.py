@@ -77,12 +77,10 @@ def test_info_says_for_people_and_in_json_what_is_there_and_what_is_missing(
     log = make_log(tmp_path / "log.mcap", LogRecipe(has_depth=False))
     code, printed, _ = run(capsys, "info", log)
     assert code == 0
-    assert "missing for a reconstruction: no depth topic" in printed
-    assert "/joint_states" in printed
+    assert "missing for a reconstruction: no depth topic" in printed and "/joint_states" in printed
     code, printed, _ = run(capsys, "info", log, "--json")
     result = json.loads(printed)
-    assert result["kind"] == "MCAP"
-    assert result["missing"][0].startswith("no depth topic")
+    assert result["kind"] == "MCAP" and result["missing"][0].startswith("no depth topic")
     assert {row["topic"] for row in result["topics"]} >= {"/tf", "/joint_states"}
 
 
@@ -91,8 +89,7 @@ def test_info_keeps_names_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / "run.json").write_text(json.dumps(given))
     code, printed, _ = run(capsys, "info", tmp_path / "run.json")
     assert code == 0
-    assert "\n    robot_spheres.yaml: 12ab\n" in printed
-    assert "\n    max_splats: 5\n" in printed
+    assert "\n    robot_spheres.yaml: 12ab\n" in printed and "\n    max_splats: 5\n" in printed
     assert "\n  stamp_ns: -\n" in printed
 
 
@@ -180,8 +177,7 @@ def test_a_camera_that_sees_a_wall_elsewhere_is_an_error(tmp_path: Path, capsys:
     assert (code, finding["code"], finding["where"]) == (1, "agreement", "cameras cam0 and cam1")
     assert "poses are off, or so little depth is left" in finding["remedy"]
     assert finding["value"] == pytest.approx(100)
-    assert "agreement" in result["commands"]["reconstruct"][0]
-    assert result["commands"]["ingest"] == []
+    assert "agreement" in result["commands"]["reconstruct"][0] and result["commands"]["ingest"] == []
 
 
 @pytest.mark.parametrize(

@@ -141,8 +141,7 @@ def test_a_camera_that_jumps_is_refused_by_distance_and_stamps(
     assert reconstruct_folder(description, tmp_path / "scene", "-q") == 4
     err = capsys.readouterr().err
     assert "camera cam0 jumps by 3.00 m from stamp 200000000 to 400000000 ns, 0.2 s later" in err
-    assert "--max-pose-jump 3.01" in err
-    assert err.count("\n") == 1
+    assert "--max-pose-jump 3.01" in err and err.count("\n") == 1
     assert not (tmp_path / "scene").exists()
     assert reconstruct_folder(description, tmp_path / "scene", "-q", "--max-pose-jump", "3.01") == 0
     still = write_folder(tmp_path / "still", views, has_clock=False)  # views of a still scene may lie anywhere
@@ -163,11 +162,8 @@ def test_cameras_that_disagree_are_refused_before_anything_is_fitted(
     description = write_folder(tmp_path / "in", two_cameras(0.09), has_clock=has_clock)
     assert reconstruct_folder(description, tmp_path / "scene", "-q") == 4
     err = capsys.readouterr().err
-    assert "camera cam0 and cam1: depths disagree by 90 mm" in err
-    assert "expected at most 30 mm" in err
-    assert CAUSES in err
-    assert "--cameras cam0" in err
-    assert "--allow-disagreement" in err
+    assert "camera cam0 and cam1: depths disagree by 90 mm" in err and "expected at most 30 mm" in err
+    assert CAUSES in err and "--cameras cam0" in err and "--allow-disagreement" in err
     assert err.count("\n") == 1
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
     assert reconstruct_folder(description, tmp_path / "one", "-q", "--cameras", "cam0") == 0

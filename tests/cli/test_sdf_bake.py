@@ -57,8 +57,7 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
     result = splatctrl(
         "sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--require", "num_splats>1000000"
     )
-    assert result.returncode == 1
-    assert "num_splats is 600, required > 1e+06" in result.stdout
+    assert result.returncode == 1 and "num_splats is 600, required > 1e+06" in result.stdout
     assert (tmp_path / "field" / "field.npz").exists()
 
 
@@ -156,8 +155,7 @@ def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
     assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
     assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
     assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
-    assert tuple(FORMATS) == scene_options.SPLAT_FORMATS
-    assert tuple(baker.CHANNELS) == scene_options.CHANNELS
+    assert tuple(FORMATS) == scene_options.SPLAT_FORMATS and tuple(baker.CHANNELS) == scene_options.CHANNELS
     assert scene_options.CHANNELS[:4] == baker.DEFAULT_CHANNELS
 
 
@@ -186,11 +184,9 @@ def test_the_field_that_is_updated_is_not_replaced(tmp_path: Path, splats: Path)
     given = ["sdf-bake", splats, "-o", field, "--voxel", 0.1, *COARSE, "--formats", "npz", "--no-report"]
     assert splatctrl(*given).returncode == 0
     again = splatctrl(*given, "--update", field, "--force")
-    assert again.returncode == 2
-    assert "would replace the input" in again.stderr
+    assert again.returncode == 2 and "would replace the input" in again.stderr
     updated = splatctrl(*given, "--update", field, "-o", tmp_path / "same")
-    assert updated.returncode == 0
-    assert "blocks baked" in updated.stdout
+    assert updated.returncode == 0 and "blocks baked" in updated.stdout
     assert (tmp_path / "same" / "field.npz").read_bytes() == (field / "field.npz").read_bytes()
 
 
@@ -203,5 +199,4 @@ def test_resume_goes_on_with_what_is_left(tmp_path: Path, splats: Path, monkeypa
     assert f"field.partial is kept; continue it with: splatctrl sdf-bake --resume {splats} " in stopped.stderr
     monkeypatch.setattr(Baker, "bake", None)  # nothing is left to bake
     resumed = splatctrl(*given, "--resume")
-    assert resumed.returncode == 0
-    assert "continues after" in resumed.stderr
+    assert resumed.returncode == 0 and "continues after" in resumed.stderr

@@ -51,8 +51,7 @@ def test_what_is_within_reach_of_a_sphere_anywhere_in_its_cell_is_near() -> None
     swept = evidence.Swept(np.zeros((1, 3)), np.array([0.05]), reach=0.1)
     corners = SPHERE_CELL * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 1]])
     reached = corners + 0.149 * np.array([[-1.0, 0, 0], [1, 0, 0], [3**-0.5] * 3])
-    assert len(swept.near(reached)) == 3
-    assert len(swept.near(np.array([[0.22, 0.0, 0.0]]))) == 0
+    assert len(swept.near(reached)) == 3 and len(swept.near(np.array([[0.22, 0.0, 0.0]]))) == 0
 
 
 def view(stamp_ns: int, depth: float | Float64, eye: Float64 = FROM, camera: str = "cam9") -> RgbdFrame:
@@ -105,8 +104,7 @@ def test_the_bound_is_that_of_what_the_map_misses(desk: Desk, scene: list[str]) 
     assert metrics["map_error_bound"] == pytest.approx(MISSES.max(), abs=1e-4)
     assert metrics["map_error_blocks"] == expected.num_stretches >= 4
     assert metrics["map_error_confidence"] == pytest.approx(expected.num_stretches / (expected.num_stretches + 1))
-    assert reason(desk)["outcome"] == "passed"
-    assert reason(desk)["count"] == len(MISSES) * SIZE[0] * SIZE[1]
+    assert reason(desk)["outcome"] == "passed" and reason(desk)["count"] == len(MISSES) * SIZE[0] * SIZE[1]
     assert f"map error at most {1e3 * metrics['map_error_bound']:.1f} mm with" in desk.verdict()["sentence"]
 
 
@@ -129,8 +127,7 @@ def test_a_bound_larger_than_the_clearance_alone_turns_the_verdict(
     verdict = desk.verdict()
     assert verdict["label"] == "not evaluable"
     (broken,) = [reason for reason in verdict["reasons"] if reason["outcome"] != "passed"]
-    assert broken["criterion"] == "map error"
-    assert broken["time_s"] == pytest.approx(0.6)
+    assert broken["criterion"] == "map error" and broken["time_s"] == pytest.approx(0.6)
     assert broken["place"] == pytest.approx([*BALL[0][:2], BALL[0][2] + BALL[1] + misses[6]], abs=2e-3)
     assert broken["value"] == pytest.approx(-0.02, abs=1e-3)
     misses[6] = least - 0.005
@@ -142,13 +139,11 @@ def test_a_contact_outranks_it(desk: Desk, scene: list[str], arm: RobotModel) ->
     splats = splats_of(BALL, ((x, y, z), 0.02))
     touched = write_scene(desk.folder / "touched", (0, splats), (SECOND, splats))
     assert desk.replay("--scene", str(touched), *scene[2:], "--evidence", "cam9", is_judged=True) == 1
-    assert desk.verdict()["label"] == "contact"
-    assert reason(desk)["outcome"] == "not evaluable"
+    assert desk.verdict()["label"] == "contact" and reason(desk)["outcome"] == "not evaluable"
 
 
 def test_without_evidence_the_sentence_says_so_and_a_request_can_ask_for_it(desk: Desk, scene: list[str]) -> None:
-    assert desk.replay(*scene, is_judged=True) == 0
-    assert "map error not measured" in desk.verdict()["sentence"]
+    assert desk.replay(*scene, is_judged=True) == 0 and "map error not measured" in desk.verdict()["sentence"]
     assert {desk.metrics()[f"map_error_{name}"] for name in ("bound", "blocks", "confidence")} == {None}
     assert desk.replay(*scene, "--require-evidence", out="asked", is_judged=True) == 5
     assert desk.verdict("asked")["reasons"][0]["criterion"] == "map error"
@@ -288,8 +283,7 @@ def test_every_set_either_trains_or_is_evidence(recording: Path) -> None:
     for every in (2, 3, 5):
         given = list(time_steps(source.records(), source.cameras, has_clock=True))
         kept, left = [s.stamp_ns for s in trained(given, every)], [s.stamp_ns for s in held_out(given, every)]
-        assert sorted(kept + left) == steps and not set(kept) & set(left)
-        assert left == steps[every - 1 :: every]
+        assert sorted(kept + left) == steps and not set(kept) & set(left) and left == steps[every - 1 :: every]
 
 
 @pytest.mark.parametrize("evidence", ["2", "cam3"])

@@ -247,8 +247,7 @@ def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_fiel
         )
         gap = np.linalg.norm(points[:, None] - centers.astype(np.float64), axis=2) - radii.astype(np.float64)
         certified = certified_distance(fields)(points)
-        assert np.all(certified < gap.min(axis=1))
-        assert np.all(certified > gap.min(axis=1) - 3e-5)
+        assert np.all(certified < gap.min(axis=1)) and np.all(certified > gap.min(axis=1) - 3e-5)
         near = points + random.normal(size=points.shape) * 2e-3
         change = np.abs(fields.barrier.query(near)[0] - fields.barrier.query(points)[0])
         steepest = max(steepest, float(np.max(change / np.linalg.norm(near - points, axis=1))))

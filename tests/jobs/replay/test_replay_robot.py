@@ -82,8 +82,7 @@ def test_a_link_without_a_sphere_is_named_and_refused_as_a_margin(
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     links = tuple(link for link in dict.fromkeys(arm.sphere_set.links) if link not in ("link0", "link3"))
     with_spheres(desk, shrunk(arm.sphere_set, links))
-    assert desk.replay("--scene", str(scene), "-q") == 0
-    assert desk.metrics()["coverage_deficit"] is None
+    assert desk.replay("--scene", str(scene), "-q") == 0 and desk.metrics()["coverage_deficit"] is None
     assert "nothing of link0, link3, which have no sphere" in about(desk)
     capsys.readouterr()
     assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
@@ -101,8 +100,7 @@ def test_collision_geometry_that_cannot_be_read_is_said_and_refused_as_a_margin(
     mesh = '<collision><geometry><mesh filename="package://arm/m.stl"/></geometry></collision>'
     lost.write_text(urdf.read_text().replace('<link name="link1">', f'<link name="link1">{mesh}', 1))
     desk.robot[1] = str(lost)
-    assert desk.replay("--scene", str(scene), "-q") == 0
-    assert desk.metrics()["coverage_deficit"] is None
+    assert desk.replay("--scene", str(scene), "-q") == 0 and desk.metrics()["coverage_deficit"] is None
     assert "is not known" in about(desk) and "package://arm/m.stl" in about(desk)
     capsys.readouterr()
     assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
@@ -122,8 +120,7 @@ def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotMod
         config = ControlConfig(coverage=coverage, solver="daqp", max_time=6.0)
         trace = closed_loop(model, config, task, lambda stamp: ball)
         kept[coverage] = surface_clearance(model, trace.position[:: len(trace.position) // 4], ball)
-    assert kept["margin"] >= 0.02 - 1e-3
-    assert kept["report"] < 0.02 - 3e-3
+    assert kept["margin"] >= 0.02 - 1e-3 and kept["report"] < 0.02 - 3e-3
 
 
 def test_spheres_that_stick_out_of_a_drawn_link_into_the_margin_are_named(desk: Desk, arm: RobotModel) -> None:

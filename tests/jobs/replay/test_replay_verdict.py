@@ -81,8 +81,7 @@ def test_one_criterion_that_is_broken_turns_the_verdict_and_names_itself(stage: 
     broken, arguments, criterion, label, words = ALONE[name]
     broken(stage)
     code, verdict = stage.judged(*arguments)
-    assert set(decisive(verdict)) == {criterion}
-    assert (verdict["label"], code) == (label, CODES.get(label, 1))
+    assert set(decisive(verdict)) == {criterion} and (verdict["label"], code) == (label, CODES.get(label, 1))
     assert words in verdict["sentence"]
     assert not criterion.startswith(ASKED), "with --report-only it turns no exit code"
 
@@ -127,8 +126,7 @@ def test_a_users_controller_that_fails_is_not_doubted_for_a_displaced_camera(sta
     displaced_camera(stage)
     dead = ("--controller-command", "sh -c 'read a; echo {\\\"protocol\\\":1}'")
     code, verdict = stage.judged(*dead, mode="closed-loop")
-    assert (code, verdict["label"]) == (1, "controller failed")
-    assert decisive(verdict)["controller"] == "failed"
+    assert (code, verdict["label"]) == (1, "controller failed") and decisive(verdict)["controller"] == "failed"
 
 
 @pytest.mark.parametrize(("gap", "code"), [(0.0185, 1), (0.0195, 0)])
@@ -271,8 +269,7 @@ def test_a_map_may_be_as_old_and_as_much_time_unjudged_as_is_said(
 ) -> None:
     broken(stage)
     scene = stage.scene()
-    assert stage.judged(allowed, scene=scene)[0] == 0
-    assert stage.judged(too_little, scene=scene)[0] == 5
+    assert stage.judged(allowed, scene=scene)[0] == 0 and stage.judged(too_little, scene=scene)[0] == 5
 
 
 def test_states_of_another_hour_are_not_judged_by_a_scene_or_a_field(stage: Stage) -> None:
@@ -310,8 +307,7 @@ def test_after_a_long_lead_in_the_rest_can_be_judged_as_the_remedy_says(stage: S
     assert code == 5 and "judge the rest alone with --start-time first-map" in verdict["sentence"]
     assert stage.desk.metrics()["unjudged_s"] == pytest.approx(0.6)
     code, verdict = stage.judged("--start-time", "first-map", scene=scene)
-    assert (code, decisive(verdict)) == (0, {})
-    assert "from 0.60 to 1.00 s of the log" in verdict["scope"]
+    assert (code, decisive(verdict)) == (0, {}) and "from 0.60 to 1.00 s of the log" in verdict["scope"]
 
 
 def test_a_short_lead_in_is_left_out_and_said(stage: Stage) -> None:

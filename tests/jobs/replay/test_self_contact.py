@@ -252,8 +252,7 @@ def test_the_closed_loop_arrives_with_every_step_solved(
 ) -> None:
     robot: MeasuredRobot = request.getfixturevalue(name)
     trace = driven(robot.model, scene())
-    assert trace.outcome is Outcome.GOAL_REACHED
-    assert num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
+    assert trace.outcome is Outcome.GOAL_REACHED and num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
     assert all(step.scale == 1.0 for step in trace.steps)
     q = np.asarray(trace.position)[::20]
     assert robot.surfaces is not None
@@ -281,14 +280,12 @@ def test_an_fr3_touches_itself_where_its_surfaces_do_and_not_where_its_spheres_d
     fr3: MeasuredRobot, at: tuple[float, float], spheres: float, touches: bool
 ) -> None:
     q = np.array([0.0, -0.8, 0.0, -2.3, 0.0, *at])
-    assert sphere_gap(fr3.model, q, "link5", "link7") < spheres
-    assert (nearest(fr3, q) < 0) == touches
+    assert sphere_gap(fr3.model, q, "link5", "link7") < spheres and (nearest(fr3, q) < 0) == touches
 
 
 def test_a_panda_touches_itself_where_curobos_spheres_are_apart(panda: MeasuredRobot) -> None:
     q = np.array([0.0, -0.8, 0.0, -2.3, 0.0, 0.2, 2.0])
-    assert sphere_gap(panda.model, q, "link5", "link7") > 0.015
-    assert nearest(panda, q) < 0
+    assert sphere_gap(panda.model, q, "link5", "link7") > 0.015 and nearest(panda, q) < 0
     (kept,) = panda.kept
     assert kept.links == ("panda_link5", "panda_link7") and kept.surface_gap is not None and kept.surface_gap < 0
 
