@@ -273,3 +273,14 @@ def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None
     whole = list(range(6))
     assert list(stored) == whole and stored[-1] == 5 and stored[4:1:-1] == whole[4:1:-1]
     assert all(stored[i:j] == whole[i:j] for i in range(-7, 8) for j in range(-7, 8))
+
+
+def test_a_row_per_step_with_nothing_where_there_is_no_value(tmp_path: Path) -> None:
+    columns = {"stamp_ns": [1, 2], "d": [np.float64(0.123456789012), float("nan")], "name": ["a[0]", "b; c"]}
+    files.write_steps(tmp_path / "steps.csv", [columns])
+    assert (tmp_path / "steps.csv").read_text() == "stamp_ns,d,name\n1,0.123456789,a[0]\n2,,b; c\n"
+
+
+def test_columns_of_unequal_length_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="shorter"):
+        files.write_steps(tmp_path / "steps.csv", [{"a": [1, 2], "b": [1]}])
