@@ -43,7 +43,7 @@ def test_an_audit_measures_every_logged_state(desk: Desk, arm: RobotModel) -> No
     assert {path.name for path in (desk.folder / "out").iterdir()} == names
 
 
-@pytest.mark.parametrize("start", [(), ("--start-time", "first-map")])
+@pytest.mark.parametrize("start", [(), ("--start-time", "first-map"), ("--start-time", "0.5")])
 def test_states_and_a_scene_on_clocks_that_do_not_overlap_are_said_as_such(
     desk: Desk, capsys: pytest.CaptureFixture[str], start: tuple[str, ...]
 ) -> None:

@@ -208,6 +208,8 @@ def test_unknown_space_counts_from_the_share_that_is_allowed(stage: Stage, heigh
         found, verdict = stage.judged("--max-unknown", str(allowed), scene=scene)
         assert found == code, verdict["sentence"]
         assert decisive(verdict) == ({"known space": "not evaluable"} if code else {})
+        said = f"{100 * share:.1f} % of the sphere centres lie in unseen space, allowed {100 * allowed:g} %, first"
+        assert any(said in reason["sentence"] for reason in verdict["reasons"]) == bool(code)
 
 
 def test_at_most_half_of_the_space_beside_the_arm_may_be_unseen(stage: Stage) -> None:
