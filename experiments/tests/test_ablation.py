@@ -100,7 +100,7 @@ def test_a_recording_goes_through_the_mechanisms_that_it_can_show(monkeypatch: p
 @pytest.mark.usefixtures("fast", "without_plots")
 def test_a_map_serves_all_that_changes_the_motion_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        ablation, "RecordingOptions", partial(RecordingOptions, duration_s=2.0, fps=4.0, color_rays=0)
+        ablation, "RecordingOptions", partial(RecordingOptions, duration_s=2.0, fps=2.0, color_rays=0)
     )
     methods = [ALL, "distance-rate"]
     whole, without = measured(asked("table-0003", methods, 64), Config(), Stopwatch())

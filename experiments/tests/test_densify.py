@@ -44,25 +44,20 @@ def grown(before: GaussianArrays, settings: GaussianSettings = SETTINGS, **flags
 def test_what_the_images_pull_at_little_stays_as_it_is() -> None:
     before = arrays([0.005, 0.05], [QUIET, QUIET])
     after = grown(before)
-    assert np.array_equal(after.parameters, before.parameters)
-    assert (after.first == np.float32(0.3)).all()
+    assert np.array_equal(after.parameters, before.parameters) and (after.first == np.float32(0.3)).all()
     assert after.num_steps.tolist() == [7, 7]
 
 
 def test_a_small_gaussian_is_cloned_where_it_is_and_the_clone_has_no_moments() -> None:
     after = grown(arrays([0.005, 0.005], [LOUD, QUIET]))
-    assert len(after) == 3
-    assert np.array_equal(after.parameters[2], after.parameters[0])
-    assert not after.first[2].any()
-    assert not after.second[2].any()
-    assert after.num_steps.tolist() == [7, 7, 0]
+    assert len(after) == 3 and np.array_equal(after.parameters[2], after.parameters[0])
+    assert not after.first[2].any() and not after.second[2].any() and after.num_steps.tolist() == [7, 7, 0]
 
 
 def test_a_large_gaussian_becomes_two_smaller_ones() -> None:
     before = arrays([0.05, 0.05], [QUIET, LOUD])
     after = grown(before)
-    assert after.num_steps.tolist() == [7, 0, 0]
-    assert np.array_equal(after.parameters[0], before.parameters[0])
+    assert after.num_steps.tolist() == [7, 0, 0] and np.array_equal(after.parameters[0], before.parameters[0])
     for part in after.parameters[1:]:
         assert np.exp(part[LOG_SCALE]) == pytest.approx(np.exp(before.parameters[1, LOG_SCALE]) / 1.6, rel=1e-5)
         assert np.array_equal(part[6:], before.parameters[1, 6:])
@@ -128,6 +123,5 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments_alone() -> None:
     reset_opacity(before, 0.01)
     opacity: Float32 = 1 / (1 + np.exp(-before.parameters[:, LOGIT]))
     assert opacity == pytest.approx([0.01, 1 / (1 + np.exp(6.0))], rel=1e-5)
-    assert not before.first[:, LOGIT].any()
-    assert not before.second[:, LOGIT].any()
+    assert not before.first[:, LOGIT].any() and not before.second[:, LOGIT].any()
     assert np.count_nonzero(before.first) == 2 * 58

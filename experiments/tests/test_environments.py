@@ -23,15 +23,9 @@ from tests.simulate.limits import DURATIONS, assert_keeps_limits
 
 
 @pytest.fixture(scope="module")
-def robot(plain_arm: Path) -> RobotModel:
-    folder = plain_arm / "tabletop"
-    return RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
-
-
-@pytest.fixture(scope="module")
-def tasks(robot: RobotModel) -> Callable[[str], Task]:
+def tasks(arm: RobotModel) -> Callable[[str], Task]:
     """The task of seed 1 by kind, each found once."""
-    return cache(lambda kind: task_of(kind, 1, robot))
+    return cache(lambda kind: task_of(kind, 1, arm))
 
 
 def environment(kind: str, seed: int) -> Environment:
@@ -90,19 +84,19 @@ def test_every_opening_takes_a_hand_whose_way_in_is_free(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ENVIRONMENTS)
 def test_the_task_is_a_clear_way_between_places_that_are_apart(
-    kind: str, robot: RobotModel, tasks: Callable[[str], Task]
+    kind: str, arm: RobotModel, tasks: Callable[[str], Task]
 ) -> None:
     task = tasks(kind)
-    room = Clearance.of(robot, solids_of(task.environment.primitives))
+    room = Clearance.of(arm, solids_of(task.environment.primitives))
     assert room.at(resampled(task.waypoints, 0.01)).min() > drawn_task.TASK_CLEARANCE - 1e-3
-    tip = robot.frame_names[-1]
-    start, end = (robot.frame_pose(q, tip) for q in task.waypoints[[0, -1]])
+    tip = arm.frame_names[-1]
+    start, end = (arm.frame_pose(q, tip) for q in task.waypoints[[0, -1]])
     np.testing.assert_allclose(end[:3, 3], task.T_world_goal[:3, 3], atol=1e-3)
     assert np.linalg.norm(end[:3, 3] - start[:3, 3]) > drawn_task.TASK_APART - 2e-3
 
 
-def test_a_seed_gives_one_task(robot: RobotModel, tasks: Callable[[str], Task]) -> None:
-    task, again = tasks("tabletop"), task_of("tabletop", 1, robot)
+def test_a_seed_gives_one_task(arm: RobotModel, tasks: Callable[[str], Task]) -> None:
+    task, again = tasks("tabletop"), task_of("tabletop", 1, arm)
     assert again.waypoints.tolist() == task.waypoints.tolist() and again.num_refused == task.num_refused
 
 
@@ -114,10 +108,10 @@ def test_an_arm_that_reaches_no_opening_is_refused(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("duration", DURATIONS)
 def test_the_way_through_it_keeps_the_velocity_limits_in_any_time(
-    robot: RobotModel, tasks: Callable[[str], Task], duration: float
+    arm: RobotModel, tasks: Callable[[str], Task], duration: float
 ) -> None:
     options = RecordingOptions(duration_s=duration, fps=10.0)
-    assert_keeps_limits(Recording(options, robot, tasks("cubby").scene(robot, options, 4)))
+    assert_keeps_limits(Recording(options, arm, tasks("cubby").scene(arm, options, 4)))
 
 
 def test_a_log_is_written_of_it_with_its_truth(tmp_path: Path, tasks: Callable[[str], Task]) -> None:

@@ -41,8 +41,7 @@ def test_both_methods_are_fitted_scored_and_printed_beside_the_paper(
     assert any(line.startswith("PSNR over the mask; 400 splats to begin with, 6 iterations") for line in rest)
     result = json.loads((out / "fits.json").read_text())
     made = {fit["method"]: fit for fit in result["fits"]}
-    assert list(made) == ["3dgs", "budget"]
-    assert made["3dgs"]["psnr"] == made["3dgs"]["metrics"]["psnr_masked"]
+    assert list(made) == ["3dgs", "budget"] and made["3dgs"]["psnr"] == made["3dgs"]["metrics"]["psnr_masked"]
     assert result["metrics"]["psnr_ours"] > 5 and result["metrics"]["splats_ours"] <= 400
     for method in made:
         run = json.loads((out / "scan1" / method / "scene" / "run.json").read_text())
@@ -81,8 +80,7 @@ def test_the_mean_is_over_the_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (metrics["memory_ours"], metrics["psnr_seen_ours"]) == (70.0, 1.0)
     assert report["warnings"][1] == "scan1, ours: odd"
     table = list(fits.lines_of(report))
-    assert "scan1 dB  scan2 dB  mean dB" in table[0]
-    assert table[3].split()[5:8] == ["+1.00", "+2.50", "+1.75"]
+    assert "scan1 dB  scan2 dB  mean dB" in table[0] and table[3].split()[5:8] == ["+1.00", "+2.50", "+1.75"]
     del psnr["scan2", "budget"]
     lacking = fits.fit_scans(fits.FitRequest(recording=request.recording, config=Config(), iterations=5))
     assert lacking["metrics"]["psnr_ours"] is None, "a scan without a figure leaves no mean"

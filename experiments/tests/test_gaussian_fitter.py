@@ -51,8 +51,7 @@ def test_a_floor_is_reconstructed_in_colour_and_depth_from_a_view_not_trained_on
     error = (view.color - frame(x=0.03, y=-0.02).color / 255.0)[inside]
     assert -10 * np.log10(np.mean(error**2)) > 30
     assert np.median(np.abs(view.normalised_depth()[inside] - HEIGHT)) < 0.01 * HEIGHT
-    assert rows[-1].psnr is not None
-    assert rows[-1].psnr > 30
+    assert rows[-1].psnr is not None and rows[-1].psnr > 30
 
 
 def test_growing_shows_detail_that_the_seeds_cannot() -> None:
@@ -72,8 +71,7 @@ def test_the_audit_adds_up_and_follows_the_schedule() -> None:
     count = start
     for row in rows:
         count += row.cloned + row.split - sum(row.pruned.values())
-        assert row.gaussians == count
-        assert set(asdict(row)["pruned"]) == {"broken", "opacity", "screen", "size"}
+        assert row.gaussians == count and set(asdict(row)["pruned"]) == {"broken", "opacity", "screen", "size"}
     assert count == len(fitter.gaussians())
     assert [row.iteration for row in rows] == [60, 90, 120, 300]
     assert [row.opacity_reset for row in rows] == [True, False, True, False]
@@ -84,8 +82,7 @@ def test_the_degree_rises_with_the_iterations() -> None:
     rules = replace(FAST, iterations=50, degree_every=0.3)
     fitter = GaussianFitter(CONFIG, WORKSPACE, frames(), settings=rules, threads=1)
     fitter.fit()
-    assert fitter.degree == 3
-    assert fitter.gaussians().harmonics.shape[1] == 16
+    assert fitter.degree == 3 and fitter.gaussians().harmonics.shape[1] == 16
     assert GaussianFitter(CONFIG, WORKSPACE, frames(), threads=1).gaussians().harmonics.shape[1] == 1
 
 
@@ -94,8 +91,7 @@ def test_the_number_of_gaussians_never_exceeds_its_limit() -> None:
     fitter = GaussianFitter(CONFIG, WORKSPACE, checked(), settings=rules, threads=1)
     rows: list[GaussianAuditRow] = []
     fitter.fit(rows.append)
-    assert all(row.gaussians <= 220 for row in rows)
-    assert any(row.unmet for row in rows)
+    assert all(row.gaussians <= 220 for row in rows) and any(row.unmet for row in rows)
 
 
 def test_same_seed_gives_the_same_bytes_at_any_thread_count() -> None:
@@ -109,8 +105,7 @@ def test_same_seed_gives_the_same_bytes_at_any_thread_count() -> None:
 
 def test_seeds_are_those_that_an_empty_map_asks_for() -> None:
     seeds = first_map(CONFIG, WORKSPACE, frames()).splats()
-    assert 50 < len(seeds) <= 200
-    assert np.abs(seeds.centers[:, 2]).max() < 1e-3
+    assert 50 < len(seeds) <= 200 and np.abs(seeds.centers[:, 2]).max() < 1e-3
 
 
 def test_the_colour_of_what_has_no_depth_is_the_background() -> None:
@@ -130,8 +125,7 @@ def test_a_scene_without_depth_is_refused() -> None:
 
 def test_the_extent_is_that_of_the_cameras_or_of_what_they_see() -> None:
     apart = [frame(x=1.0), frame(x=-1.0)]
-    assert scene_extent(apart) == pytest.approx(1.1)
-    assert scene_extent([frame()]) == pytest.approx(0.5 * HEIGHT)
+    assert scene_extent(apart) == pytest.approx(1.1) and scene_extent([frame()]) == pytest.approx(0.5 * HEIGHT)
 
 
 def test_the_rate_of_centres_falls_exponentially_to_its_end() -> None:

@@ -130,8 +130,7 @@ def test_a_glance_slows_the_path_without_a_stop() -> None:
     assert not run.is_stopped.any() and run.path_speed.min() < 0.8
     assert run.duration_s > 1.02
     at_once = braked(0.25, 0.35, max_acceleration=0.0)
-    assert at_once.is_stopped.sum() == 10
-    assert set(at_once.path_speed) == {0.0, 1.0}
+    assert at_once.is_stopped.sum() == 10 and set(at_once.path_speed) == {0.0, 1.0}
 
 
 def test_an_arm_that_starts_beside_a_person_stands() -> None:

@@ -36,6 +36,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Stud
         patch.setattr(
             "experiments.study.ProcessPoolExecutor", lambda max_workers, **_: ThreadPoolExecutor(max_workers)
         )
+        patch.setattr("experiments.trial.PLANS", 1)
+        patch.setattr("experiments.trial.SEARCH", 300)
         patch.setattr("experiments.trial.CAMERAS", CAMERAS)
         patch.setattr("experiments.table2.CAMERAS", CAMERAS)
         part = run_study(replace(request(out), shard=(1, 2)))

@@ -47,8 +47,7 @@ def least(position: Float64, field: Balls = BALL) -> float:
 def test_the_figures_of_a_straight_motion_are_its_lengths_and_its_least_distances() -> None:
     motion = straight(101)
     figures = yardstick().figures(motion)
-    assert figures.has_arrived and figures.is_success
-    assert figures.duration == pytest.approx(1.0)
+    assert figures.has_arrived and figures.is_success and figures.duration == pytest.approx(1.0)
     assert figures.joint_path == pytest.approx(np.linalg.norm(TO - FROM))
     tips = np.array([ARM.frame_pose(q, "tip")[:3, 3] for q in motion.position])
     assert figures.effector_path == pytest.approx(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum())

@@ -6,6 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.jobs.replay import files, inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.robot.model import RobotModel
@@ -24,6 +25,15 @@ def short_sample(sample_data: Path, tmp_path_factory: pytest.TempPathFactory) ->
     messages = list(messages_of(sample_data / "tabletop" / "log.mcap"))
     end_ns = min(filter(None, (message.log_time_ns for message in messages))) + 2_600_000_000
     write_raw(folder / "tabletop" / "log.mcap", (each for each in messages if each.log_time_ns < end_ns))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated second of the tabletop in small images, and its scan."""
+    folder = tmp_path_factory.mktemp("recording") / "small"
+    size = ["--duration", "1.0", "--width", "96", "--height", "72", "--dtu"]
+    assert main(["simulate", "-o", str(folder), *size, "-q"]) == 0
     return folder
 
 

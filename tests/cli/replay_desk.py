@@ -119,13 +119,15 @@ class Desk:
         log, judged = str(self.folder / "fake.mcap"), [] if is_judged else ["--report-only"]
         return main(["replay", log, *self.robot, "-o", str(self.folder / out), *judged, *arguments])
 
-    def verdict(self, out: str = "out") -> dict[str, Any]:
-        verdict: dict[str, Any] = json.loads((self.folder / out / "summary.json").read_text())["verdict"]
-        return verdict
+    def json(self, name: str, out: str = "out") -> Any:
+        """A file of a run."""
+        return json.loads((self.folder / out / name).read_text())
 
-    def metrics(self, out: str = "out") -> dict[str, Any]:
-        metrics: dict[str, Any] = json.loads((self.folder / out / "summary.json").read_text())["metrics"]
-        return metrics
+    def verdict(self, out: str = "out") -> Any:
+        return self.json("summary.json", out)["verdict"]
+
+    def metrics(self, out: str = "out") -> Any:
+        return self.json("summary.json", out)["metrics"]
 
     def rows(self, out: str = "out") -> list[dict[str, str]]:
         with (self.folder / out / "steps.csv").open() as stream:

@@ -1,7 +1,9 @@
 """``splatctrl batch`` as a person and a CI job use it."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import xunitparserx
@@ -9,6 +11,7 @@ from junitparser import JUnitXml
 
 from splatctrl_cli.cli import batch
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.jobs.batch import run, task
 from tests.conftest import ROOT
 from tests.recording.log.make_log import LogRecipe, make_log
 
@@ -28,10 +31,14 @@ cameras = ["cam0"]
 """
 
 
-@pytest.fixture
-def quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runners that import what their node's command needs, and not every command beforehand."""
-    monkeypatch.setattr(batch.OfThisProgram, "entry", "splatctrl_cli.cli.main:main")
+@pytest.fixture(scope="module", autouse=True)
+def one_runner() -> Iterator[None]:
+    """The nodes of all batches run in one runner, which imports the commands once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task, "_local", SimpleNamespace())
+        patch.setattr(run, "stop_runners", lambda: None)
+        yield
+    task.stop_runners()
 
 
 def test_a_suite_runs_once_tells_what_was_not_expected_and_lists_it(
@@ -103,7 +110,6 @@ def test_what_cannot_run_is_said_in_a_line(
     assert said in error and error.count("\n") == 1
 
 
-@pytest.mark.usefixtures("quick_start")
 def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     suite, junit = tmp_path / "nightly.toml", tmp_path / "nightly.xml"
     suite.write_text(SUITE + "[jobs.scene]\ncommand = 'reconstruct'\nurdf = 'missing.urdf'\n")
@@ -124,7 +130,6 @@ def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.Ca
     assert joined.properties["batch"] == "two logs"
 
 
-@pytest.mark.usefixtures("quick_start")
 @pytest.mark.parametrize(("expect", "code", "num_errors"), [("passed", 3, 2), ("exit 3", 0, 0)])
 def test_a_log_that_was_cut_is_named_in_the_table_the_sentence_the_page_and_junit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], expect: str, code: int, num_errors: int
@@ -152,7 +157,6 @@ def test_a_log_that_was_cut_is_named_in_the_table_the_sentence_the_page_and_juni
     assert "passed, damaged" in page and "done, damaged" in page
 
 
-@pytest.mark.usefixtures("quick_start")
 def test_what_a_page_reads_is_the_suite_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     suite, out = tmp_path / "nightly.toml", tmp_path / "nightly.out"
     (tmp_path / "damaged.mcap").write_bytes(b"not a log")
@@ -175,7 +179,6 @@ def test_what_a_page_reads_is_the_suite_as_it_is(tmp_path: Path, capsys: pytest.
     assert fewer == {"good/info": "done", "good/ingest": "done"}, "what is no longer in the suite is not told"
 
 
-@pytest.mark.usefixtures("quick_start")
 def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,7 +204,6 @@ def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
     assert "1 of 3 jobs not as expected; first good/look: has not run since" in page
 
 
-@pytest.mark.usefixtures("quick_start")
 def test_many_recordings_are_printed_where_they_are_not_as_expected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,8 +1,9 @@
 """The command line as a person meets it: help, exit codes, one line per error, nothing left.
 
-Each subcommand runs as a process of its own in some tests; what only asks for another line of it runs in this one.
+Tests of imports, signals and streams run processes; the others run in this one.
 """
 
+import json
 import os
 import re
 import shlex
@@ -18,7 +19,7 @@ import pytest
 
 from splatctrl_cli.cli.commands import COMMANDS, Command, build_parser, function_of
 from splatctrl_cli.cli.main import main
-from tests.cli import here
+from tests.cli.here import checked, splatctrl
 from tests.conftest import ROOT
 from tests.recording.log.make_log import LogRecipe, make_log
 
@@ -37,12 +38,6 @@ ARM = """<robot name="r"><link name="base"/><link name="a"/><link name="b">
 <limit lower="-2" upper="2" velocity="2" effort="9"/></joint>
 <joint name="{1}" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 0.2"/><axis xyz="0 1 0"/>
 <limit lower="-2" upper="2" velocity="2" effort="9"/></joint></robot>"""
-
-
-def splatctrl(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own."""
-    command = [sys.executable, "-m", "splatctrl_cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 
 
 @dataclass(frozen=True)
@@ -97,30 +92,26 @@ def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: st
         assert word in done.stderr
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS])
-def test_help_imports_nothing_heavy_and_fits_a_screen(command: str) -> None:
+def test_help_imports_nothing_heavy_and_fits_a_screen() -> None:
     """Of a command: its usage, the options that people use, two examples, and where to find the rest."""
     program = f"""
-import sys
+import contextlib, io, json, sys
 from splatctrl_cli.cli.main import main
-try:
-    main([*{command.split()!r}, "--help"])
-except SystemExit:
-    pass
-print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
+found = {{}}
+for command in {["", *COMMANDS]!r}:
+    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        main([*command.split(), "--help"])
+    found[command] = said.getvalue(), [name for name in {HEAVY!r} if name in sys.modules]
+print(json.dumps(found))
 """
-    environment = os.environ | {"COLUMNS": "100"}
     words = [sys.executable, "-c", program]
-    done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout.startswith(f"usage: splatctrl {command}")
-    assert "show this help" in done.stdout
-    assert done.stderr == "[]\n"
-    assert len(done.stdout.splitlines()) <= 40
-    if command:
-        assert len(re.findall(f"^  splatctrl {command}", done.stdout, flags=re.MULTILINE)) == 2
-    else:
-        assert all(f"    {name}" in done.stdout for name in COMMANDS)
-        assert "130 interrupted" in done.stdout
+    done = subprocess.run(words, capture_output=True, text=True, check=True, env=os.environ | {"COLUMNS": "100"})
+    found = json.loads(done.stdout)
+    for command, (said, heavy) in found.items():
+        assert said.startswith(f"usage: splatctrl {command}") and "show this help" in said
+        assert not heavy and len(said.splitlines()) <= 40, command
+        assert not command or len(re.findall(f"^  splatctrl {command}", said, flags=re.MULTILINE)) == 2, command
+    assert all(f"    {name}" in found[""][0] for name in COMMANDS) and "130 interrupted" in found[""][0]
 
 
 @pytest.mark.parametrize(
@@ -212,57 +203,41 @@ FILE_WRITERS = ("calibrate", "export", "query", "report", "view", "robot")  # th
 
 
 @pytest.mark.parametrize("command", WRITERS)
-def test_an_output_that_exists_is_kept_without_force(work: Work, tmp_path: Path, command: str) -> None:
-    out = tmp_path / "out"
-    file = out if command in FILE_WRITERS else out / "run.json"
+@pytest.mark.parametrize("what", ["there already", "of somebody else", "below a file"])
+def test_an_output_that_exists_or_cannot_be_written_is_refused(
+    work: Work, tmp_path: Path, command: str, what: str
+) -> None:
+    """Also with --force what no command wrote is kept."""
+    is_file = command in FILE_WRITERS
+    not_ours = "is a folder, expected a file" if is_file else "was not written by splatctrl (no run.json)"
+    there, out, force, said = {
+        "there already": ("out" if is_file else "out/run.json", "out", [], ["out: already exists; give --force"]),
+        "of somebody else": ("out/precious", "out", ["--force"], [not_ours, "another --out"]),
+        "below a file": ("file", "file/out", [], ["cannot be written", "another --out"]),
+    }[what]
+    file = tmp_path / there
     file.parent.mkdir(exist_ok=True)
     file.write_text("precious")
-    done = here.splatctrl(*work.arguments(command, out), "-q")
-    assert_refused(done, 2, "out: already exists; give --force")
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file]
-    assert file.read_text() == "precious"
+    assert_refused(splatctrl(*work.arguments(command, tmp_path / out), "-q", *force), 2, *said)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file] and file.read_text() == "precious"
 
 
-@pytest.mark.parametrize("command", WRITERS)
-def test_force_keeps_what_no_command_wrote(work: Work, tmp_path: Path, command: str) -> None:
-    precious = tmp_path / "out" / "precious"
-    precious.parent.mkdir()
-    precious.write_text("mine")
-    said = "is a folder, expected a file" if command in FILE_WRITERS else "was not written by splatctrl (no run.json)"
-    assert_refused(
-        here.splatctrl(*work.arguments(command, precious.parent), "-q", "--force"), 2, said, "another --out"
-    )
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [precious]
-
-
-@pytest.mark.parametrize("command", WRITERS)
-def test_an_output_below_a_file_cannot_be_written(work: Work, tmp_path: Path, command: str) -> None:
-    (tmp_path / "file").write_text("no folder")
-    done = here.splatctrl(*work.arguments(command, tmp_path / "file" / "out"), "-q")
-    assert_refused(done, 2, "cannot be written", "another --out")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-@pytest.mark.parametrize("command", ["export", "sdf-bake", "query", "score", "replay"])
-def test_what_reconstruct_wrote_is_taken_by_the_next_steps(work: Work, tmp_path: Path, command: str) -> None:
+@pytest.mark.parametrize(
+    "command",
+    ["simulate", "ingest", "reconstruct", "robot", "export", "sdf-bake", "query", "score", "replay"],
+)
+def test_what_a_command_prints_as_json_is_as_the_schema_says(work: Work, tmp_path: Path, command: str) -> None:
+    """The last five take what reconstruct wrote."""
     more = ["--report-only"] if command == "replay" else []
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--json", *more)
-    assert done.returncode == 0, done.stderr
-    here.checked(done.stdout, 0)
-    assert (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("command", ["simulate", "ingest", "reconstruct", "robot"])
-def test_what_a_command_prints_as_json_is_as_the_schema_says(work: Work, tmp_path: Path, command: str) -> None:
-    done = here.splatctrl(*work.arguments(command, tmp_path / "out"), "--json", "-q")
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0 and (tmp_path / "out").exists(), done.stderr
 
 
 @pytest.mark.parametrize(
     "words", ["info {log}", "check {log}", "config", "config --schema", "completion bash", "robot info --urdf {urdf}"]
 )
 def test_what_is_only_printed_is_as_the_schema_says(work: Work, words: str) -> None:
-    done = here.splatctrl(*words.format(log=work.log, urdf=work.folder / "robot.urdf").split(), "--json", "-q")
+    done = splatctrl(*words.format(log=work.log, urdf=work.folder / "robot.urdf").split(), "--json", "-q")
     assert done.returncode == 0, done.stderr
 
 
@@ -283,23 +258,14 @@ sys.exit(main(sys.argv[1:]))
     running.send_signal(signal.SIGINT)
     stderr = running.communicate(timeout=30)[1]
     last = "splatctrl: interrupted before its first checkpoint; run the same command again"
-    assert (running.returncode, stderr.splitlines()[-1]) == (130, last)
-    assert "Traceback" not in stderr
+    assert (running.returncode, stderr.splitlines()[-1]) == (130, last) and "Traceback" not in stderr
     assert [path.name for path in tmp_path.iterdir()] == [partial.name]
-
-
-def test_results_that_cannot_be_printed_are_exit_6(work: Work) -> None:
-    with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "splatctrl_cli", "info", str(work.log)]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
-    assert done.returncode == 6
-    assert done.stderr == "splatctrl: output: writing failed: No space left on device; make room\n"
 
 
 def test_a_failed_gate_is_exit_1_an_object_with_its_verdict_and_keeps_the_output(work: Work, tmp_path: Path) -> None:
     arguments = work.arguments("reconstruct", tmp_path / "scene")
-    done = here.splatctrl(*arguments, "-q", "--json", "--require", "splats>1000000")
-    assert done.returncode == 1 and here.checked(done.stdout, 1)["verdict"]["outcome"] == "failed"
+    done = splatctrl(*arguments, "-q", "--json", "--require", "splats>1000000")
+    assert done.returncode == 1 and checked(done.stdout, 1)["verdict"]["outcome"] == "failed"
     assert "splats is " in done.stderr
     assert (tmp_path / "scene" / "run.json").is_file()
 
@@ -307,30 +273,22 @@ def test_a_failed_gate_is_exit_1_an_object_with_its_verdict_and_keeps_the_output
 def test_our_own_bug_is_an_object_too(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, "splatctrl_cli.cli.config", None)  # importing it fails
     assert main(["config", "--json"]) == 70
-    found = here.checked(capsys.readouterr().out, 70)
+    found = checked(capsys.readouterr().out, 70)
     assert found["error"]["message"].startswith("internal error: ") and found["error"]["remedy"] == "please report it"
 
 
 def test_an_error_with_v_shows_where_it_came_from(tmp_path: Path) -> None:
     done = splatctrl("info", tmp_path / "absent", "-v")
-    assert done.returncode == 4
-    assert "Traceback" in done.stderr
+    assert done.returncode == 4 and "Traceback" in done.stderr
     assert done.stderr.splitlines()[-1].startswith("splatctrl: ")
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of one camera."""
-    return make_log(tmp_path_factory.mktemp("log") / "log.mcap", LogRecipe(cameras=("cam0",)))
 
 
 @pytest.mark.parametrize(
     ("closed", "words", "code", "said"),
     [
         (">&-", ["info", "{log}"], 6, "splatctrl: stdout: closed, so the result was not printed"),
-        (">&-", ["info", "absent"], 4, "splatctrl: absent: no such file"),
         (">&-", ["info", "absent", "--json"], 4, "splatctrl: absent: no such file"),
-        (">&-", ["info", "{log}", "--json"], 6, "splatctrl: stdout: closed, so the result was not printed"),
+        (">/dev/full", ["info", "{log}"], 6, "splatctrl: output: writing failed: No space left on device; make room"),
         (">/dev/full", ["info", "absent", "--json"], 4, "splatctrl: absent: no such file"),
         (">/dev/full", ["info", "{log}", "--json"], 6, "splatctrl: output: writing failed: No space left"),
         ("2>&-", ["info", "absent"], 4, ""),
@@ -338,38 +296,39 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_a_stream_that_is_closed_is_told_where_there_was_something_to_print(
-    log: Path, closed: str, words: list[str], code: int, said: str
+    work: Work, closed: str, words: list[str], code: int, said: str
 ) -> None:
-    command = [sys.executable, "-m", "splatctrl_cli", *(word.format(log=log) for word in words)]
+    command = [sys.executable, "-m", "splatctrl_cli", *(word.format(log=work.log) for word in words)]
     shell = ["sh", "-c", f'"$@" {closed}', "sh", *command]
     done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr.startswith(said) and done.stderr.count("\n") == bool(said)
 
 
-@pytest.mark.parametrize(("words", "first"), [(["info", "{log}"], "log.mcap"), (["replay", "--help-all"], "usage: ")])
+@pytest.mark.parametrize(
+    ("words", "reader", "first"),
+    [(["info", "{log}"], "head -1", ["log.mcap"]), (["replay", "--help-all"], "true", [])],  # `true` reads nothing
+)
 def test_a_reader_that_stops_after_the_first_line_ends_the_program_quietly(
-    log: Path, words: list[str], first: str
+    work: Work, words: list[str], reader: str, first: list[str]
 ) -> None:
-    program = [str(Path(sys.executable).with_name("splatctrl")), *(word.format(log=log) for word in words)]
-    for reader in ("head -1", "true"):  # `true` reads nothing: the pipe is closed before the program writes
-        shell = ["bash", "-c", f'"$@" | {reader}; echo "code ${{PIPESTATUS[0]}}"', "bash", *program]
-        done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
-        *lines, code = done.stdout.splitlines()
-        assert (code, done.stderr) == ("code 0", "")
-        assert [first in line for line in lines] == [True] * (reader == "head -1")
+    program = [str(Path(sys.executable).with_name("splatctrl")), *(word.format(log=work.log) for word in words)]
+    shell = ["bash", "-c", f'"$@" | {reader}; echo "code ${{PIPESTATUS[0]}}"', "bash", *program]
+    done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
+    *lines, code = done.stdout.splitlines()
+    assert (code, done.stderr, [Path(line.split(":")[0]).name for line in lines]) == ("code 0", "", first)
 
 
-def test_an_output_is_written_though_stdout_is_closed(log: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "splatctrl_cli", "ingest", str(log), "-o", str(tmp_path / "x.capture")]
+def test_an_output_is_written_though_stdout_is_closed(work: Work, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "splatctrl_cli", "ingest", str(work.log), "-o", str(tmp_path / "x.capture")]
     shell = ["sh", "-c", '"$@" >&-', "sh", *command]
     done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 6 and "stdout: closed" in done.stderr
     assert (tmp_path / "x.capture/run.json").is_file()
 
 
-def test_a_partial_that_is_an_input_is_not_replaced(log: Path, tmp_path: Path) -> None:
+def test_a_partial_that_is_an_input_is_not_replaced(work: Work, tmp_path: Path) -> None:
     given = tmp_path / "log.partial"
-    given.write_bytes(log.read_bytes())
-    assert_refused(here.splatctrl("ingest", given, "-o", tmp_path / "log", "--force"), 2, "would replace the input")
-    assert given.read_bytes() == log.read_bytes()
+    given.write_bytes(work.log.read_bytes())
+    assert_refused(splatctrl("ingest", given, "-o", tmp_path / "log", "--force"), 2, "would replace the input")
+    assert given.read_bytes() == work.log.read_bytes()

@@ -13,7 +13,6 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-import shtab
 
 from splatctrl_cli.cli import main as main_module
 from splatctrl_cli.cli.commands import COMMANDS, SHELLS, Command, build_parser
@@ -41,14 +40,6 @@ printf '%s\\n' "${COMPREPLY[@]}"
         ["bash", "-c", program, str(script), *words], capture_output=True, text=True, check=True, cwd=script.parent
     )
     return done.stdout.split()
-
-
-def test_the_shells_are_those_of_the_library() -> None:
-    assert set(SHELLS) <= set(shtab.SUPPORTED_SHELLS)
-
-
-def test_bash_accepts_its_script(bash: Path) -> None:
-    assert subprocess.run(["bash", "-n", bash], capture_output=True, check=False).returncode == 0
 
 
 def test_bash_completes_commands_options_choices_and_files(bash: Path) -> None:

@@ -7,9 +7,8 @@ import pytest
 
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.query.query import TITLES
-from tests.cli import here
+from tests.cli.here import splatctrl
 from tests.cli.replay_desk import BALL, splats_of
-from tests.cli.test_command_line import splatctrl
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -22,7 +21,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_without_an_output_the_answers_are_stdout_and_the_figures_stderr(folder: Path) -> None:
-    done = here.splatctrl("query", folder / "splats.ply", folder / "points.csv")
+    done = splatctrl("query", folder / "splats.ply", folder / "points.csv")
     lines = done.stdout.splitlines()
     assert done.returncode == 0 and lines[0] == ",".join(TITLES) and len(lines) == 3
     assert "min distance" in done.stderr and "wrote" not in done.stderr
@@ -31,13 +30,13 @@ def test_without_an_output_the_answers_are_stdout_and_the_figures_stderr(folder:
 def test_points_come_from_stdin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with (folder / "points.csv").open() as stream:
         monkeypatch.setattr("sys.stdin", stream)
-        done = here.splatctrl("query", folder / "splats.ply", "-", "--json")
+        done = splatctrl("query", folder / "splats.ply", "-", "--json")
     assert json.loads(done.stdout)["num_points"] == 2 and done.stderr == ""
 
 
 def test_json_has_the_figures_of_what_is_written(folder: Path) -> None:
     out = folder / "answers.csv"
-    done = here.splatctrl("query", folder / "splats.ply", folder / "points.csv", "-o", out, "--json")
+    done = splatctrl("query", folder / "splats.ply", folder / "points.csv", "-o", out, "--json")
     found = json.loads(done.stdout)
     assert found["out"] == str(out) and found["source"] == "scene" and found["notes"] == []
     rows = out.read_text().splitlines()
@@ -47,8 +46,7 @@ def test_json_has_the_figures_of_what_is_written(folder: Path) -> None:
 def test_a_table_with_a_wrong_line_prints_nothing(folder: Path) -> None:
     (folder / "points.csv").write_text("0,0,2\n" * 40_000 + "0,0\n")
     done = splatctrl("query", folder / "splats.ply", folder / "points.csv", "-q")
-    assert (done.returncode, done.stdout) == (4, "")
-    assert "line 40001: expected 3 columns, got 2" in done.stderr
+    assert (done.returncode, done.stdout) == (4, "") and "line 40001: expected 3 columns, got 2" in done.stderr
 
 
 def test_the_page_lists_the_columns() -> None:

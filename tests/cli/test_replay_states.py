@@ -1,5 +1,6 @@
 """What replay says of the states of a log or capture: their kinds, losses and faults, fit to robot and cameras."""
 
+import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,20 +49,13 @@ def replayed(desk: Desk, scene: str, log: Path, *more: str) -> int:
     return main([*arguments, "--max-unknown", "1", "--report-only"])
 
 
-def states_of_run(desk: Desk) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((desk.folder / "out" / "states.json").read_text())
-    return found
-
-
 def test_a_log_of_the_robot_alone_is_audited(desk: Desk, scene: str, capsys: pytest.CaptureFixture[str]) -> None:
     log = write_mcap(desk.folder / "x.mcap", states_of(moving(), JOINTS))
     assert replayed(desk, scene, log) == 0
     said = capsys.readouterr().out
-    assert "log: no camera is used" in said
-    assert "log: /joint_states: no velocities recorded" in said
-    found = states_of_run(desk)
-    assert found["num_states"] == 30
-    assert found["loss"]["differentiated_velocities"] == 30
+    assert "log: no camera is used" in said and "log: /joint_states: no velocities recorded" in said
+    found = desk.json("states.json")
+    assert found["num_states"] == 30 and found["loss"]["differentiated_velocities"] == 30
     assert (found["end_effector_poses"], found["clock_offset"]) == (None, None)
 
 
@@ -87,23 +81,12 @@ def test_logged_end_effector_poses_are_compared_with_the_robot(
     described.write_text("[states]\n" + "\n".join(f"{key} = {value!r}" for key, value in table.items()))
     assert replayed(desk, scene, described) == 0
     assert f"log: 30 logged end-effector poses agree with {link}: median 0.00 mm" in capsys.readouterr().out
-    found = states_of_run(desk)["end_effector_poses"]
-    assert found["verdict"] == "agree"
-    assert found["difference"]["max_position"] < 1e-9
+    found = desk.json("states.json")["end_effector_poses"]
+    assert found["verdict"] == "agree" and found["difference"]["max_position"] < 1e-9
     table["joints"] = list(JOINTS[::-1])
     described.write_text("[states]\n" + "\n".join(f"{key} = {value!r}" for key, value in table.items()))
     assert replayed(desk, scene, described, "--force") == 0
     assert "wrong URDF, joint order, or units?" in capsys.readouterr().out
-
-
-def test_a_log_with_frames_says_how_the_clocks_agree(
-    desk: Desk, scene: str, sample_data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    tabletop = sample_data / "tabletop"
-    desk.robot[:] = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
-    assert replayed(desk, scene, tabletop / "log.mcap", "--cameras", "cam0") == 0
-    assert "log: clocks of cameras and robot: frames are stamped" in capsys.readouterr().out
-    assert abs(states_of_run(desk)["clock_offset"]["offset_s"]) < 0.06
 
 
 def test_joints_in_degrees_are_refused_in_one_line(
@@ -119,8 +102,7 @@ def test_a_posture_outside_the_limits_is_an_event_with_its_joint(desk: Desk, sce
     q[4:7, 3] = 0.5  # its limit is below 0
     assert replayed(desk, scene, write_mcap(desk.folder / "x.mcap", states_of(q, JOINTS)), "-q") == 0
     assert desk.verdict()["label"] == "limits broken"
-    events = json.loads((desk.folder / "out" / "events.json").read_text())["events"]
-    (outside,) = [event for event in events if event["kind"] == "outside-limits"]
+    (outside,) = [event for event in desk.json("events.json")["events"] if event["kind"] == "outside-limits"]
     assert (outside["worst_name"], outside["num_states"]) == ("joint4", 3) and outside["worst"] < -0.5
 
 
@@ -260,27 +242,19 @@ def test_a_damaged_topic_is_refused_and_an_old_capture_is_read(
     scene = [*desk.robot, "--scene", str(tmp_path / "scene")]
     assert main(["replay", str(capture), *scene]) == 4
     assert "position.npy: missing, or its checksum differs" in capsys.readouterr().err
-    old = as_of_old(capture)
-    assert audited(old, desk, tmp_path / "out")[1]["num_states"] == NUM_STATES
-    assert main(["replay", str(old), *scene, "--joint-topic", "/x"]) == 4
+    make_old(capture)
+    assert audited(capture, desk, tmp_path / "out")[1]["num_states"] == NUM_STATES
+    assert main(["replay", str(capture), *scene, "--joint-topic", "/x"]) == 4
     assert "--joint-topic does not apply" in capsys.readouterr().err
 
 
-def as_of_old(capture: Path) -> Path:
-    """The capture as it was written before topics were kept."""
-    import hashlib
-    import shutil
-
-    shutil.rmtree(capture / "joint_topics")
+def make_old(capture: Path) -> None:
+    """Make the capture one that was written before topics and commands were kept."""
     document = json.loads((capture / "capture.json").read_text())
     del document["joint_topics"]
     (capture / "capture.json").write_text(json.dumps(document))
-    states = dict(np.load(capture / "joints.npz"))
+    states = np.load(capture / "joints.npz")
     np.savez(capture / "joints.npz", **{name: states[name] for name in ("stamp_ns", "position", "velocity")})
-    lines = []
-    for line in (capture / "SHA256SUMS").read_text().splitlines():
-        name = line[66:]
-        if not name.startswith("joint_topics/"):
-            lines.append(f"{hashlib.sha256((capture / name).read_bytes()).hexdigest()}  {name}\n")
-    (capture / "SHA256SUMS").write_text("".join(lines))
-    return capture
+    names = [line[66:] for line in (capture / "SHA256SUMS").read_text().splitlines() if "joint_topics/" not in line]
+    sums = [f"{hashlib.sha256((capture / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
+    (capture / "SHA256SUMS").write_text("".join(sums))

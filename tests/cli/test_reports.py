@@ -59,8 +59,7 @@ def test_a_verdict_is_a_suite_of_its_recording(log: Path, tmp_path: Path) -> Non
     told = splatctrl("check", log, "--fail-on", "warning", "--junit", tmp_path / "j.xml", "--json")
     suite = suite_in(tmp_path / "j.xml")
     criteria = {reason["criterion"]: reason["outcome"] for reason in json.loads(told.stdout)["verdict"]["reasons"]}
-    assert (told.returncode, suite.name) == (1, str(log))
-    assert {case.name for case in suite} == set(criteria)
+    assert (told.returncode, suite.name) == (1, str(log)) and {case.name for case in suite} == set(criteria)
     failures = {case.name for case in suite if any(isinstance(result, Failure) for result in case.result)}
     assert failures == {name for name, outcome in criteria.items() if outcome == "failed"} != set()
     assert {case.classname for case in suite} == {f"{log}/check"}
@@ -90,8 +89,7 @@ def test_a_command_that_cannot_run_is_one_error(
     assert [case.name for case in suite_in(tmp_path / "same.xml")] == [name]
     (case,) = suite_in(tmp_path / "j.xml")
     (error,) = case.result
-    assert (told.returncode, case.name, type(error)) == (code, name, Error)
-    assert said in error.message
+    assert (told.returncode, case.name, type(error)) == (code, name, Error) and said in error.message
     assert f"splatctrl: {error.message}\n" == told.stderr
 
 
@@ -193,13 +191,11 @@ def audits(tmp_path: Path) -> tuple[Path, Path]:
 
 def test_a_regression_exits_with_1_and_is_a_failure_in_junit(audits: tuple[Path, Path], tmp_path: Path) -> None:
     told = splatctrl("compare", *audits, "--junit", tmp_path / "j.xml")
-    assert told.returncode == 1
-    assert told.stdout.startswith("compare: REGRESSION (")
+    assert told.returncode == 1 and told.stdout.startswith("compare: REGRESSION (")
     assert "min_clearance: worse went from 0.0158572 to 0.001 m, 0.0149 worse, allowed 0.001 at 0.92 s" in told.stdout
     lines = {line.split()[0]: line for line in told.stdout.splitlines()[4:] if line}
     assert "0.92 s, state 46, hand[11] near unrepresented voxel" in lines["min_clearance"]
-    assert "better" in lines["min_self_clearance"]
-    assert "num_states" not in lines
+    assert "better" in lines["min_self_clearance"] and "num_states" not in lines
     assert lines["control.margin"].split() == ["control.margin", "0.02", "0.03"]
     (suite,) = JUnitXml.fromfile(str(tmp_path / "j.xml"))
     assert [case.name for case in suite if isinstance((case.result or [None])[0], Failure)] == ["min_clearance"]

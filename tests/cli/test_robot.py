@@ -34,8 +34,7 @@ def test_a_fit_writes_spheres_that_a_check_finds_complete(
     out, picture = tmp_path / "s.yaml", tmp_path / "s.png"
     fitted = result(capsys, "spheres", "--urdf", urdf, "--max-spheres", 5, "-o", out, "--picture", picture)
     checked = result(capsys, "check", "--urdf", urdf, "--spheres", out, "--require", "max_deficit<=0")
-    assert fitted["metrics"] == checked["metrics"]
-    assert fitted["links"] == checked["links"]
+    assert fitted["metrics"] == checked["metrics"] and fitted["links"] == checked["links"]
     assert checked["metrics"]["uncovered_share"] == 0  # type: ignore[index]
     assert len(read_spheres(out).radii) == checked["metrics"]["num_spheres"] <= 5  # type: ignore[index]
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -48,12 +47,9 @@ def test_the_table_names_links_and_what_sticks_out(capsys: pytest.CaptureFixture
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[0].startswith("robot check: PASSED (1 spheres on 2 links)")
-    assert lines[2].split()[:2] == ["link", "spheres"]
-    assert lines[4].split()[0] == "base"
-    assert "no sphere" in lines[4]
-    assert "10.0" in lines[5]
-    assert "1 spheres: 100.0 % of the surface outside" in out
-    assert "no sphere stands for base" in out
+    assert lines[2].split()[:2] == ["link", "spheres"] and lines[4].split()[0] == "base"
+    assert "no sphere" in lines[4] and "10.0" in lines[5]
+    assert "1 spheres: 100.0 % of the surface outside" in out and "no sphere stands for base" in out
 
 
 def test_gates_hold_a_set_to_its_figures(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:

@@ -35,21 +35,13 @@ def test_the_table_shows_each_view_and_the_mean(scored: Path, capsys: pytest.Cap
     assert table[0].split("  ")[0] == "view"
     assert [line.split()[0] for line in table[2:5]] == ["cam3-0001", "cam3-0002", "cam3-0003"]
     assert table[6].startswith("mean of 3")
-    assert "3 views scored, 1 before the first snapshot" in lines[-2]
-    assert lines[-1].startswith("in front: ")
+    assert "3 views scored, 1 before the first snapshot" in lines[-2] and lines[-1].startswith("in front: ")
 
 
 def test_a_gate_that_fails_leaves_the_scores_and_exits_1(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(scored, "-o", scored / "score", "--require", "psnr_seen>=20", "--require", "psnr_all>=90") == 5
     assert "psnr_all is" in capsys.readouterr().out
     assert (scored / "score" / "score.json").is_file()
-
-
-def test_a_gate_on_an_unknown_metric_is_refused_before_anything_is_rendered(
-    scored: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(FakeScene, "splats_at", lambda scene, stamp_ns: pytest.fail("rendered"))
-    assert run(scored, "--require", "num_skipped<=1", "--require", "sharpness>=1") == 2
 
 
 def test_damaged_input_exits_3(scored: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,8 +53,7 @@ def test_free_space_is_printed_and_gated(scored: Path, capsys: pytest.CaptureFix
     (scored / "scene" / "occupancy.npz").touch()
     assert run(scored, "--require", "free_mass<=0.1") == 1
     out = capsys.readouterr().out
-    assert "of the splats' mass is in space observed free" in out
-    assert "in front" in out
+    assert "of the splats' mass is in space observed free" in out and "in front" in out
 
 
 def test_a_scene_that_cannot_be_compared_prints_one_line(

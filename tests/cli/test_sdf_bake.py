@@ -20,8 +20,7 @@ from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.formats.splat.splats import FORMATS, write_ply
 from splatctrl_cli.jobs.bake.accuracy import SUMMARY_METRICS
 from splatctrl_cli.simulate.truth import load_truth
-from tests.cli import here
-from tests.cli.test_command_line import splatctrl
+from tests.cli.here import splatctrl
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.stage import interrupt
 from tests.plain import known, plain_grid
@@ -33,13 +32,9 @@ COARSE = ("--set", "field.max_loss=1")  # cells that are baked in no time
 @pytest.fixture(scope="module")
 def splats(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("splats") / "splats.ply"
-    write_ply(path, splat_set(*cloud_without_points()), {})
-    return path
-
-
-def cloud_without_points():  # type: ignore[no-untyped-def]
     centers, radii = cloud()
-    return centers, radii + 0.001  # a PLY holds log radii
+    write_ply(path, splat_set(centers, radii + 0.001), {})  # a PLY holds log radii
+    return path
 
 
 def test_bakes_both_formats_a_header_and_a_run(tmp_path: Path, splats: Path) -> None:
@@ -59,11 +54,10 @@ def test_bakes_both_formats_a_header_and_a_run(tmp_path: Path, splats: Path) -> 
 
 
 def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
-    result = here.splatctrl(
+    result = splatctrl(
         "sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--require", "num_splats>1000000"
     )
-    assert result.returncode == 1
-    assert "num_splats is 600, required > 1e+06" in result.stdout
+    assert result.returncode == 1 and "num_splats is 600, required > 1e+06" in result.stdout
     assert (tmp_path / "field" / "field.npz").exists()
 
 
@@ -78,7 +72,7 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     write_ply(tmp_path / "true.ply", splat_set(surface, np.full(len(surface), 0.002)), {})
     corners = ",".join(f"{value}" for value in box.ravel())
     trimesh.creation.box(bounds=box).export(tmp_path / "box.ply")
-    result = here.splatctrl(
+    result = splatctrl(
         "sdf-bake",
         tmp_path / "true.ply",
         *("-o", tmp_path / "field", f"--box={corners}", "--voxel", 0.03, *COARSE, "--formats", "npz"),
@@ -90,19 +84,18 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     accuracy = json.loads((tmp_path / "field" / "field.json").read_text())["accuracy"]["truth"]
     metrics = json.loads((tmp_path / "field" / "run.json").read_text())["metrics"]
     assert sorted(set(metrics) - {"devices"}) == sorted((*SUMMARY_METRICS, *metric_names(FIELDS))), "as checked"
-    assert accuracy["num_seen"] > 50
-    assert accuracy["holds"] is True
-    assert f"of {accuracy['num_seen']} seen cells" in result.stdout
+    assert accuracy["num_seen"] > 50 and accuracy["holds"] is True
     rows = [line.split()[:2] for line in result.stdout.splitlines() if line.startswith(("seen  ", "all   "))]
     assert rows == [[where, name] for where in ("seen", "all") for name in FIELDS for _ in range(4)]
-    assert "all: also those before backs that none saw" in result.stdout
-    assert "probability, calibrated: calibration error" in result.stdout
-    assert f"--set field.error_mean={accuracy['error_mean']:.4f}" in result.stdout
-    assert "held-out depth of 1 frames" in result.stdout
+    for text in (
+        f"of {accuracy['num_seen']} seen cells",
+        *("all: also those before backs that none saw", "probability, calibrated: calibration error"),
+        *(f"--set field.error_mean={accuracy['error_mean']:.4f}", "held-out depth of 1 frames", "from mesh cm"),
+    ):
+        assert text in result.stdout
     assert [line.split()[:2] for line in result.stdout.splitlines() if "  on it " in line] == [
         [name, "on"] for name in ("sdf", "hard")
     ]
-    assert "from mesh cm" in result.stdout
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +121,7 @@ def test_a_scene_is_baked_as_it_was_known_then(
 ) -> None:
     times = [] if at is None else ["--at", at]
     box = "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3"
-    result = here.splatctrl("sdf-bake", scene, "-o", tmp_path / "field", box, "--voxel", 0.1, *COARSE, *times)
+    result = splatctrl("sdf-bake", scene, "-o", tmp_path / "field", box, "--voxel", 0.1, *COARSE, *times)
     assert result.returncode == 0, result.stderr
     grid = read_npz(tmp_path / "field" / "field.npz")
     assert exact_channel(grid)[1, 1, 4] == pytest.approx(0.3 - height - 0.01, abs=1e-6)
@@ -141,7 +134,7 @@ def test_a_scene_is_baked_as_it_was_known_then(
 
 @pytest.mark.painted
 def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) -> None:
-    result = here.splatctrl(
+    result = splatctrl(
         "sdf-bake", scene, "-o", tmp_path / "field", "--box=7,7,7,8,8,8", "--voxel", 0.5, *COARSE, "--json"
     )
     verdict = json.loads(result.stdout)["verdict"]
@@ -149,7 +142,7 @@ def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) 
     assert "no cell of the grid was ever seen by a camera; give a --box that the cameras saw" in result.stderr
     assert json.loads(result.stdout)["num_warnings"] == sum(reason["is_note"] for reason in verdict["reasons"])
     assert json.loads((tmp_path / "field" / "run.json").read_text())["verdict"] == verdict
-    inside = here.splatctrl(
+    inside = splatctrl(
         "sdf-bake", scene, "-o", tmp_path / "seen", "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, *COARSE
     )
     assert inside.returncode == 0
@@ -162,8 +155,7 @@ def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
     assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
     assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
     assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
-    assert tuple(FORMATS) == scene_options.SPLAT_FORMATS
-    assert tuple(baker.CHANNELS) == scene_options.CHANNELS
+    assert tuple(FORMATS) == scene_options.SPLAT_FORMATS and tuple(baker.CHANNELS) == scene_options.CHANNELS
     assert scene_options.CHANNELS[:4] == baker.DEFAULT_CHANNELS
 
 
@@ -173,7 +165,7 @@ def test_options_and_configuration_say_the_same(tmp_path: Path, splats: Path) ->
     settings = [part for key in keys for part in ("--set", f"field.{key}")]
     same = ["--box=-0.2,-0.2,-0.2,0.2,0.2,0.2", "--voxel", 0.05, *COARSE, "--no-report"]
     for name, given in (("a", options), ("b", settings)):
-        assert here.splatctrl("sdf-bake", splats, "-o", tmp_path / name, *same, *given).returncode == 0
+        assert splatctrl("sdf-bake", splats, "-o", tmp_path / name, *same, *given).returncode == 0
     first, second = ((tmp_path / name / "field.npz").read_bytes() for name in "ab")
     assert first == second
 
@@ -190,13 +182,11 @@ def test_cameras_that_were_held_out_follow_the_log(tmp_path: Path) -> None:
 def test_the_field_that_is_updated_is_not_replaced(tmp_path: Path, splats: Path) -> None:
     field = tmp_path / "field"
     given = ["sdf-bake", splats, "-o", field, "--voxel", 0.1, *COARSE, "--formats", "npz", "--no-report"]
-    assert here.splatctrl(*given).returncode == 0
-    again = here.splatctrl(*given, "--update", field, "--force")
-    assert again.returncode == 2
-    assert "would replace the input" in again.stderr
-    updated = here.splatctrl(*given, "--update", field, "-o", tmp_path / "same")
-    assert updated.returncode == 0
-    assert "blocks baked" in updated.stdout
+    assert splatctrl(*given).returncode == 0
+    again = splatctrl(*given, "--update", field, "--force")
+    assert again.returncode == 2 and "would replace the input" in again.stderr
+    updated = splatctrl(*given, "--update", field, "-o", tmp_path / "same")
+    assert updated.returncode == 0 and "blocks baked" in updated.stdout
     assert (tmp_path / "same" / "field.npz").read_bytes() == (field / "field.npz").read_bytes()
 
 
@@ -204,10 +194,9 @@ def test_resume_goes_on_with_what_is_left(tmp_path: Path, splats: Path, monkeypa
     given = ["sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--formats", "npz"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("splatctrl_cli.field.header.label_counts", interrupt)
-        stopped = here.splatctrl(*given)
+        stopped = splatctrl(*given)
     assert stopped.returncode == 130
     assert f"field.partial is kept; continue it with: splatctrl sdf-bake --resume {splats} " in stopped.stderr
     monkeypatch.setattr(Baker, "bake", None)  # nothing is left to bake
-    resumed = here.splatctrl(*given, "--resume")
-    assert resumed.returncode == 0
-    assert "continues after" in resumed.stderr
+    resumed = splatctrl(*given, "--resume")
+    assert resumed.returncode == 0 and "continues after" in resumed.stderr

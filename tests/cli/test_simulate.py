@@ -12,8 +12,7 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import SLIM, arm_urdf
 from splatctrl_cli.simulate.truth import load_truth
-from tests.cli import here
-from tests.cli.test_command_line import splatctrl
+from tests.cli.here import splatctrl
 
 TINY = ("--duration", "0.6", "--fps", "5", "--width", "64", "--height", "48")
 
@@ -44,7 +43,7 @@ def test_it_writes_log_truth_robot_run_and_scan(recorded: Path) -> None:
 
 
 def test_the_same_command_writes_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
-    result = here.splatctrl("simulate", "-o", tmp_path / "again", *TINY, "--dtu", "-q")
+    result = splatctrl("simulate", "-o", tmp_path / "again", *TINY, "--dtu", "-q")
     assert result.returncode == 0
     files = [path.relative_to(recorded) for path in recorded.rglob("*") if path.is_file() and path.name != "run.json"]
     assert len(files) > 30
@@ -70,8 +69,7 @@ def test_the_container_is_a_ros_2_profile_with_checksums_and_full_schemas(record
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
-        assert summary is not None
-        assert all(chunk.compression == "zstd" for chunk in summary.chunk_indexes)
+        assert summary is not None and all(chunk.compression == "zstd" for chunk in summary.chunk_indexes)
         assert all(schema.encoding == "ros2msg" for schema in summary.schemas.values())
         schema = next(s for s in summary.schemas.values() if s.name == "sensor_msgs/msg/CameraInfo")
         assert b"MSG: sensor_msgs/RegionOfInterest" in schema.data
@@ -117,7 +115,7 @@ def test_a_slim_arm_with_a_tool_has_its_collision_shapes_in_the_urdf_and_the_too
 ) -> None:
     out = tmp_path / "slim"
     parts = ("--slim", "--unmodelled", "tool,cable", "--noise", "stereo")
-    result = here.splatctrl("simulate", "-o", out, *TINY, *parts, "-q")
+    result = splatctrl("simulate", "-o", out, *TINY, *parts, "-q")
     assert (result.returncode, result.stderr) == (0, "")
     assert (out / "robot.urdf").read_text() == arm_urdf(SLIM)
     assert (out / "robot_spheres.yaml").read_bytes() == (recorded / "robot_spheres.yaml").read_bytes()
@@ -138,6 +136,6 @@ def test_a_slim_arm_with_a_tool_has_its_collision_shapes_in_the_urdf_and_the_too
     ],
 )
 def test_parts_of_another_arm_are_refused(tmp_path: Path, options: tuple[str, ...], message: str) -> None:
-    result = here.splatctrl("simulate", "-o", tmp_path / "out", *TINY, *options)
+    result = splatctrl("simulate", "-o", tmp_path / "out", *TINY, *options)
     assert result.returncode == 2 and message in result.stderr
     assert not (tmp_path / "out").exists()

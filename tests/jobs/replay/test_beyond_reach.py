@@ -22,7 +22,7 @@ from tests.cli.replay_desk import splats_of
 from tests.jobs.bake.baked import baked
 from tests.jobs.score.test_score import run as scores
 from tests.jobs.score.wall import FRAMES, FakeScene, FakeSource, set_up, wall, write_scene
-from tests.jobs.stage import FAR, Stage, ball_beside, patch_json, voxels
+from tests.jobs.stage import Stage, ball_beside, patch_json, voxels
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 
@@ -41,8 +41,7 @@ def in_the_way(stage: Stage) -> SplatSet:
     return splats_of(ball, *(((x, y, 0.5), 0.3) for x in (-2.0, 2.0) for y in np.arange(-2.0, 2.0, 0.4)))
 
 
-@pytest.mark.parametrize("is_known", [True, False], ids=["known space", "unknown space"])
-@pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
+@pytest.mark.parametrize(("mode", "is_known"), [("audit", False), ("open-loop", True), ("closed-loop", True)])
 def test_a_shell_in_the_arms_way_changes_no_verdict_and_no_step(stage: Stage, mode: str, is_known: bool) -> None:
     stage.last_seen = None if is_known else voxels(is_known=False)
     bare = stage.judged(mode=mode, scene=stage.scene("bare"))
@@ -50,12 +49,6 @@ def test_a_shell_in_the_arms_way_changes_no_verdict_and_no_step(stage: Stage, mo
     given = stage.judged(mode=mode, scene=with_shell(stage.scene("given"), in_the_way(stage)))
     assert given == bare and steps == stage.desk.rows()
     assert bare[1]["label"] == ("safe" if is_known else bare[1]["label"]) and (bare[0] == 0) == is_known
-
-
-def test_what_is_in_the_way_is_contact_where_it_is_no_shell(stage: Stage) -> None:
-    """Or the runs above would show nothing."""
-    stage.balls = (FAR, ball_beside(stage.arm, stage.states[-1].position, -0.03))
-    assert stage.judged()[1]["label"] == "contact"
 
 
 @pytest.mark.parametrize("at", [None, 0.3])
@@ -105,8 +98,10 @@ def test_a_shell_alone_is_refused_wherever_splats_are_taken(
 
 def test_other_splats_in_the_place_of_a_shell_are_refused(stage: Stage) -> None:
     """As a changed or missing file is, by its digest."""
-    scene = with_shell(stage.scene(), in_the_way(stage))
+    scene = stage.scene()
     stamp_ns = open_scene(scene).snapshots[-1].stamp_ns
+    assert open_scene(scene).shell_at(None) is None and open_scene(scene).shell_at(stamp_ns) is None
+    with_shell(scene, in_the_way(stage))
     assert open_scene(scene).shell_at(None) is not None and open_scene(scene).shell_at(stamp_ns) is not None
     (scene / "shell.ply").write_bytes((scene / "splats.ply").read_bytes())
     with pytest.raises(InputError, match=r"shell.ply: was changed after it was written"):
@@ -115,11 +110,6 @@ def test_other_splats_in_the_place_of_a_shell_are_refused(stage: Stage) -> None:
     with pytest.raises(InputError, match="expected a shell, got other splats"):
         open_scene(scene).shell_at(None)
     assert len(open_scene(scene).splats()) == 1
-
-
-def test_a_scene_without_the_file_has_no_shell(stage: Stage) -> None:
-    scene = open_scene(stage.scene())
-    assert scene.shell_at(None) is None and scene.shell_at(scene.snapshots[0].stamp_ns) is None
 
 
 def test_a_score_shows_the_shell_and_keeps_its_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,16 +133,14 @@ def test_a_score_shows_the_shell_and_keeps_its_depth(tmp_path: Path, monkeypatch
     assert [views[True][name] for name in kept] == [views[False][name] for name in kept]
 
 
-def test_a_recording_with_a_robot_has_a_shell_and_counts_it_apart(tmp_path: Path) -> None:
-    small = ["--duration", "0.8", "--width", "96", "--height", "72", "-q"]
-    assert main(["simulate", "-o", str(tmp_path / "log"), *small]) == 0
+def test_a_recording_with_a_robot_has_a_shell_and_counts_it_apart(small_recording: Path, tmp_path: Path) -> None:
     fast = ["--max-splats", "400", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4", "-q"]
-    log = [str(tmp_path / "log" / "log.mcap"), "--cameras", "cam1,cam2", *fast]
+    log = [str(small_recording / "log.mcap"), "--cameras", "cam1,cam2", *fast]
     robot = [
         "--urdf",
-        str(tmp_path / "log" / "robot.urdf"),
+        str(small_recording / "robot.urdf"),
         "--spheres",
-        str(tmp_path / "log" / "robot_spheres.yaml"),
+        str(small_recording / "robot_spheres.yaml"),
     ]
     found = {}
     for name, more in (("with", robot), ("without", [*robot, "--set", "scene.shell=0"])):

@@ -112,8 +112,7 @@ def test_a_step_of_any_kind_that_is_not_solved_fails_the_controller(what: str) -
     run = judged(closed_loop=SimpleNamespace(steps=[None] * 5), events=[event(EventKind(what.replace("_", "-")))])
     run.metrics |= {f"num_{name}": 0 for name in ("relaxed", "minimum_violation", "hold")} | {f"num_{what}": 2}
     (reason,) = controller(run)
-    assert reason.outcome is Outcome.FAILED
-    assert f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
+    assert reason.outcome is Outcome.FAILED and f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
 
 
 def bodied(deficit: tuple[float, float], surface: float) -> Any:
@@ -139,8 +138,7 @@ def test_what_the_spheres_leave_uncovered_must_keep_the_margin_too(surface: floa
 
 def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
     (reason,) = surface_clearance(bodied((0.0, np.nan), 0.025))
-    assert reason.outcome is Outcome.NOT_EVALUABLE
-    assert "is unknown: no meshes" in reason.sentence
+    assert reason.outcome is Outcome.NOT_EVALUABLE and "is unknown: no meshes" in reason.sentence
 
 
 def test_one_state_judged_by_an_old_map_is_enough() -> None:

@@ -35,19 +35,11 @@ FAST = ["--threads", "1", "-q", *(word for setting in SETTINGS for word in ("--s
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recording") / "small"
-    size = ["--duration", "1.0", "--width", "96", "--height", "72"]
-    assert main(["simulate", "-o", str(folder), *size, "-q"]) == 0
-    return folder
-
-
-@pytest.fixture(scope="module")
-def replayed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dict[str, str]]]:
+def replayed(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dict[str, str]]]:
     """The steps of a replay of the recording, in lockstep or (with `scene`) after `reconstruct`."""
     folder = tmp_path_factory.mktemp("replays")
-    robot = ["--urdf", str(recording / "robot.urdf"), "--spheres", str(recording / "robot_spheres.yaml")]
-    log = [str(recording / "log.mcap"), *robot, "--cameras", "cam0,cam1", *FAST]
+    robot = ["--urdf", str(small_recording / "robot.urdf"), "--spheres", str(small_recording / "robot_spheres.yaml")]
+    log = [str(small_recording / "log.mcap"), *robot, "--cameras", "cam0,cam1", *FAST]
 
     def replay(*options: str, every: int = 1, has_folder: bool = False) -> list[dict[str, str]]:
         number = len(list(folder.iterdir()))
@@ -85,8 +77,7 @@ def test_a_closed_loop_in_lockstep_drives_as_in_the_reconstruction(
     rows, expected = replayed(*drive), replayed(*drive, has_folder=True)
     for row in (*rows, *expected):
         del row["unknown_share"]  # known space is what was seen until the arm stopped, there in the whole log
-    assert rows == expected
-    assert {float(row["map_age_s"]) >= 0.3 - 1e-9 for row in rows} == {True}
+    assert rows == expected and {float(row["map_age_s"]) >= 0.3 - 1e-9 for row in rows} == {True}
 
 
 def test_a_lockstep_measures_how_far_off_the_cameras_see_the_robot(sample_data: Path, tmp_path: Path) -> None:
@@ -98,9 +89,9 @@ def test_a_lockstep_measures_how_far_off_the_cameras_see_the_robot(sample_data: 
 
 
 def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
-    recording: Path, tmp_path: Path, arm: RobotModel
+    small_recording: Path, tmp_path: Path, arm: RobotModel
 ) -> None:
-    scene = opened(recording, tmp_path, arm, latency=0.25)
+    scene = opened(small_recording, tmp_path, arm, latency=0.25)
     assert len(scene.stamps_ns) == 1
     first = scene.stamps_ns[0]
     assert scene.first_ns == first + SECOND // 4
@@ -119,7 +110,7 @@ def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
 
 
 def test_the_log_is_read_four_times(
-    replayed: Callable[..., list[dict[str, str]]], recording: Path, monkeypatch: pytest.MonkeyPatch
+    replayed: Callable[..., list[dict[str, str]]], small_recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For its survey, the checks that can stop it, in lockstep with the clock, and for the truth and worst frames."""
     passes: list[object] = []
@@ -130,7 +121,7 @@ def test_the_log_is_read_four_times(
         passes.append(names)
 
     monkeypatch.setattr(McapLog, "messages", counted)
-    assert replayed("--truth", str(recording / "truth.json"))
+    assert replayed("--truth", str(small_recording / "truth.json"))
     assert len(passes) == 4 and passes[0] is None
 
 
@@ -147,21 +138,21 @@ def test_the_clock_is_estimated_from_every_frame_also_where_the_arm_stops_before
 
 
 def test_the_fit_of_a_lockstep_computes_where_it_is_told_to(
-    recording: Path, tmp_path: Path, arm: RobotModel, monkeypatch: pytest.MonkeyPatch
+    small_recording: Path, tmp_path: Path, arm: RobotModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory = EmulatedDevice()
     cards(monkeypatch, memory)
-    scene = opened(recording, tmp_path, arm, latency=0.0, device="cuda")
+    scene = opened(small_recording, tmp_path, arm, latency=0.0, device="cuda")
     scene.finish()
     assert [each["device"] for each in run_of(tmp_path / "scene")["metrics"]["devices"]] == ["cuda:0"]
     assert not memory.sizes  # given back
     with pytest.raises(UsageError, match="--device cuda: expected --lockstep"):
-        check_lockstep(ReplayRequest(log=recording, out=tmp_path, scene=tmp_path, device="cuda"))
+        check_lockstep(ReplayRequest(log=small_recording, out=tmp_path, scene=tmp_path, device="cuda"))
 
 
-def test_it_says_how_long_a_frame_set_took(recording: Path, tmp_path: Path, arm: RobotModel) -> None:
+def test_it_says_how_long_a_frame_set_took(small_recording: Path, tmp_path: Path, arm: RobotModel) -> None:
     said = Said()
-    scene = opened(recording, tmp_path, arm, latency=0.0, console=said)
+    scene = opened(small_recording, tmp_path, arm, latency=0.0, console=said)
     scene.advance(scene.stamps_ns[0] + SECOND)
     scene.finish()
     found = re.search(
@@ -172,7 +163,7 @@ def test_it_says_how_long_a_frame_set_took(recording: Path, tmp_path: Path, arm:
 
 
 def opened(
-    recording: Path,
+    small_recording: Path,
     folder: Path,
     arm: RobotModel,
     *,
@@ -181,8 +172,8 @@ def opened(
     console: Progress = SILENT,
 ) -> known_scene.KnownScene:
     request = ReplayRequest(
-        log=recording / "log.mcap",
-        urdf=recording / "robot.urdf",
+        log=small_recording / "log.mcap",
+        urdf=small_recording / "robot.urdf",
         out=folder,
         options=SourceOptions(cameras=("cam0", "cam1")),
         lockstep=True,

@@ -51,8 +51,7 @@ def test_what_is_within_reach_of_a_sphere_anywhere_in_its_cell_is_near() -> None
     swept = evidence.Swept(np.zeros((1, 3)), np.array([0.05]), reach=0.1)
     corners = SPHERE_CELL * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 1]])
     reached = corners + 0.149 * np.array([[-1.0, 0, 0], [1, 0, 0], [3**-0.5] * 3])
-    assert len(swept.near(reached)) == 3
-    assert len(swept.near(np.array([[0.22, 0.0, 0.0]]))) == 0
+    assert len(swept.near(reached)) == 3 and len(swept.near(np.array([[0.22, 0.0, 0.0]]))) == 0
 
 
 def view(stamp_ns: int, depth: float | Float64, eye: Float64 = FROM, camera: str = "cam9") -> RgbdFrame:
@@ -86,6 +85,13 @@ def scene(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ["--scene", str(folder), *FAR, "-q"]
 
 
+def judged(desk: Desk, scene: list[str], frames: list[RgbdFrame], code: int = 0) -> Any:
+    """The metrics of an audit that ends with this code, where cam9 recorded these frames."""
+    desk.source = FilmedSource(states=logged(), frames=frames)
+    assert desk.replay(*scene, "--evidence", "cam9", "--force", is_judged=True) == code
+    return desk.metrics()
+
+
 def reason(desk: Desk, criterion: str = "map error") -> dict[str, Any]:
     (found,) = [reason for reason in desk.verdict()["reasons"] if reason["criterion"] == criterion]
     return found
@@ -98,8 +104,7 @@ def test_the_bound_is_that_of_what_the_map_misses(desk: Desk, scene: list[str]) 
     assert metrics["map_error_bound"] == pytest.approx(MISSES.max(), abs=1e-4)
     assert metrics["map_error_blocks"] == expected.num_stretches >= 4
     assert metrics["map_error_confidence"] == pytest.approx(expected.num_stretches / (expected.num_stretches + 1))
-    assert reason(desk)["outcome"] == "passed"
-    assert reason(desk)["count"] == len(MISSES) * SIZE[0] * SIZE[1]
+    assert reason(desk)["outcome"] == "passed" and reason(desk)["count"] == len(MISSES) * SIZE[0] * SIZE[1]
     assert f"map error at most {1e3 * metrics['map_error_bound']:.1f} mm with" in desk.verdict()["sentence"]
 
 
@@ -117,19 +122,16 @@ def test_a_bound_larger_than_the_clearance_alone_turns_the_verdict(
     least = clearance(arm, START)
     misses = MISSES.copy()
     misses[6] = least + 0.02
-    desk.source = FilmedSource(states=logged(), frames=showing(misses))
     assert desk.replay(*scene, is_judged=True) == 0
-    assert desk.replay(*scene, "--evidence", "cam9", out="with", is_judged=True) == 5
-    verdict = desk.verdict("with")
+    judged(desk, scene, showing(misses), 5)
+    verdict = desk.verdict()
     assert verdict["label"] == "not evaluable"
     (broken,) = [reason for reason in verdict["reasons"] if reason["outcome"] != "passed"]
-    assert broken["criterion"] == "map error"
-    assert broken["time_s"] == pytest.approx(0.6)
+    assert broken["criterion"] == "map error" and broken["time_s"] == pytest.approx(0.6)
     assert broken["place"] == pytest.approx([*BALL[0][:2], BALL[0][2] + BALL[1] + misses[6]], abs=2e-3)
     assert broken["value"] == pytest.approx(-0.02, abs=1e-3)
     misses[6] = least - 0.005
-    desk.source = FilmedSource(states=logged(), frames=showing(misses))
-    assert desk.replay(*scene, "--evidence", "cam9", out="less", is_judged=True) == 0
+    judged(desk, scene, showing(misses))
 
 
 def test_a_contact_outranks_it(desk: Desk, scene: list[str], arm: RobotModel) -> None:
@@ -137,13 +139,11 @@ def test_a_contact_outranks_it(desk: Desk, scene: list[str], arm: RobotModel) ->
     splats = splats_of(BALL, ((x, y, z), 0.02))
     touched = write_scene(desk.folder / "touched", (0, splats), (SECOND, splats))
     assert desk.replay("--scene", str(touched), *scene[2:], "--evidence", "cam9", is_judged=True) == 1
-    assert desk.verdict()["label"] == "contact"
-    assert reason(desk)["outcome"] == "not evaluable"
+    assert desk.verdict()["label"] == "contact" and reason(desk)["outcome"] == "not evaluable"
 
 
 def test_without_evidence_the_sentence_says_so_and_a_request_can_ask_for_it(desk: Desk, scene: list[str]) -> None:
-    assert desk.replay(*scene, is_judged=True) == 0
-    assert "map error not measured" in desk.verdict()["sentence"]
+    assert desk.replay(*scene, is_judged=True) == 0 and "map error not measured" in desk.verdict()["sentence"]
     assert {desk.metrics()[f"map_error_{name}"] for name in ("bound", "blocks", "confidence")} == {None}
     assert desk.replay(*scene, "--require-evidence", out="asked", is_judged=True) == 5
     assert desk.verdict("asked")["reasons"][0]["criterion"] == "map error"
@@ -154,10 +154,8 @@ def test_without_evidence_the_sentence_says_so_and_a_request_can_ask_for_it(desk
 
 
 def test_too_few_stretches_are_no_bound(desk: Desk, scene: list[str]) -> None:
-    desk.source = FilmedSource(states=logged(), frames=showing(MISSES)[:1])
-    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 5
+    assert judged(desk, scene, showing(MISSES)[:1], 5)["map_error_bound"] is None
     assert "of 1 held-out frame sets in the judged time 1 show surface" in reason(desk)["sentence"]
-    assert desk.metrics()["map_error_bound"] is None
     assert "map error not measured" in desk.verdict()["notes"]
 
 
@@ -178,22 +176,19 @@ def test_what_shows_the_robot_is_no_surface_that_the_map_misses(
     centers, radii = arm.sphere_centers(START), arm.sphere_set.radii
     top = int(np.argmax(centers[:, 2] + radii))
     eye = centers[top] + [0.0, 0.0, 1.0]
-    frames = [view(k * SECOND // 10, 1.0 - radii[top] - 0.02, eye=eye) for k in range(11)]
-    desk.source = FilmedSource(states=logged(), frames=frames)
-    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 5
+    on, beside = (
+        [view(k * SECOND // 10, 1.0 - radii[top] - gap, eye=eye) for k in range(11)] for gap in (0.02, 0.05)
+    )
+    judged(desk, scene, on, 5)
     assert "0 show surface" in desk.verdict()["sentence"]
-    beside = [view(k * SECOND // 10, 1.0 - radii[top] - 0.05, eye=eye) for k in range(11)]
-    desk.source = FilmedSource(states=logged(), frames=beside)
-    assert desk.replay(*scene, "--evidence", "cam9", out="beside") == 0
-    assert desk.metrics("beside")["map_error_bound"] > 0.2
+    assert judged(desk, scene, beside, 5)["map_error_bound"] > 0.2
 
 
 def test_pixels_at_an_edge_of_depth_are_left_out(desk: Desk, scene: list[str]) -> None:
     depth = np.full(SIZE[::-1], 1.0 - BALL[1] - 0.004)
     depth[:, 3] = 0.7  # flies between two surfaces, 25 cm before the ball
-    desk.source = FilmedSource(states=logged(), frames=[view(k * SECOND // 10, depth) for k in range(11)])
-    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
-    assert desk.metrics()["map_error_bound"] == pytest.approx(0.004, abs=1e-4)
+    metrics = judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])
+    assert metrics["map_error_bound"] == pytest.approx(0.004, abs=1e-4)
     assert reason(desk)["count"] == 11 * SIZE[1] * (SIZE[0] - 3)
 
 
@@ -201,13 +196,10 @@ def test_the_largest_miss_of_a_view_counts_and_a_map_that_is_too_fat_misses_noth
     desk: Desk, scene: list[str]
 ) -> None:
     depth = np.full(SIZE[::-1], 1.0 - BALL[1] + 0.002)  # within the ball
-    desk.source = FilmedSource(states=logged(), frames=[view(k * SECOND // 10, depth) for k in range(11)])
-    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
-    assert desk.metrics()["map_error_bound"] == 0.0
+    assert judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])["map_error_bound"] == 0.0
     depth[4, 5] = 1.0 - BALL[1] - 0.013
-    desk.source = FilmedSource(states=logged(), frames=[view(k * SECOND // 10, depth) for k in range(11)])
-    assert desk.replay(*scene, "--evidence", "cam9", out="one", is_judged=True) == 0
-    assert desk.metrics("one")["map_error_bound"] == pytest.approx(0.013, abs=1e-4)
+    metrics = judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])
+    assert metrics["map_error_bound"] == pytest.approx(0.013, abs=1e-4)
 
 
 def test_what_spheres_leave_of_the_robot_uncovered_is_the_robot_as_well(
@@ -291,8 +283,7 @@ def test_every_set_either_trains_or_is_evidence(recording: Path) -> None:
     for every in (2, 3, 5):
         given = list(time_steps(source.records(), source.cameras, has_clock=True))
         kept, left = [s.stamp_ns for s in trained(given, every)], [s.stamp_ns for s in held_out(given, every)]
-        assert sorted(kept + left) == steps and not set(kept) & set(left)
-        assert left == steps[every - 1 :: every]
+        assert sorted(kept + left) == steps and not set(kept) & set(left) and left == steps[every - 1 :: every]
 
 
 @pytest.mark.parametrize("evidence", ["2", "cam3"])
@@ -319,9 +310,7 @@ def test_the_map_of_evidence_is_the_one_that_states_before_it_were_judged_by(des
         desk.folder / "grown", (0, splats_of(low)), (SECOND // 2, splats_of(BALL)), (SECOND, splats_of(BALL))
     )
     frames = [view(k * SECOND // 10, 1.0 - BALL[1]) for k in (5, 6, 8, 10)]  # from 0.5 s on, as it is then
-    desk.source = FilmedSource(states=logged(), frames=frames)
-    assert desk.replay("--scene", str(grown), *scene[2:], "--evidence", "cam9") == 0
-    assert desk.metrics()["map_error_bound"] == pytest.approx(0.03, abs=1e-4)
-    desk.source = FilmedSource(states=logged(), frames=frames[1:])
-    assert desk.replay("--scene", str(grown), *scene[2:], "--evidence", "cam9", out="later") == 0
-    assert desk.metrics("later")["map_error_bound"] == pytest.approx(0.0, abs=1e-4)
+    for shown, bound in ((frames, 0.03), (frames[1:], 0.0)):
+        desk.source = FilmedSource(states=logged(), frames=shown)
+        assert desk.replay("--scene", str(grown), *scene[2:], "--evidence", "cam9", "--force") == 0
+        assert desk.metrics()["map_error_bound"] == pytest.approx(bound, abs=1e-4)

@@ -99,7 +99,7 @@ def alike(a: str, b: str) -> bool:
 
 def test_a_controller_that_is_good_is_safe_and_named(stage: Stage) -> None:
     shutil.copy(EXAMPLES / "reach.py", stage.desk.folder)
-    stage.states = passing(0.3 * MOVE)
+    stage.states = passing(0.1 * MOVE)
     code, verdict = stage.judged("--controller", "reach:Reach", "--controller-twice", mode="closed-loop")
     assert (code, verdict["label"], decisive(verdict)) == (0, "safe", {})
     (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "controller"]
@@ -108,12 +108,6 @@ def test_a_controller_that_is_good_is_safe_and_named(stage: Stage) -> None:
     assert f"{num} states, controller reach:Reach" in verdict["sentence"]
     about = json.loads((stage.desk.folder / "out" / "summary.json").read_text())["about"]
     assert about["controller"] == "reach:Reach"
-
-
-def test_a_controller_that_goes_elsewhere_does_not_reach_the_goal(stage: Stage) -> None:
-    constant = ("--controller", "own:Constant", "--set", "control.max_time=0.5")
-    code, verdict = stage.judged(*constant, mode="closed-loop")
-    assert (code, verdict["label"], decisive(verdict)) == (1, "goal not reached", {"goal": "failed"})
 
 
 def test_a_motion_of_its_own_is_judged_by_every_criterion(stage: Stage) -> None:
@@ -221,19 +215,16 @@ def goal(folder: Path, moved: list[str], *values: float) -> Float64:
     return waypoint.posture
 
 
-def test_fingers_that_the_log_does_not_move_take_no_value(tmp_path: Path) -> None:
-    assert goal(tmp_path, ["shoulder", "wrist"], 0.03, 0.04).tolist() == [0.03, 0.04]
-
-
-def test_fingers_that_the_log_knows_stay_as_logged_at_the_end_or_take_values(tmp_path: Path) -> None:
-    moved = ["shoulder", "wrist", "left", "right"]
+def test_fingers_take_no_value_or_the_logged_one_or_their_own(
+    tmp_path: Path,
+) -> None:
+    arm = ["shoulder", "wrist"]
+    assert goal(tmp_path, arm, 0.03, 0.04).tolist() == [0.03, 0.04]
+    with pytest.raises(InputError, match=r"--goal-joints: expected 2 joints \(shoulder, wrist\), got shape \(4,\)"):
+        goal(tmp_path, arm, 0, 0, 0, 0)
+    moved = [*arm, "left", "right"]
     assert goal(tmp_path, moved, 0.03, 0.04).tolist() == [0.03, 0.04, 0.03, 0.04]
     assert goal(tmp_path, moved, 0.03, 0.04, 0.0, 0.01).tolist() == [0.03, 0.04, 0.0, 0.01]
-
-
-def test_another_number_of_values_is_refused_with_the_joints(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--goal-joints: expected 2 joints \(shoulder, wrist\), got shape \(4,\)"):
-        goal(tmp_path, ["shoulder", "wrist"], 0, 0, 0, 0)
 
 
 def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_field_is_no_proof() -> None:
@@ -256,8 +247,7 @@ def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_fiel
         )
         gap = np.linalg.norm(points[:, None] - centers.astype(np.float64), axis=2) - radii.astype(np.float64)
         certified = certified_distance(fields)(points)
-        assert np.all(certified < gap.min(axis=1))
-        assert np.all(certified > gap.min(axis=1) - 3e-5)
+        assert np.all(certified < gap.min(axis=1)) and np.all(certified > gap.min(axis=1) - 3e-5)
         near = points + random.normal(size=points.shape) * 2e-3
         change = np.abs(fields.barrier.query(near)[0] - fields.barrier.query(points)[0])
         steepest = max(steepest, float(np.max(change / np.linalg.norm(near - points, axis=1))))

@@ -81,8 +81,7 @@ def test_one_criterion_that_is_broken_turns_the_verdict_and_names_itself(stage: 
     broken, arguments, criterion, label, words = ALONE[name]
     broken(stage)
     code, verdict = stage.judged(*arguments)
-    assert set(decisive(verdict)) == {criterion}
-    assert (verdict["label"], code) == (label, CODES.get(label, 1))
+    assert set(decisive(verdict)) == {criterion} and (verdict["label"], code) == (label, CODES.get(label, 1))
     assert words in verdict["sentence"]
     assert not criterion.startswith(ASKED), "with --report-only it turns no exit code"
 
@@ -127,11 +126,10 @@ def test_a_users_controller_that_fails_is_not_doubted_for_a_displaced_camera(sta
     displaced_camera(stage)
     dead = ("--controller-command", "sh -c 'read a; echo {\\\"protocol\\\":1}'")
     code, verdict = stage.judged(*dead, mode="closed-loop")
-    assert (code, verdict["label"]) == (1, "controller failed")
-    assert decisive(verdict)["controller"] == "failed"
+    assert (code, verdict["label"]) == (1, "controller failed") and decisive(verdict)["controller"] == "failed"
 
 
-@pytest.mark.parametrize(("gap", "code"), [(0.0185, 1), (0.0195, 0), (0.0205, 0)])
+@pytest.mark.parametrize(("gap", "code"), [(0.0185, 1), (0.0195, 0)])
 def test_the_margin_is_kept_up_to_what_a_solver_leaves(stage: Stage, gap: float, code: int) -> None:
     stage.states, stage.balls = resting(), [FAR, ball_beside(stage.arm, START, gap)]
     assert stage.judged()[0] == code
@@ -158,7 +156,10 @@ def test_what_stands_at_the_mount_from_the_start_is_only_said(stage: Stage) -> N
     stage.balls = [FAR, beside_the_mount(stage.arm)]
     code, verdict = stage.judged()
     assert (code, decisive(verdict)) == (0, {})
-    assert any("fixed spheres stand within the margin" in note for note in verdict["notes"])
+    listed = stage.desk.json("events.json")["static_violations"]
+    nearest = min(listed, key=lambda one: one["clearance"])
+    assert nearest["clearance"] < 0 and nearest["sphere"].startswith("link0[")
+    assert any(f"{len(listed)} fixed spheres stand within the margin" in note for note in verdict["notes"])
 
 
 def test_what_comes_nearer_to_a_fixed_sphere_that_stood_free_counts(stage: Stage) -> None:
@@ -207,11 +208,13 @@ def test_unknown_space_counts_from_the_share_that_is_allowed(stage: Stage, heigh
         found, verdict = stage.judged("--max-unknown", str(allowed), scene=scene)
         assert found == code, verdict["sentence"]
         assert decisive(verdict) == ({"known space": "not evaluable"} if code else {})
+        said = f"{100 * share:.1f} % of the sphere centres lie in unseen space, allowed {100 * allowed:g} %, first"
+        assert any(said in reason["sentence"] for reason in verdict["reasons"]) == bool(code)
 
 
 def test_at_most_half_of_the_space_beside_the_arm_may_be_unseen(stage: Stage) -> None:
     shares, codes, drawn = [], [], np.random.default_rng(0).random(grid_seen().log_odds.shape)
-    for number, share in enumerate((0.3, 0.4, 0.47, 0.53, 0.6)):  # here and there, so that no link sees nothing
+    for number, share in enumerate((0.3, 0.47, 0.6)):  # here and there, so that no link sees nothing
         stage.last_seen = voxels(is_seen=drawn > share)
         codes.append(stage.judged(scene=stage.scene(f"scene{number}"))[0])
         shares.append(stage.desk.metrics()["max_unseen_share"])
@@ -256,12 +259,6 @@ def test_what_was_known_about_the_arm_is_a_criterion_where_it_suffices_too(stage
         assert (metrics[figure], allowed) in values
 
 
-def test_the_time_that_is_not_judged_holds_that_before_the_first_map(stage: Stage) -> None:
-    late_maps(stage)
-    stage.judged()
-    assert stage.desk.metrics()["unjudged_s"] == pytest.approx(0.6)
-
-
 @pytest.mark.parametrize(
     ("broken", "allowed", "too_little"),
     [
@@ -274,8 +271,7 @@ def test_a_map_may_be_as_old_and_as_much_time_unjudged_as_is_said(
 ) -> None:
     broken(stage)
     scene = stage.scene()
-    assert stage.judged(allowed, scene=scene)[0] == 0
-    assert stage.judged(too_little, scene=scene)[0] == 5
+    assert stage.judged(allowed, scene=scene)[0] == 0 and stage.judged(too_little, scene=scene)[0] == 5
 
 
 def test_states_of_another_hour_are_not_judged_by_a_scene_or_a_field(stage: Stage) -> None:
@@ -311,9 +307,9 @@ def test_after_a_long_lead_in_the_rest_can_be_judged_as_the_remedy_says(stage: S
     scene = stage.scene()
     code, verdict = stage.judged(scene=scene)
     assert code == 5 and "judge the rest alone with --start-time first-map" in verdict["sentence"]
+    assert stage.desk.metrics()["unjudged_s"] == pytest.approx(0.6)
     code, verdict = stage.judged("--start-time", "first-map", scene=scene)
-    assert (code, decisive(verdict)) == (0, {})
-    assert "from 0.60 to 1.00 s of the log" in verdict["scope"]
+    assert (code, decisive(verdict)) == (0, {}) and "from 0.60 to 1.00 s of the log" in verdict["scope"]
 
 
 def test_a_short_lead_in_is_left_out_and_said(stage: Stage) -> None:
@@ -381,18 +377,15 @@ def test_a_failure_outranks_what_cannot_be_evaluated(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize(
-    ("gate", "code"),
+    ("gate", "more", "code"),
     [
-        *(("min_clearance>=0.1", 0), ("min_clearance>=5", 1), ("min_clearance_true>=0", 5)),
-        *(("clock_offset_s<=1", 5), ("max_pose_position<=0.01", 5)),
+        *(("min_clearance>=0.1", True, 0), ("min_clearance>=5", True, 1), ("min_clearance>=5", False, 1)),
+        *(("min_clearance_true>=0", True, 5), ("clock_offset_s<=1", False, 5), ("max_pose_position<=0.01", True, 5)),
     ],
 )
-def test_a_gate_turns_the_verdict_with_report_only_too(stage: Stage, gate: str, code: int) -> None:
-    scene = stage.scene()
-    for more in ((), ("--report-only",)):
-        found, verdict = stage.judged("--require", gate, *more, scene=scene)
-        assert found == code, verdict["sentence"]
-        assert set(decisive(verdict)) == ({f"--require {gate}"} if code else set())
+def test_a_gate_turns_the_verdict_with_report_only_too(stage: Stage, gate: str, more: bool, code: int) -> None:
+    found, verdict = stage.judged("--require", gate, *["--report-only"] * more)
+    assert (found, set(decisive(verdict))) == (code, {f"--require {gate}"} if code else set()), verdict["sentence"]
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, close
 from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, measured_robot
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.records import Float64, JointState, SphereSet
+from splatctrl_cli.robot import self_margins
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import spheres_yaml
@@ -54,6 +55,7 @@ def desk_of(
     folder: Path, monkeypatch: pytest.MonkeyPatch, spheres: SphereSet, *postures: Float64, urdf: str = URDF
 ) -> Desk:
     """A replay of the folding arm from posture to posture, 20 states on each way."""
+    monkeypatch.setattr(self_margins, "SELF_POSTURES", 1000)
     ways = [a + (b - a) * t for a, b in pairwise(postures) for t in np.linspace(0, 1, 20)]
     states = [JointState(stamp_ns=k * SECOND // 50, position=q, velocity=0 * q) for k, q in enumerate(ways)]
     source = FakeSource(states=states, joint_names=tuple(re.findall(r'joint name="(\w+)"', urdf)))
@@ -250,8 +252,7 @@ def test_the_closed_loop_arrives_with_every_step_solved(
 ) -> None:
     robot: MeasuredRobot = request.getfixturevalue(name)
     trace = driven(robot.model, scene())
-    assert trace.outcome is Outcome.GOAL_REACHED
-    assert num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
+    assert trace.outcome is Outcome.GOAL_REACHED and num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
     assert all(step.scale == 1.0 for step in trace.steps)
     q = np.asarray(trace.position)[::20]
     assert robot.surfaces is not None
@@ -279,14 +280,12 @@ def test_an_fr3_touches_itself_where_its_surfaces_do_and_not_where_its_spheres_d
     fr3: MeasuredRobot, at: tuple[float, float], spheres: float, touches: bool
 ) -> None:
     q = np.array([0.0, -0.8, 0.0, -2.3, 0.0, *at])
-    assert sphere_gap(fr3.model, q, "link5", "link7") < spheres
-    assert (nearest(fr3, q) < 0) == touches
+    assert sphere_gap(fr3.model, q, "link5", "link7") < spheres and (nearest(fr3, q) < 0) == touches
 
 
 def test_a_panda_touches_itself_where_curobos_spheres_are_apart(panda: MeasuredRobot) -> None:
     q = np.array([0.0, -0.8, 0.0, -2.3, 0.0, 0.2, 2.0])
-    assert sphere_gap(panda.model, q, "link5", "link7") > 0.015
-    assert nearest(panda, q) < 0
+    assert sphere_gap(panda.model, q, "link5", "link7") > 0.015 and nearest(panda, q) < 0
     (kept,) = panda.kept
     assert kept.links == ("panda_link5", "panda_link7") and kept.surface_gap is not None and kept.surface_gap < 0
 
