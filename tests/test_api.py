@@ -62,17 +62,21 @@ def test_the_examples_of_the_page_run_on_the_sample_data(
         exec(compile(example, PAGE.name, "exec"), scope)
     names = ("made", "baked", "answered", "exported", "scored", "found", "since")
     made, baked, answered, exported, scored, found, since = (scope[name] for name in names)
+    kinds = (
+        api.ReconstructResult,
+        api.BakeResult,
+        api.QueryResult,
+        api.ExportResult,
+        api.ScoreResult,
+        api.ReplayResult,
+    )
+    assert all(map(isinstance, (made, baked, answered, exported, scored, found), kinds))
     assert isinstance(since, api.CompareResult)
     assert (since.verdict.label, since.figures, dict(since.differences)) == ("no regression", (), {})
     assert isinstance(scope["logged"], api.ExportRunResult)
     assert isinstance(scope["told"], api.WriteReportResult)
     assert isinstance(scope["seen"], api.ViewResult)
-    assert isinstance(made, api.ReconstructResult)
-    assert isinstance(baked, api.BakeResult)
-    assert isinstance(answered, api.QueryResult) and answered.metrics["num_answered"] == 2
-    assert isinstance(exported, api.ExportResult)
-    assert isinstance(scored, api.ScoreResult)
-    assert isinstance(found, api.ReplayResult)
+    assert answered.metrics["num_answered"] == 2  # type: ignore[attr-defined]
     for result in (made, baked, answered, exported, scored, found, since):
         verdict = getattr(result, "verdict", None)
         assert len(repr(result)) < 1200 and (verdict is None or verdict.sentence in repr(result))

@@ -192,7 +192,12 @@ def showing(board: Board) -> Shown:
     [
         (ShownApart, "7x4:0.03", "does not tie together: cam0 | cam1, cam2", "at the same moment"),
         (Mirrored, "7x4:0.03", "too few views of the board of 7x4 inner corners: cam2 in 0", "its printed side"),
-        (Shown, "8x5:0.03", "no board of 8x5 inner corners in 36 frames, but one of 7x4", "--board 7x4:0.03"),
+        (
+            lambda: Shown(options=replace(OPTIONS, fps=2.0)),
+            "8x5:0.03",
+            "no board of 8x5 inner corners in 18 frames, but one of 7x4",
+            "--board 7x4:0.03",
+        ),
         (
             lambda: showing(Board(columns=6, rows=4, square=0.03)),
             "6x4:0.03",
@@ -323,11 +328,10 @@ class OneLink(Partial):
         return np.asarray(np.linalg.norm(points_world - pose[:3, 3], axis=-1) < 0.12)
 
 
-@pytest.mark.parametrize(("thing", "seed"), [("cylinder", 2), ("sphere", 3)])
-def test_turns_about_the_one_round_thing_on_a_table_are_named(thing: str, seed: int, tmp_path: Path) -> None:
-    setup = Round(seed)
-    setup.thing = thing
-    setup.primitives = setup._scene(seed, SMALL).primitives
+def test_turns_about_the_one_round_thing_on_a_table_are_named(tmp_path: Path) -> None:
+    setup = Round(3)
+    setup.thing = "sphere"
+    setup.primitives = setup._scene(3, SMALL).primitives
     with pytest.raises(NotEvaluableError) as refusal:
         calibrated(setup, tmp_path)
     assert "rotation about the table's normal" in refusal.value.message
@@ -339,7 +343,7 @@ def test_what_is_not_observed_stays_as_recorded_and_the_rest_is_found(tmp_path: 
     result = calibrated(setup, tmp_path, allow_unobserved=True)
     for camera in setup.cameras[1:]:
         found = result.calibration.cameras[camera.name]
-        assert any("the table's" in direction for direction in found.unobserved)
+        assert any("rotation about the table's normal" in direction for direction in found.unobserved)
         off = found.T @ invert_transform(camera.T_world_camera)  # of the world as it sees it
         recorded = camera.T_world_camera @ setup.off[camera.name] @ invert_transform(camera.T_world_camera)
         middle = np.array([*MIDDLE, 0.0, 1.0])

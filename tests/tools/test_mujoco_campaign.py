@@ -95,6 +95,7 @@ def test_families_robots_and_depths_are_counted_by_outcome_and_truth() -> None:
     assert line_of(rows, "arrive  unknown") == ["1", "0", "0", "0", "0", "0", "1"]
     assert line_of(rows, "panda  clear") == line_of(rows, "ideal  clear") == ["1", "1", "0", "0", "0", "0", "0"]
     assert any("no mesh" in line for line in report(rows))
+    assert "| still | clear | 1 | 1 | 0 | 0 | 0 | 0 | 0 |" in report(rows, markdown=True)
 
 
 def test_errors_of_audits_are_by_depth_and_over_estimates_by_state() -> None:
@@ -119,12 +120,6 @@ def test_causes_are_weighed_and_a_map_without_a_true_surface_there_is_named() ->
     assert line_of(rows, "audit: not evaluable: known space") == ["1", "33 %"]
     assert line_of(rows, "driven: refused: start: expected a free posture") == ["1", "33 %"]
     assert line_of(rows, "start: expected a free posture") == ["1", "100 %"]
-
-
-def test_markdown_has_the_same_tables() -> None:
-    text = "\n".join(report([CLEAR, RED], markdown=True))
-    assert "| still | clear | 2 | 1 | 0 | 1 | 0 | 0 | 0 |" in text
-    assert "| false red (true > 35 mm) | 2 | 1 | 50.0 % |" in text
 
 
 def test_the_worst_are_the_largest_false_reds_then_the_largest_over_estimates(tmp_path: Path) -> None:
@@ -308,13 +303,10 @@ def test_an_audit_is_compared_at_its_own_stamps_and_a_closed_loop_with_its_own_m
     assert [driven.true_mm, driven.collision_mm, driven.num_true_below] == pytest.approx([11.0, 10.0, 2])
 
 
-def test_a_closed_loop_that_refuses_is_judged_by_the_truth_of_its_start(tmp_path: Path) -> None:
-    _, driven = judge(request(tmp_path, 0), machinery(FakeBatch(is_driven=False)))
+def test_a_replay_that_refuses_has_its_reason_or_that_of_the_scene(tmp_path: Path) -> None:
+    _, driven = judge(request(tmp_path / "a", 0), machinery(FakeBatch(is_driven=False)))
     assert (driven.outcome, driven.reason, driven.true_mm) == ("refused", "start: deep", pytest.approx(100.0))
-
-
-def test_replays_without_a_scene_have_the_reason_of_the_scene(tmp_path: Path) -> None:
-    rows = judge(request(tmp_path, 0), machinery(FakeBatch(has_scene=False)))
+    rows = judge(request(tmp_path / "b", 0), machinery(FakeBatch(has_scene=False)))
     assert [(row.outcome, row.reason) for row in rows] == [("refused", "reconstruct: no depth")] * 2
 
 

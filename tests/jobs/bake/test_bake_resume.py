@@ -58,21 +58,26 @@ def bake(splats: Path, out: Path, **more: Any) -> BakeResult:
     return baked(splats, out, **(options | more))
 
 
-def interrupted(splats: Path, out: Path, after: int) -> str:
+def interrupted(splats: Path, out: Path, after: int, error: BaseException | None = None) -> str:
     """What a person is told whose bake was stopped at that slab."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt) as stop:
-        patch.setattr(GridSlabs, "write", failing(GridSlabs.write, after, KeyboardInterrupt()))
+    raised = WriteError if isinstance(error, OSError) else KeyboardInterrupt
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(raised) as stop:
+        patch.setattr(GridSlabs, "write", failing(GridSlabs.write, after, error or KeyboardInterrupt()))
         bake(splats, out)
     return str(stop.value)
 
 
+FULL = OSError(28, "No space left on device", "field.partial/channels/sdf.npy")
+
+
 @pytest.mark.usefixtures("small_slabs")
-@pytest.mark.parametrize("after", [2, 4])
+@pytest.mark.parametrize(("after", "error"), [(2, None), (4, None), (3, FULL)], ids=["early", "late", "a full disk"])
 def test_an_interrupted_bake_says_how_to_go_on_and_does(
-    splats: Path, whole: dict[str, Any], tmp_path: Path, after: int
+    splats: Path, whole: dict[str, Any], tmp_path: Path, after: int, error: OSError | None
 ) -> None:
-    said = interrupted(splats, tmp_path / "field", after)
-    assert "field.partial is kept; continue it with the same command and --resume" in said
+    said = interrupted(splats, tmp_path / "field", after, error)
+    assert "--resume" in said
+    assert error or "field.partial is kept; continue it with the same command and --resume" in said
     bake(splats, tmp_path / "field", resume=True, threads=1)
     assert contents(tmp_path / "field") == whole
 
@@ -195,15 +200,3 @@ def test_openvdb_that_does_not_fit_the_memory_is_told_before_anything_is_baked(
         bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])
     monkeypatch.setattr(grid_cells, "available_memory", lambda: 28 * 10**6)
     bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])
-
-
-@pytest.mark.usefixtures("small_slabs")
-def test_a_disk_that_fills_up_is_a_failure_to_write_and_goes_on(
-    splats: Path, whole: dict[str, Any], tmp_path: Path
-) -> None:
-    full = OSError(28, "No space left on device", str(tmp_path / "field.partial" / "channels" / "sdf.npy"))
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(WriteError, match="--resume"):
-        patch.setattr(GridSlabs, "write", failing(GridSlabs.write, 3, full))
-        bake(splats, tmp_path / "field")
-    bake(splats, tmp_path / "field", resume=True)
-    assert contents(tmp_path / "field") == whole

@@ -76,13 +76,10 @@ def test_the_bound_of_a_scene_is_never_above_the_exact_distance_and_hardly_below
     assert (bound <= exact).all() and (bound >= exact - 1e-5).all()
 
 
-def test_the_probability_is_that_of_the_distance(scene: Path) -> None:
+def test_the_probability_is_that_of_the_distance_and_a_label_that_is_left_out_is_not_near(scene: Path) -> None:
     _, rows = asked(scene, config=HARD)
     assert float(rows[2]["probability"]) == pytest.approx(1.0)
     assert float(rows[0]["probability"]) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_label_that_is_left_out_is_not_near(scene: Path) -> None:
     _, rows = asked(scene, labels=frozenset({Label.OBJECT}))
     assert {row["label"] for row in rows} == {"object"}
     assert float(rows[1]["distance"]) > 0.4
@@ -108,7 +105,10 @@ def test_a_grid_answers_within_its_box_and_leaves_the_rest_empty(scene: Path) ->
     assert result.metrics["num_answered"] == 4
 
 
-def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the_scene(scene: Path) -> None:
+def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the_scene(
+    scene: Path, tmp_path: Path
+) -> None:
+    """Another scene does not go with it."""
     field = baked(scene, scene.parent / "field", voxel=0.05, box=BOX).out
     _, of_grid = asked(field)
     _, of_scene = asked(scene)
@@ -118,10 +118,6 @@ def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the
     for name in ("label", "splat", "observed", "surface_x", "surface_rest"):
         assert [row[name] for row in both] == [row[name] for row in of_scene]
     assert both[4]["probability"] == "" and result.kind == "field and scene"
-
-
-def test_a_field_and_another_scene_do_not_go_together(scene: Path, tmp_path: Path) -> None:
-    field = baked(scene, scene.parent / "field", voxel=0.05, box=BOX).out
     other = write_scene(tmp_path / "other", (START_NS, splats_of(BALLS[0])))
     with pytest.raises(UsageError, match=r"field: was not baked from the splats of .*other; .* as --scene"):
         asked(field, scene=other)

@@ -64,6 +64,12 @@ def request(
     )
 
 
+def scored(folder: Path, frames: list[RgbdFrame], monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The metrics of the scene in a folder on these frames."""
+    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=frames, has_clock=False))
+    return dict(score(ScoreRequest(scene=folder / "scene", recording=RecordingRequest(path=folder))).metrics)
+
+
 def test_a_view_held_out_is_scored_where_it_was_recorded_and_where_it_belongs(
     views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -71,10 +77,9 @@ def test_a_view_held_out_is_scored_where_it_was_recorded_and_where_it_belongs(
     result = reconstruct(request(off, tmp_path / "scene"))
     assert result.metrics["pose_residual"] < 0.1 * result.metrics["poses"]["residual_before"]
     assert len(SceneFolder(tmp_path / "scene").corrections) == len(views) - 1
-    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
-    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
-    assert scored.metrics["psnr_all_corrected"] > scored.metrics["psnr_all"] + 2.0  # type: ignore[operator]
-    assert scored.metrics["depth_median_all_corrected"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
+    metrics = scored(tmp_path, off, monkeypatch)
+    assert metrics["psnr_all_corrected"] > metrics["psnr_all"] + 2.0
+    assert metrics["depth_median_all_corrected"] < 0.5 * metrics["depth_median_all"]
 
 
 def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
@@ -92,9 +97,8 @@ def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
         if frame.camera != "holdout":
             free = corrected(frame, scene.corrections)
             assert np.array_equal(free.depth, unbent(frame, np.array(bend["offsets"])).depth)
-    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
-    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
-    assert scored.metrics["depth_median_all_corrected"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
+    metrics = scored(tmp_path, off, monkeypatch)
+    assert metrics["depth_median_all_corrected"] < 0.5 * metrics["depth_median_all"]
 
 
 def test_where_a_robot_is_judged_depth_stays_as_it_was_recorded(
@@ -136,9 +140,8 @@ def test_a_view_held_out_is_scored_at_its_own_exposure_and_at_that_of_the_others
     off = held_out([exposed(view, 1 / gain) for view, gain in zip(views, gains, strict=True)])
     result = reconstruct(request(off, tmp_path / "scene", corrections=EXPOSURE))
     assert result.metrics["exposure_spread"] > 0.1
-    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
-    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
-    assert scored.metrics["psnr_all_corrected"] > scored.metrics["psnr_all"] + 1.0  # type: ignore[operator]
+    metrics = scored(tmp_path, off, monkeypatch)
+    assert metrics["psnr_all_corrected"] > metrics["psnr_all"] + 1.0
 
 
 def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_path: Path) -> None:

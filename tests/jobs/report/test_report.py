@@ -143,12 +143,15 @@ def test_what_is_no_whole_run_is_refused(run: Runs, break_it: Callable[[Path], N
     assert not folder.with_name("audit.html").exists()
 
 
-def test_a_report_is_not_replaced_without_force(run: Runs) -> None:
+def test_a_report_is_not_replaced_without_force_and_a_run_without_anything_to_see_is_refused(run: Runs) -> None:
     folder = run()
     made = write_report(WriteReportRequest(path=folder))
     assert made.file == folder.with_name("audit.html")
     with pytest.raises(UsageError, match="already exists"):
         write_report(WriteReportRequest(path=folder))
+    patch_json(folder / "run.json", lambda found: found | {"command": "score"})
+    with pytest.raises(InputError, match="score leaves nothing to see"):
+        view(ViewRequest(path=folder))
 
 
 @pytest.fixture
@@ -258,38 +261,29 @@ def _as_expected(node: dict[str, Any]) -> dict[str, Any]:
     return node | {"state": "done"} if node["state"] == "failed" else node
 
 
-def test_variants_have_a_column_each_and_what_only_prints_has_no_folder_to_miss(batch: Path) -> None:
+def added(batch: Path, *nodes: dict[str, Any]) -> str:
+    """The page of a batch with these nodes, too, which are named by recording and job."""
     more = [
-        {
-            "id": f"rec0/drive+rate={rate}",
-            "recording": "rec0",
-            "job": "drive",
-            "state": "skipped",
-            "cause": "needs it",
-        }
-        for rate in (1, 2)
+        {"recording": node["id"].split("/")[0], "job": node["id"].split("/")[1].partition("+")[0]} | node
+        for node in nodes
     ]
-    check = {
-        "id": "rec0/check",
-        "recording": "rec0",
-        "job": "check",
-        "command": "check",
-        "state": "failed",
-        "out": "",
-    }
-    check |= {"outcome": "passed", "label": "passed", "expect": "failed"}
-    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *more, check]})
-    page = reported(batch)
+    patch_json(batch / "batch.json", lambda found: found | {"nodes": [*found["nodes"], *more]})
+    return reported(batch)
+
+
+def test_variants_have_a_column_each_and_what_only_prints_has_no_folder_to_miss(batch: Path) -> None:
+    skipped = {"state": "skipped", "cause": "needs it"}
+    check = {"command": "check", "state": "failed", "out": "", "outcome": "passed", "label": "passed"}
+    drives = [{"id": f"rec0/drive+rate={rate}", **skipped} for rate in (1, 2)]
+    page = added(batch, *drives, {"id": "rec0/check", "expect": "failed", **check})
     assert re.findall(r"<th[^>]*>(drive[^<]*)<", page) == ["drive +rate=1", "drive +rate=2"]
     assert "expected a path in the batch" not in page
 
 
 def test_many_recordings_are_folded_and_an_expected_error_is_said(batch: Path) -> None:
-    refused = {"job": "ingest", "command": "ingest", "state": "done", "label": "exit 4", "expect": "exit 4"}
-    more = [{"id": f"bag{k}/ingest", "recording": f"bag{k}", **refused} for k in range(50)]
-    skipped = {"id": "bag0/scene", "recording": "bag0", "job": "scene", "state": "skipped", "cause": "needs it"}
-    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *more, skipped]})
-    page = reported(batch)
+    refused = {"command": "ingest", "state": "done", "label": "exit 4", "expect": "exit 4"}
+    more = [{"id": f"bag{k}/ingest", **refused} for k in range(50)]
+    page = added(batch, *more, {"id": "bag0/scene", "state": "skipped", "cause": "needs it"})
     first, _, rest = page[page.index("<h2>Recordings") :].partition("<summary>20 more recordings</summary>")
     assert first.count("<tr") == 41 and rest.count(">exit 4, as expected<") == 20
     assert "bag0/scene" in page and 'id="bag0/scene"' not in page, "what did not run has no section"
@@ -304,10 +298,9 @@ def test_recordings_as_expected_have_a_picture(batch: Path) -> None:
         cv2.imwrite(str(folder / f"{name}.png"), np.zeros((40, 900, 3), np.uint8))
         run = {"command": kind, "splatctrl": "0.2.0", "parts": part_digests(folder)}
         (folder / "run.json").write_text(json.dumps(run))
-        node = {"id": f"other{number}/job", "recording": f"other{number}", "job": "job", "command": kind}
-        nodes.append(node | {"state": "done", "outcome": "passed", "label": "passed", "out": f"other{number}/job"})
-    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *nodes]})
-    page = reported(batch)
+        done = {"state": "done", "outcome": "passed", "label": "passed"}
+        nodes.append({"id": f"other{number}/job", "command": kind, "out": f"other{number}/job", **done})
+    page = added(batch, *nodes)
     shown = page[page.index("Pictures of other recordings") :]
     assert re.findall(r"<figcaption>([^:]+):", shown) == ["other0/job", "other1/job"]
 
@@ -340,13 +333,6 @@ def test_scene_splats_and_field_have_pages(run: Runs, tmp_path: Path) -> None:
     assert space_of(tmp_path / "field").surface is not None
     found = found_on(scene.file, f"{OPENED} found.parts = Object.keys(viewer.parts);")
     assert found == {"parts": ["objects", "grid of 10 cm"], "complaints": []}
-
-
-def test_a_run_without_anything_to_see_is_refused(run: Runs) -> None:
-    folder = run()
-    patch_json(folder / "run.json", lambda found: found | {"command": "score"})
-    with pytest.raises(InputError, match="score leaves nothing to see"):
-        view(ViewRequest(path=folder))
 
 
 def test_a_page_is_opened_only_where_there_is_a_screen(

@@ -105,13 +105,6 @@ def test_a_log_that_describes_its_robot_needs_no_urdf(tmp_path: Path, kind: str)
     assert open_log(request)[0].joint_names == ("joint_a", "joint_b")
 
 
-def test_a_log_without_a_description_asks_for_the_urdf(tmp_path: Path) -> None:
-    path = log_with(tmp_path / "run.mcap", as_parameter(robot(), kind=3), described(robot(), "/chatter"))
-    assert logged_urdf([path]) is None
-    with pytest.raises(UsageError, match=r"run.mcap does not describe the robot; give it with --urdf FILE"):
-        open_log(ReplayRequest(log=path, out=tmp_path / "out"))
-
-
 def test_what_holds_states_and_is_no_log_is_replayed_with_the_urdf_that_is_given(tmp_path: Path) -> None:
     names = ("joint_a", "joint_b")
     (tmp_path / "x.csv").write_text("t,a,b\n0,0.1,0.2\n0.01,0.1,0.2\n")
@@ -123,23 +116,34 @@ def test_what_holds_states_and_is_no_log_is_replayed_with_the_urdf_that_is_given
         assert open_log(request)[0].joint_names == names
 
 
-def test_several_robots_in_a_log_ask_for_one_and_one_said_twice_does_not(tmp_path: Path) -> None:
+def test_a_robot_that_is_said_twice_is_one(tmp_path: Path) -> None:
     twice = log_with(tmp_path / "twice.mcap", described(robot(), "/a/robot_description"), described(robot()))
     assert logged_urdf([twice]) is not None
-    other = described(robot(shift=0.5), "/b/robot_description")
-    path = log_with(tmp_path / "run.mcap", described(robot(), "/a/robot_description"), other)
-    with pytest.raises(
-        InputError, match=r"2 robots, of /a/robot_description, /b/robot_description; give one of them"
-    ):
-        logged_urdf([path])
 
 
-def test_a_description_that_is_no_urdf_is_named_by_its_topic(tmp_path: Path) -> None:
-    path = log_with(tmp_path / "run.mcap", described("<robot"))
-    with pytest.raises(InputError, match=r"run.mcap/robot_description: expected a URDF, got broken XML"):
-        logged_urdf([path])
-    file = read_urdf(written(tmp_path, robot()))
-    assert "its robot_description cannot be read" in differs(file, [path])
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        (
+            (as_parameter(robot(), kind=3), described(robot(), "/chatter")),
+            "does not describe the robot; give it with",
+        ),
+        (
+            (described(robot(), "/a/robot_description"), described(robot(shift=0.5), "/b/robot_description")),
+            "2 robots, of /a/robot_description, /b/robot_description; give one of them",
+        ),
+        ((described("<robot"),), "/robot_description: expected a URDF, got broken XML"),
+    ],
+    ids=["none", "two", "no URDF"],
+)
+def test_a_log_without_one_readable_robot_is_refused(
+    tmp_path: Path, messages: tuple[RawMessage, ...], words: str
+) -> None:
+    path = log_with(tmp_path / "run.mcap", *messages)
+    with pytest.raises((InputError, UsageError), match=f"run.mcap.*{words}"):
+        open_log(ReplayRequest(log=path, out=tmp_path / "out"))
+    if "broken" in words:
+        assert "its robot_description cannot be read" in differs(read_urdf(written(tmp_path, robot())), [path])
 
 
 @pytest.mark.parametrize(

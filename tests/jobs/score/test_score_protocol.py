@@ -278,13 +278,6 @@ def test_the_surface_is_compared_with_a_mesh(place: Path, views: list[DtuView], 
     assert 0 < metrics["completeness"] < 0.1
 
 
-def test_a_gate_on_what_was_not_scored_fails(place: Path) -> None:
-    verdict = scored(place, "mvsnet", require=("psnr_masked>=1", "mask_share<=1")).verdict
-    first = "score: NOT EVALUABLE (2 views): --require psnr_masked>=1: psnr_masked is unknown, required >= 1"
-    assert verdict.sentence.startswith(first)
-    assert verdict.decisive[1].sentence == "mask_share is unknown, required <= 1"
-
-
 def test_another_scan_of_the_same_camera_names_is_refused_with_figures(
     place: Path, views: list[DtuView], tmp_path: Path
 ) -> None:

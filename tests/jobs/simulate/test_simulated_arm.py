@@ -12,7 +12,6 @@ import trimesh
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.jobs.running.progress import Silent
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -23,6 +22,7 @@ from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.truth import distance_to, load_truth
+from tests.jobs.bake.baked import Said
 from tests.robot.shapes import collada, coverage_deficit, written
 
 OPTIONS = RecordingOptions(duration_s=3.0, fps=1.0, width=64, height=48, noise="none", color_rays=0)
@@ -98,7 +98,8 @@ def test_every_depth_of_the_log_lies_on_the_arm_or_in_the_scene(simulated: Path)
 
 
 def test_the_same_options_give_the_same_bytes(simulated: Path, arm: Path, tmp_path: Path) -> None:
-    simulate(SimulateRequest(out=tmp_path / "again", urdf=arm, options=OPTIONS))
+    spheres = simulated / "robot_spheres.yaml"
+    simulate(SimulateRequest(out=tmp_path / "again", urdf=arm, spheres=spheres, options=OPTIONS))
     for name in ("log.mcap", "truth.json", "robot.urdf"):
         assert (tmp_path / "again" / name).read_bytes() == (simulated / name).read_bytes(), name
 
@@ -122,16 +123,10 @@ def test_given_spheres_are_taken_and_the_same_kinematics_move_alike(
 NAMES = ("visual/seen", "forearm")
 
 
-class Heard(Silent):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def log(self, line: str) -> None:
-        self.lines.append(line)
-
-
 @pytest.mark.parametrize("suffix", ["dae", "none"])
-def test_a_link_is_seen_by_its_visual_mesh_where_that_can_be_read(arm: Path, tmp_path: Path, suffix: str) -> None:
+def test_a_link_is_seen_by_its_visual_mesh_where_that_can_be_read(
+    arm: Path, simulated: Path, tmp_path: Path, suffix: str
+) -> None:
     """The forearm's visual mesh is a rod of 3 cm inside of its collision mesh."""
     packages = shutil.copytree(arm.parents[1], tmp_path / "packages")
     (urdf,) = packages.rglob("my_arm.urdf")
@@ -141,8 +136,9 @@ def test_a_link_is_seen_by_its_visual_mesh_where_that_can_be_read(arm: Path, tmp
         (urdf.parent / "meshes" / "seen.dae").write_text(collada(rod))
     visual = f'<visual><geometry><mesh filename="package://my_arm/meshes/seen.{suffix}"/></geometry></visual>'
     urdf.write_text(urdf.read_text().replace('<link name="link5">', f'<link name="link5">{visual}'))
-    heard = Heard()
-    simulate(SimulateRequest(out=tmp_path / "out", urdf=urdf, options=OPTIONS), heard)
+    heard = Said()
+    spheres = simulated / "robot_spheres.yaml"
+    simulate(SimulateRequest(out=tmp_path / "out", urdf=urdf, spheres=spheres, options=OPTIONS), heard)
     copy = read_urdf(tmp_path / "out" / "robot.urdf")
     assert {mesh.filename for mesh in copy.meshes} == {"meshes/forearm.stl"}
     seen = visual_urdf(copy)

@@ -82,25 +82,31 @@ def test_a_killed_sweep_goes_on_to_the_bytes_of_one_that_was_not(tmp_path: Path)
     assert (tmp_path / "sweep" / "sweep.json").read_bytes() == (tmp_path / "whole" / "sweep.json").read_bytes()
 
 
-def test_a_latency_that_fails_and_passes_again_is_told_at_its_first_flip(tmp_path: Path) -> None:
-    run = run_of(tmp_path, failed={"latency": [[0.2, 0.3], [0.8, 9]]})
-    flip = swept(run, "latency=0:1").flips[0]
-    assert flip.first is not None and flip.first.values["latency"] == pytest.approx(0.2, abs=1 / 64)
-    assert not flip.is_monotone
-
-
-def test_what_flips_to_not_evaluable_is_called_so_with_what_comes_behind_it(tmp_path: Path) -> None:
-    run = run_of(tmp_path, lacking={"latency": [[0.4, 0.7]]}, failed={"latency": [[0.7, 9]]})
-    flip = swept(run, "latency=0:1").flips[0]
-    assert flip.first is not None and flip.first.outcome == "not evaluable"
-    assert "NOT EVALUABLE at 0.4" in flip.sentence and flip.sentence.endswith("beyond it also MARGIN BROKEN")
-
-
-def test_no_flip_says_so_with_the_verdicts_of_the_ends(tmp_path: Path) -> None:
-    run = run_of(tmp_path)
-    flip = swept(run, "latency=0:1").flips[0]
-    assert (flip.first, flip.start.label, flip.end.label) == (None, "safe", "safe")
-    assert flip.sentence == "latency: no flip between 0 and 1 s: SAFE at all 9 values tried"
+@pytest.mark.parametrize(
+    ("spans", "first", "outcome", "words"),
+    [
+        ({"failed": {"latency": [[0.2, 0.3], [0.8, 9]]}}, pytest.approx(0.2, abs=1 / 64), "failed", "MARGIN BROKEN"),
+        (
+            {"lacking": {"latency": [[0.4, 0.7]]}, "failed": {"latency": [[0.7, 9]]}},
+            pytest.approx(0.4, abs=1 / 64),
+            "not evaluable",
+            "beyond it also MARGIN BROKEN",
+        ),
+        ({}, None, "", "latency: no flip between 0 and 1 s: SAFE at all 9 values tried"),
+    ],
+    ids=["passes again", "not evaluable", "no flip"],
+)
+def test_a_latency_is_told_at_its_first_flip_with_what_comes_behind_it(
+    tmp_path: Path, spans: dict[str, Any], first: Any, outcome: str, words: str
+) -> None:
+    flip = swept(run_of(tmp_path, **spans), "latency=0:1").flips[0]
+    found = (flip.first.values["latency"], flip.first.outcome) if flip.first is not None else (None, "")
+    assert found == (first, outcome)
+    assert words in flip.sentence and (
+        not outcome or f"{outcome.replace('failed', 'margin broken').upper()} at" in flip.sentence
+    )
+    assert flip.is_monotone == (outcome != "failed")
+    assert (flip.start.label, flip.end.label) == ("safe", "margin broken" if spans else "safe")
 
 
 def test_two_keys_together_flip_before_either_alone(tmp_path: Path) -> None:

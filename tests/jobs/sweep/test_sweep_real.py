@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.runs.run_folder import open_run
 from splatctrl_cli.jobs.sweep.keys import chain_of, key_of
-from splatctrl_cli.jobs.sweep.search import Flip, find_flip, find_least
+from splatctrl_cli.jobs.sweep.search import find_flip, find_least
 from splatctrl_cli.jobs.sweep.sweep import Runs, SweepRequest, sweep
 
 PROGRAM = OfThisProgram(threads=1)
@@ -185,17 +186,25 @@ def test_a_verdict_that_turns_back_fools_bisection_and_is_caught() -> None:
     assert bisected(judge.outcome, 0.0, 1.0, 0.001) == pytest.approx(0.8, abs=0.001)
     found = find_flip(judge, 0.0, 1.0, tolerance=0.001, is_monotone=True)
     assert found.first == pytest.approx(0.2, abs=0.001) and not found.is_monotone
+    assert find_flip(Counted((0.2, 0.3), (0.8, 9.0)), 0.0, 1.0, tolerance=0.001, is_monotone=True) == found
 
 
-def test_where_it_turns_back_a_nearer_flip_is_looked_for() -> None:
-    """Of the quarters only the middle fails, which says that it turns back; of the eighths the first fails, too."""
-    found = find_flip(Counted((0.1, 0.2), (0.45, 0.55)), 0.0, 1.0, tolerance=0.001, is_monotone=True)
-    assert found.first == pytest.approx(0.1, abs=0.001) and not found.is_monotone
-
-
-def test_a_flip_between_ends_that_agree_is_found() -> None:
-    found = find_flip(Counted((0.3, 0.6)), 0.0, 1.0, tolerance=0.01, is_monotone=True)
-    assert found.first == pytest.approx(0.3, abs=0.01) and not found.is_monotone
+@pytest.mark.parametrize(
+    ("judge", "first", "outcome", "is_monotone"),
+    [
+        (Counted((0.1, 0.2), (0.45, 0.55)), pytest.approx(0.1, abs=0.001), "failed", False),
+        (Counted((0.3, 0.6)), pytest.approx(0.3, abs=0.001), "failed", False),
+        (Counted((0.8, 9.0), lacking=[(0.45, 0.8)]), pytest.approx(0.45, abs=0.001), "not evaluable", True),
+        (Counted((5.0, 6.0)), None, "", True),
+    ],
+    ids=["turns back", "ends that agree", "a third verdict", "none"],
+)
+def test_the_first_flip_from_the_start_is_found(judge: Counted, first: Any, outcome: str, is_monotone: bool) -> None:
+    """Where of the quarters only the middle fails, it turns back: the eighths are tried, of which the first fails."""
+    found = find_flip(judge, 0.0, 1.0, tolerance=0.001, is_monotone=True)
+    assert (found.first, found.is_monotone) == (first, is_monotone)
+    assert (judge.outcome(found.first) if found.first is not None else "") == outcome
+    assert found.first is not None or (found.last is None and set(found.outcomes.values()) == {"passed"})
 
 
 def test_what_is_not_declared_monotone_is_searched_and_what_may_be_missed_is_told() -> None:
@@ -205,18 +214,6 @@ def test_what_is_not_declared_monotone_is_searched_and_what_may_be_missed_is_tol
     assert declared.first is None and declared.spacing == pytest.approx(0.25)
     assert searched.first == pytest.approx(0.51, abs=0.01) and searched.spacing == pytest.approx(1 / 8)
     assert find_flip(Counted(narrow), 0.0, 1.0, tolerance=0.01).spacing > narrow[1] - narrow[0]
-
-
-def test_a_third_verdict_between_the_two_is_a_flip_of_its_own() -> None:
-    judge = Counted((0.8, 9.0), lacking=[(0.45, 0.8)])
-    found = find_flip(judge, 0.0, 1.0, tolerance=0.01, is_monotone=True)
-    assert found.first is not None and judge.outcome(found.first) == "not evaluable"
-    assert found.first == pytest.approx(0.45, abs=0.01) and found.is_monotone
-
-
-def test_without_a_flip_there_is_none() -> None:
-    found = find_flip(Counted((5.0, 6.0)), 0.0, 1.0, tolerance=0.01)
-    assert (found.last, found.first) == (None, None) and set(found.outcomes.values()) == {"passed"}
 
 
 def beyond(*slope: float) -> Callable[[Sequence[Sequence[float]]], list[str]]:
@@ -246,10 +243,3 @@ def test_what_only_all_together_flip_is_found_at_the_corner() -> None:
 def test_a_flip_of_one_value_alone_stands_where_nothing_is_nearer() -> None:
     found = find_least(beyond(4.0, 0.0), [0.25, None], tolerance=0.01)
     assert found is not None and found.first == (0.25, 0.0)
-
-
-def test_flips_are_the_same_each_time() -> None:
-    def once() -> Flip:
-        return find_flip(Counted((0.2, 0.3), (0.8, 9.0)), 0.0, 1.0, tolerance=0.003)
-
-    assert once() == once()
