@@ -104,7 +104,7 @@ def grazing(angle: float, away: float) -> RgbdFrame:
 @pytest.mark.parametrize("angle", [np.pi / 2, 0.6, 0.4])
 def test_a_floor_seen_at_any_angle_says_where_a_dark_block_returns_no_depth(angle: float) -> None:
     """At 0.4 rad a pixel of the floor lies 4 cm behind its neighbour."""
-    found, _ = contradicted(masks_of(block_measured_at(0.0), grazing(angle, 1.2)), is_drawn=False)
+    found, _ = found_by(block_measured_at(0.0), grazing(angle, 1.2))
     is_blank = found.is_blank & (found.until > 0)
     assert is_blank.sum() > 0.5 * found.is_blank.sum()
 
@@ -114,7 +114,7 @@ def test_depth_beside_a_step_is_no_surface() -> None:
     ribbed, dark = frame(x=BESIDE, camera="cam1"), block_measured_at(0.0)
     ribbed.depth[:, 0::4] += 0.05
     ribbed.depth[:, 1::4] += 0.05
-    found, _ = contradicted(masks_of(dark, ribbed), is_drawn=False)
+    found, _ = found_by(dark, ribbed)
     assert found.is_blank.any() and not found.until.any()
 
 
