@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -16,7 +17,9 @@ from tests.recording.log.make_states import AB, opened, refusal, states
 from tests.refused import refused
 
 NUM = 5000  # rows, more than a block
+
 T = np.arange(NUM) * 0.01
+
 Q = np.stack([np.linspace(0, 1, NUM), np.linspace(1, -1, NUM)], axis=1)
 
 
@@ -61,44 +64,47 @@ def test_tables_of_every_form_give_the_states_that_were_written(tmp_path: Path, 
     assert found[7].velocity == pytest.approx((Q[1] - Q[0]) / 0.01, rel=1e-3)
 
 
-def test_times_of_a_type_that_says_its_unit_need_no_time_unit(tmp_path: Path) -> None:
+def with_q(folder: Path, **columns: Any) -> Path:
+    """A description of a table of times t and positions q."""
+    write_parquet(folder / "run.parquet", **columns)
+    return described(folder, file="run.parquet", joints=list(AB), time="t", position=["q"])
+
+
+def test_times_of_a_type_that_says_its_unit_need_no_time_unit_and_what_is_not_there_is_no_number(
+    tmp_path: Path,
+) -> None:
     stamps = 1_700_000_000_000_000 + 10_000 * np.arange(20)
-    times = pa.array(stamps, type=pa.timestamp("us"))
-    write_parquet(tmp_path / "run.parquet", t=times, q=lists(Q[:20]))
-    found = states(described(tmp_path, file="run.parquet", joints=list(AB), time="t", position=["q"]))
+    found = states(with_q(tmp_path, t=pa.array(stamps, type=pa.timestamp("us")), q=lists(Q[:20])))
     assert [s.stamp_ns for s in found] == (1000 * stamps).tolist()
-
-
-def test_a_value_that_is_not_there_is_no_number(tmp_path: Path) -> None:
-    columns = {"t": T[:20], "qa": pa.array([None, *Q[1:20, 0]]), "qb": Q[:20, 1]}
-    write_parquet(tmp_path / "run.parquet", **columns)
+    write_parquet(tmp_path / "run.parquet", t=T[:20], qa=pa.array([None, *Q[1:20, 0]]), qb=Q[:20, 1])
     source = opened(described(tmp_path, file="run.parquet", joints=list(AB), time="t", position=["qa", "qb"]))
     assert (len(source.states), source.loss.damaged) == (19, 1)  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("kind", ["h5", "parquet", "parquet with a gap"])
-def test_rows_of_several_lengths_are_refused_as_ragged(tmp_path: Path, kind: str) -> None:
-    rows = [[0.0, 1.0], [0.0, 1.0, 2.0], [3.0]]
-    if kind == "h5":
-        with h5py.File(tmp_path / "run.h5", "w") as file:
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [[0.0, 1.0], [0.0, 1.0, 2.0], [3.0]],
+        [[0.0, 1.0], None, [0.0, 1.0]],
+        [[0.0, 1.0]] * 4500 + [[0.0, 1.0, 2.0]] * 500,
+        "h5",
+    ],
+    ids=["lengths", "a gap", "a later block", "h5"],
+)
+def test_rows_of_several_lengths_are_refused_as_ragged(tmp_path: Path, rows: Any) -> None:
+    name = "run.h5" if rows == "h5" else "run.parquet"
+    if rows == "h5":
+        with h5py.File(tmp_path / name, "w") as file:
             file["t"] = T[:3]
             ragged = file.create_dataset("q", (3,), dtype=h5py.vlen_dtype(np.float64))
-            for i, row in enumerate(rows):
+            for i, row in enumerate([[0.0, 1.0], [0.0, 1.0, 2.0], [3.0]]):
                 ragged[i] = row
+        path = described(tmp_path, file=name, joints=list(AB), time="t", position=["q"])
     else:
-        values = pa.array(rows if kind == "parquet" else [[0.0, 1.0], None, [0.0, 1.0]], type=pa.list_(pa.float64()))
-        write_parquet(tmp_path / "run.parquet", t=T[:3], q=values)
-    name = "run.h5" if kind == "h5" else "run.parquet"
-    message = refusal(described(tmp_path, file=name, joints=list(AB), time="t", position=["q"]))
+        path = with_q(tmp_path, t=T[: len(rows)], q=pa.array(rows, type=pa.list_(pa.float64())))
+    message = refusal(path)
     assert f"{name}: q: ragged: its rows differ in length" in message
     assert "write rows of one length: an array (T, K), or a column for each joint" in message
-
-
-def test_a_column_that_grows_in_a_later_block_is_ragged_too(tmp_path: Path) -> None:
-    rows = [[0.0, 1.0]] * 4500 + [[0.0, 1.0, 2.0]] * 500
-    write_parquet(tmp_path / "run.parquet", t=T, q=pa.array(rows, type=pa.list_(pa.float64())))
-    path = described(tmp_path, file="run.parquet", joints=list(AB), time="t", position=["q"])
-    assert "ragged" in refusal(path)
 
 
 @pytest.mark.parametrize("name", ["run.h5", "run.parquet"])
@@ -122,15 +128,11 @@ def test_a_column_that_is_not_there_text_and_damage_are_named(tmp_path: Path, na
 
 
 def test_without_the_library_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> Any:
-        raise ImportError(f"No module named {name!r}")
-
     (tmp_path / "run.h5").write_bytes(b"")
     path = described(tmp_path, file="run.h5", joints=list(AB), time="t", position=["q"])
-    monkeypatch.setattr(libraries, "import_module", absent)
-    refused(
-        r"HDF5 files need the library h5py.*pip install 'splatctrl-cli\[tables\]'", opened, path, error=UsageError
-    )
+    monkeypatch.setattr(libraries, "import_module", Mock(side_effect=ImportError("No module named 'h5py'")))
+    said = r"HDF5 files need the library h5py.*pip install 'splatctrl-cli\[tables\]'"
+    refused(said, opened, path, error=UsageError)
 
 
 def lerobot(folder: Path, version: int, *, num_episodes: int = 3, names: Any = None) -> Path:
@@ -139,19 +141,16 @@ def lerobot(folder: Path, version: int, *, num_episodes: int = 3, names: Any = N
     info = {"codebase_version": f"v{version}.0", "total_episodes": num_episodes, "fps": 50}
     (folder / "meta").mkdir(parents=True)
     (folder / "meta/info.json").write_text(json.dumps({**info, "features": {"observation.state": feature}}))
-    episodes = []
-    for episode in range(num_episodes):
-        q = Q[:30] + np.array([episode, 0])
-        column = np.full(30, episode)
-        episodes.append({"t": T[:30].astype(np.float32) * 2, "q": q, "episode": column})
+    numbers = list(range(num_episodes))
     if version == 2:
-        files = {f"data/chunk-000/episode_{n:06d}.parquet": [entry] for n, entry in enumerate(episodes)}
+        files = {f"data/chunk-000/episode_{n:06d}.parquet": [n] for n in numbers}
     else:
-        files = {"data/chunk-000/file-000.parquet": episodes[:2], "data/chunk-000/file-001.parquet": episodes[2:]}
-    for name, parts in files.items():
-        if parts:
-            t, q, episode_index = (np.concatenate([part[key] for part in parts]) for key in ("t", "q", "episode"))
-            columns = {"observation.state": lists(q), "timestamp": t, "episode_index": episode_index}
+        files = {"data/chunk-000/file-000.parquet": numbers[:2], "data/chunk-000/file-001.parquet": numbers[2:]}
+    for name, episodes in files.items():
+        if episodes:
+            q = np.concatenate([Q[:30] + np.array([episode, 0]) for episode in episodes])
+            t = np.tile(T[:30].astype(np.float32) * 2, len(episodes))
+            columns = {"observation.state": lists(q), "timestamp": t, "episode_index": np.repeat(episodes, 30)}
             write_parquet(folder / name, **columns)
     return folder
 
@@ -183,11 +182,7 @@ def test_joints_that_a_lerobot_dataset_does_not_name_are_given(tmp_path: Path) -
     assert "states.joints is missing" in refusal(described(tmp_path, preset="lerobot", file="set"))
     path = described(tmp_path, preset="lerobot", file="set", joints=list(AB), unit="deg")
     assert states(path)[3].position == pytest.approx(np.radians(Q[3]), abs=1e-6)
-
-
-def test_a_preset_that_is_none_and_a_dataset_without_states_are_named(tmp_path: Path) -> None:
     said = refusal(described(tmp_path, preset="leroboto", file="set"))
     assert "states.preset: expected one of lerobot, got 'leroboto'" in said
-    folder = lerobot(tmp_path / "set", 3, num_episodes=1)
     (folder / "meta/info.json").write_text("{}")
     assert "expected total_episodes and the feature observation.state" in refusal(folder)
