@@ -12,9 +12,6 @@ from experiments.problems import ProblemRequest
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Stopwatch
-from splatctrl_cli.recording.folder.dtu import read_dtu
-from splatctrl_cli.recording.folder.idr import write_idr
-from tests.recording.folder.make_layout import half_size
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "dtu"
 GOOD = Fit(environment=GIVEN, number=24, method="5k", psnr=24.0, psnr_seen=25.0, ssim=0.9, depth=0.003, splats=4900)
@@ -55,14 +52,13 @@ def test_without_a_tree_the_simulated_scan_is_fitted_by_several_seeds(tmp_path: 
 
 
 @pytest.mark.usefixtures("fast")
-def test_a_scan_of_a_tree_goes_through_budgets_and_baseline(tmp_path: Path) -> None:
-    write_idr(tmp_path, "scan1", [half_size(view) for view in read_dtu(SAMPLE).views])
-    rows = list(trials_of(asked("dtu-0001", tmp_path, METHODS), Config(), Stopwatch()))
+def test_a_scan_of_a_tree_goes_through_budgets_and_baseline() -> None:
+    rows = list(trials_of(asked("dtu-0001", SAMPLE, METHODS), Config(), Stopwatch()))
     assert [row.method for row in rows] == list(METHODS)
     assert [row.splats for row in rows[:2]] < [row.splats for row in rows[1:3]]
     assert all(row.success and row.psnr is not None and row.psnr > 5 for row in rows)
     with pytest.raises(InputError, match="has no scan 7"):
-        list(trials_of(asked("dtu-0007", tmp_path, METHODS), Config(), Stopwatch()))
+        list(trials_of(asked("dtu-0007", SAMPLE, METHODS), Config(), Stopwatch()))
 
 
 def test_a_scan_of_a_tree_is_not_the_simulated_one() -> None:
