@@ -89,6 +89,7 @@ CURVE = reliability(np.array([0.0, 0.95]), np.array([False, True]))  # with empt
 DRAWN: dict[str, Callable[[Path], None]] = {
     "comparison": lambda path: comparison_picture(path, [row(0.0), row(0.1)]),
     "slice": lambda path: field_slice_picture(path, grid(), 2, 0.5, SPHERES, "A ball"),
+    "plain slice": lambda path: field_slice_picture(path, grid(), 2, 0.5),
     "slices": lambda path: slices_picture(path, grid(), MIDDLE),
     "slices of nothing": lambda path: slices_picture(path, grid(distance=np.nan), MIDDLE),
     "large slices": lambda path: slices_picture(path, LARGE, (0.5, 0.0, 0.0)),
@@ -149,8 +150,8 @@ def test_never_seen_space_shows_in_a_slice_where_somebody_looked_and_the_point_t
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.png"
-    field_slice_picture(path, grid(observed=0), 2, 0.5, SPHERES, "A ball")
-    assert path.read_bytes() != drawn_bytes("slice")
+    field_slice_picture(path, grid(observed=0), 2, 0.5)
+    assert path.read_bytes() != drawn_bytes("plain slice")
     never, unknown = grid(observed=0), grid(observed=0, header="no occupancy grid: all never seen")
     others = []
     for cells, place in ((never, MIDDLE), (unknown, MIDDLE), (grid(), (0.0, 0.0, 0.0))):
