@@ -13,11 +13,11 @@ ROOT = Path(__file__).parent.parent
 
 
 def test_mutated_inputs_of_every_kind_are_read_or_refused() -> None:
-    command = [sys.executable, "-m", "benchmarks.fuzz", "--most", "36", "--minutes", "2", "--seed", "7"]
+    command = [sys.executable, "-m", "benchmarks.fuzz", "--most", "24", "--minutes", "2", "--seed", "7"]
     command += ["--kinds", "mcap-plain", "bag", "db3", "images", "spz", "npz", "urdf", "table"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
-    assert "36 inputs" in done.stdout
+    assert "24 inputs" in done.stdout
     assert "0 faults" in done.stdout
 
 

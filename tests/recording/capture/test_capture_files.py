@@ -140,7 +140,6 @@ def test_options_that_a_capture_cannot_honour_and_newer_versions_are_refused(tmp
 @pytest.mark.parametrize(
     ("example", "folder"),
     [
-        ("apc_shelf", "apc_shelf/scene-0000"),
         ("open3d_rgbd", "open3d_rgbd/RGBD"),
         ("tabletop_views", "tabletop_views"),
     ],
