@@ -7,6 +7,7 @@ rosbags (rosbags/rosbag2/storage_sqlite3.py) counts messages first, so one bad p
 rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions.
 """
 
+import os
 import shutil
 import sqlite3
 import struct
@@ -266,14 +267,14 @@ class Bag1Log:
 
 _WIDEST_HOLE = 1 << 40
 _WAL = b"\2\2"  # format versions of a database that keeps what is new in a journal, "-wal"
-_FILE_FORMAT = slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
+_PAGE_SIZE, _FILE_FORMAT = slice(16, 18), slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
 
 
 class Db3Log:
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal, so both are copied first. Raises InputError for other tables, or
-    an unreadable file.
+    SQLite writes while it reads a journal, so both are copied first. It takes what is missing of a page for zeros, so
+    a file that was cut is copied without its last page. Raises InputError for other tables, or an unreadable file.
     """
 
     container = "ROS 2 bag (sqlite3)"
@@ -283,32 +284,42 @@ class Db3Log:
         self._journal, self._num_pages = path.with_name(f"{path.name}-wal"), 0
         has_journal = self._journal.is_file() and self._journal.stat().st_size > 0
         self.files = (path, self._journal) if has_journal else (path,)
+        with path.open("rb") as stream:
+            header = stream.read(_FILE_FORMAT.stop)
+        page = int.from_bytes(header[_PAGE_SIZE], "big") if header.startswith(b"SQLite format 3") else 0
+        size = path.stat().st_size
+        end = size - size % (page if page > 1 else 1 << 16) if page else size  # 1 stands for 65536 bytes
         try:
+            if has_journal or end < size:
+                self._copy(end)
             if has_journal:
                 self._merge()
             with closing(self._opened()) as database:
                 self._topics = _topics(database)
         except (sqlite3.Error, ValueError) as error:
             remedy = "try 'ros2 bag reindex', or copy it again"
-            with path.open("rb") as stream:
-                is_in_parts = stream.read(_FILE_FORMAT.stop)[_FILE_FORMAT] == _WAL
-            if is_in_parts and not has_journal:
+            if header[_FILE_FORMAT] == _WAL and not has_journal:
                 error = ValueError(f"{error}, and {self._journal.name} is not beside it")
                 remedy = f"copy {self._journal.name} from where the bag was recorded: a stopped recorder leaves it"
             raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
 
-    def _merge(self) -> None:
-        """Merge the journal into a copy. Raises InputError without room for it."""
+    def _copy(self, size: int) -> None:
+        """Copy the files, `size` [bytes] of the database. Raises InputError without room for it."""
         folder = Path(tempfile.mkdtemp(prefix="splatctrl-", dir=scratch_folder()))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         try:
-            self._database = Path(shutil.copyfile(self.path, folder / self.path.name))
-            shutil.copyfile(self._journal, folder / self._journal.name)
+            copies = [Path(shutil.copyfile(file, folder / file.name)) for file in self.files]
         except OSError as error:
+            names = " and ".join(file.name for file in self.files)
             raise InputError(
-                f"{self.path}: cannot be copied to {folder.parent} to read {self._journal.name}: {error.strerror}",
-                remedy="set TMPDIR to a folder with room for both files",
+                f"{self.path}: cannot be copied to {folder.parent} to read {names}: {error.strerror}",
+                remedy="set TMPDIR to a folder with room for it",
             ) from None
+        self._database = copies[0]
+        os.truncate(self._database, size)
+
+    def _merge(self) -> None:
+        """Merge the journal into the copy."""
         try:
             with closing(sqlite3.connect(self._database)) as database:
                 self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]
