@@ -1,4 +1,4 @@
-"""Refusals: what is wrong is said in one line, in most cases with a remedy."""
+"""One assertion for refusals: error type, words, one line, and a remedy if asked for."""
 
 import re
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.errors import InputError, SplatCtrlError
 
 
-def refused(
+def expect_refusal(
     words: str,
     call: Callable[..., object],
     *given: object,
@@ -16,7 +16,7 @@ def refused(
     has_remedy: bool = False,
     **named: object,
 ) -> str:
-    """The call is refused with these words, or ones of their pattern, in one line; returns all that it says."""
+    """Call, expect an error in one line that contains or matches `words`, and return its text."""
     with pytest.raises(error) as caught:
         call(*given, **named)
     said = str(caught.value)

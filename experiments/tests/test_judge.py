@@ -1,6 +1,4 @@
-"""What a motion comes to: everywhere on the way and not at samples, by cause, and greens that were not to be; and the
-picture that a trial without success leaves.
-"""
+"""Outcomes of motions, measured between samples too, with causes and false greens; pictures of failed trials."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -128,7 +126,7 @@ def pictured(
 
 
 def num_pixels(path: Path, name: str) -> int:
-    """How many have the hue of a colour, in both views."""
+    """Pixels with the hue of a named colour, in both views."""
     image = cv2.imread(str(path))[80:530, :, ::-1].astype(np.float64)
     brightest = image.max(axis=2, keepdims=True)
     color = np.array(to_rgb(COLORS[name]))

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.records import Float64, RgbdFrame
-from tests.cases.case import Case, Run, told
+from tests.cases.case import Case, Run, expect_result
 from tests.recording.log.make_log import START_NS, camera_info, encoded, frames_of, image, write_raw
 
 WIDTH, HEIGHT = 64, 48
@@ -111,7 +111,7 @@ def ingested(folder: Path, out: Path, run: Run, *options: str) -> RgbdFrame:
     """The first frame of the log in a folder, as `ingest` keeps it."""
     log = next(folder.glob("*.mcap"))
     poses = ["--camera-pose", "cam=identity"] if log.name == "log.mcap" else []
-    told(run, ["ingest", log, "-o", out / "capture", "--force", *poses, *options])
+    expect_result(run, ["ingest", log, "-o", out / "capture", "--force", *poses, *options])
     return frames_of(out / "capture")[0]
 
 
@@ -181,14 +181,14 @@ def write_transforms(**lens: Any) -> Callable[[Path], None]:
 
 def folder_at_edge(folder: Path, out: Path, run: Run) -> None:
     """The box of a folder is where it stands."""
-    told(run, ["ingest", folder, "-o", out / "capture"])
+    expect_result(run, ["ingest", folder, "-o", out / "capture"])
     low, high = box_x(frames_of(out / "capture")[0], 0.45)
     assert abs(low - 0.5) < 0.03 and abs(high - 0.65) < 0.03
 
 
 def folder_refused(*words: str) -> Callable[[Path, Path, Run], None]:
     """Refused by name."""
-    return lambda folder, out, run: told(run, ["ingest", folder, "-o", out / "capture"], *words, code=4)
+    return lambda folder, out, run: expect_result(run, ["ingest", folder, "-o", out / "capture"], *words, code=4)
 
 
 ANGLES = Lens(focal=30.0, model="equidistant", D=(0.0, 0.0, 0.0, 0.0), bends=("equidistant", ()))

@@ -52,8 +52,8 @@ def runner(capsys: pytest.CaptureFixture[str]) -> Run:
     return run
 
 
-def told(run: Run, words: Sequence[str | Path], *parts: str, code: int = 0) -> Result:
-    """What a call gives that ends with this code and says all these parts."""
+def expect_result(run: Run, words: Sequence[str | Path], *parts: str, code: int = 0) -> Result:
+    """Run a command and return its result, which must have this exit code and contain all parts."""
     result = run(words)
     assert result.code == code, result.text
     assert all(part in result.text for part in parts), result.text

@@ -22,7 +22,7 @@ from splatctrl_cli.recording.log.decoder import COMPRESSED_IMAGE
 from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Float32, Float64, RgbdFrame
-from tests.cases.case import Case, Run, told
+from tests.cases.case import Case, Run, expect_result
 from tests.recording.log.make_log import (
     Change,
     LogRecipe,
@@ -92,7 +92,7 @@ def _examine_killed(folder: Path, out: Path, run: Run) -> None:
         before = sorted((path.name, path.read_bytes()) for path in bag.parent.iterdir())
         for number, given in enumerate((bag, bag.parent)):
             words = ["ingest", given, "-o", out / f"{bag.parent.name}{number}.capture"]
-            result = told(run, words, "pages of bag_0.db3-wal were read")
+            result = expect_result(run, words, "pages of bag_0.db3-wal were read")
             assert "cam0 3" in result.text or "cam 3" in result.text
         assert sorted((path.name, path.read_bytes()) for path in bag.parent.iterdir()) == before
 
@@ -110,7 +110,7 @@ def _make_message_mode(folder: Path) -> None:
 
 def _examine_message_mode(folder: Path, out: Path, run: Run) -> None:
     for path in sorted(folder.glob("*.db3*")):
-        result = told(run, ["ingest", path, "-o", out / f"{path.name}.capture"])
+        result = expect_result(run, ["ingest", path, "-o", out / f"{path.name}.capture"])
         assert "cam 6" in result.text or "cam0 3" in result.text
         assert "damaged" not in result.text
 
@@ -159,7 +159,7 @@ def _make_sdk(folder: Path) -> None:
 def _examine_sdk(folder: Path, out: Path, run: Run) -> None:
     for path in sorted(folder.glob("*.[dm]*")):
         capture = out / f"{path.name}.capture"
-        told(run, ["ingest", path, "-o", capture, "--camera-pose", "device_0=identity"], "device_0 6")
+        expect_result(run, ["ingest", path, "-o", capture, "--camera-pose", "device_0=identity"], "device_0 6")
         camera = read_capture_header(capture)["cameras"]["device_0"]
         assert [camera[name] for name in ("fx", "fy", "cx", "cy")] == [60.0, 60.0, 31.5, 23.5]
         found, is_turned, expected = survey(open_raw_log(path)).realsense, path.stem == "turned", np.eye(4)
@@ -210,8 +210,8 @@ def _make_codes(folder: Path) -> None:
 def _examine_codes(folder: Path, out: Path, run: Run) -> None:
     for path in sorted(folder.glob("*.mcap")):
         capture = out / f"{path.stem}.capture"
-        result = told(run, ["check", path])
-        told(run, ["ingest", path, "-o", capture])
+        result = expect_result(run, ["check", path])
+        expect_result(run, ["ingest", path, "-o", capture])
         if path.stem not in CODES:
             value = {"counts-65534": 65.534}.get(path.stem, CONSTANTS.get(path.stem))
             assert f"many pixels are exactly {value:g} m, the largest depth of 6 of 6 images" in result.text
@@ -222,7 +222,7 @@ def _examine_codes(folder: Path, out: Path, run: Run) -> None:
         assert first_depth(capture).max() < 2.0
         if path.stem in {"14-65535", "float-max"}:
             few = ("scene.first_iterations=2", "--set", "scene.iterations_per_step=1", "--max-splats", "200")
-            told(run, ["reconstruct", path, "-o", out / f"{path.stem}.scene", "--set", *few])
+            expect_result(run, ["reconstruct", path, "-o", out / f"{path.stem}.scene", "--set", *few])
 
 
 def _png(message: Any) -> bytes:
@@ -274,7 +274,7 @@ def _make_packed(folder: Path) -> None:
 def _examine_packed(folder: Path, out: Path, run: Run) -> None:
     for path in sorted(folder.glob("*.mcap")):
         capture, is_read = out / f"{path.stem}.capture", path.stem in READ
-        result = told(run, ["ingest", path, "-o", capture], code=0 if is_read else 4)
+        result = expect_result(run, ["ingest", path, "-o", capture], code=0 if is_read else 4)
         assert "damaged" not in result.text and "copy the file" not in result.text
         if is_read:
             assert result.text.count("its PNG begins at byte 0") + result.text.count("a PNG behind 12 bytes") == 1
@@ -334,18 +334,18 @@ def _examine_infrared(folder: Path, out: Path, run: Run) -> None:
         words = ["ingest", path, "-o", out / f"{path.stem}.capture"]
         if path.stem in NO_DEPTH:
             said = "no depth topic; neither depth nor colour: {} (named {})".format(*NO_DEPTH[path.stem])
-            told(run, words, said, "give --camera NAME=COLOR,DEPTH", code=4)
+            expect_result(run, words, said, "give --camera NAME=COLOR,DEPTH", code=4)
             assert "no depth topic" in run(["check", path]).text
         elif path.stem in DEPTHS:
-            told(run, words)
+            expect_result(run, words)
             assert DEPTHS[path.stem].split()[0] in run(["info", path]).out.splitlines()[-1]
         elif path.stem == "gray-depth":
-            told(run, words, "/cam0/depth/image_raw (mono8 that is named depth)", code=4)
+            expect_result(run, words, "/cam0/depth/image_raw (mono8 that is named depth)", code=4)
         else:
             rivals = "/cam0/one/image_raw, /cam0/two/image_raw could each be its depth"
-            told(run, words, rivals, "give --camera cam0=/cam0/color/image_raw,DEPTH", code=4)
+            expect_result(run, words, rivals, "give --camera cam0=/cam0/color/image_raw,DEPTH", code=4)
             assert "could each be its depth" in run(["info", path]).text
-            told(run, [*words, "--camera", "cam0=/cam0/color/image_raw,/cam0/two/image_raw"])
+            expect_result(run, [*words, "--camera", "cam0=/cam0/color/image_raw,/cam0/two/image_raw"])
 
 
 def _with_info(
@@ -400,13 +400,13 @@ def _examine_cut(folder: Path, out: Path, run: Run) -> None:
         capture = out / f"{path.stem}.capture"
         words = ["ingest", path, "-o", capture]
         if path.stem in CONTRADICTED:
-            result = told(run, words, CONTRADICTED[path.stem][3], code=4)
+            result = expect_result(run, words, CONTRADICTED[path.stem][3], code=4)
             name = re.search(r"camera (\w+):", result.text)[1]
             assert f"give --intrinsics {name}=FX,FY,CX,CY of the recorded images" in result.text
             assert run(["check", path]).code != 0
-            told(run, [*words, "--intrinsics", f"{name}=60,60,31.5,23.5"])
+            expect_result(run, [*words, "--intrinsics", f"{name}=60,60,31.5,23.5"])
             continue
-        result = told(run, words)
+        result = expect_result(run, words)
         camera = next(iter(read_capture_header(capture)["cameras"].values()))
         if path.stem == "depth-alone":
             assert "/cam0/depth/camera_info: says region of 32x24 at (10, 0) of 64x48" in result.text
@@ -432,7 +432,7 @@ def _examine_foreign(folder: Path, out: Path, run: Run) -> None:
         if path.suffix != ".mkv":
             parts = "a Record3D recording, which is not read", "export it in the Record3D app"
         for words in (["ingest", path, "-o", out / "x.capture"], ["info", path], ["check", path]):
-            assert "pip install" not in told(run, words, *parts, code=4).text
+            assert "pip install" not in expect_result(run, words, *parts, code=4).text
 
 
 CASES: tuple[Case, ...] = (

@@ -11,7 +11,7 @@ from splatctrl_cli.geometry import quat_from_rotation, strided_lens
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from tests.calibration.scan import views_of
-from tests.cases.case import Case, Run, told
+from tests.cases.case import Case, Run, expect_result
 from tests.conftest import ROOT
 
 START = 1305031102.1
@@ -51,11 +51,11 @@ def lens() -> tuple[str, str]:
 def in_millimetres(folder: Path, out: Path, run: Run) -> None:
     """What `check` calls an error stops `reconstruct`, with the remedy that `check` gives; obeyed, it succeeds."""
     options, remedy = lens(), "give --depth-scale 0.001"
-    told(run, ["check", folder, *options], remedy, "views-scale", code=1)
+    expect_result(run, ["check", folder, *options], remedy, "views-scale", code=1)
     words = ["reconstruct", folder, *options, *TINY]
-    told(run, [*words, "-o", out / "scene"], remedy, "views-scale", code=4)
-    told(run, [*words, "-o", out / "scene", "--depth-scale", "0.001"])
-    told(run, [*words, "-o", out / "near", "--allow-disagreement"])
+    expect_result(run, [*words, "-o", out / "scene"], remedy, "views-scale", code=4)
+    expect_result(run, [*words, "-o", out / "scene", "--depth-scale", "0.001"])
+    expect_result(run, [*words, "-o", out / "near", "--allow-disagreement"])
 
 
 def no_pose(num: int, lines: int) -> Callable[[Path, Path, Run], None]:
@@ -66,7 +66,7 @@ def no_pose(num: int, lines: int) -> Callable[[Path, Path, Run], None]:
         given = lens() if is_ours else ("--intrinsics", "camera=60,60,31.5,23.5")
         parts = (f"without pose: {num} ", f"{lines} of ") if is_ours else ()
         words = ["ingest", folder if is_ours else folder / "32-tum-nan", *given, "-o", out / "capture"]
-        told(run, words, "lines are no pose (nan)", *parts)
+        expect_result(run, words, "lines are no pose (nan)", *parts)
 
     return examine
 
@@ -76,7 +76,7 @@ def as_check_says(folder: Path, out: Path, run: Run) -> None:
     is_ours = (folder / "rgb.txt").is_file()
     options = [folder, *lens()] if is_ours else [folder / "40-tum-mm", "--intrinsics", "camera=60,60,31.5,23.5"]
     refuses = "cannot start, or would be wrong: ingest, reconstruct" in run(["check", *options]).text
-    told(run, ["reconstruct", *options, "-o", out / "scene", *TINY], code=4 if refuses else 0)
+    expect_result(run, ["reconstruct", *options, "-o", out / "scene", *TINY], code=4 if refuses else 0)
 
 
 def write_windows(folder: Path) -> None:
@@ -100,7 +100,7 @@ def one_frame(folder: Path, out: Path, run: Run) -> None:
 def all_frames(folder: Path, out: Path, run: Run) -> None:
     """They are read."""
     num = len(views_of(ROOT / "sample_data"))
-    told(run, ["ingest", folder, *lens(), "-o", out / "capture"], f"camera {num}")
+    expect_result(run, ["ingest", folder, *lens(), "-o", out / "capture"], f"camera {num}")
 
 
 CASES: tuple[Case, ...] = (

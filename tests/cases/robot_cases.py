@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from tests.cases.case import Case, Run, told
+from tests.cases.case import Case, Run, expect_result
 
 SIZE = (0.1, 0.2, 0.3)  # [m] of the mesh
 
@@ -69,7 +69,7 @@ def areas(run: Run, urdf: Path, out: Path) -> dict[str, float]:
     spheres = out / "areas.yaml"
     spheres.write_text(json.dumps({"collision_spheres": {link: [SMALL] for link in ("base", "l1")}}))
     words = ["robot", "check", "--urdf", urdf, "--packages", urdf.parent, "--spheres", spheres, "--json"]
-    links = json.loads(told(run, [*words, *ANY]).out)["links"]
+    links = json.loads(expect_result(run, [*words, *ANY]).out)["links"]
     return {link["link"]: round(1e4 * link["area"], 3) for link in links}
 
 
@@ -79,10 +79,10 @@ def _zero_axis(folder: Path) -> None:
 
 
 def _examine_zero_axis(folder: Path, out: Path, run: Run) -> None:
-    told(run, ["robot", "info", "--urdf", folder / "07-plain-stl.urdf"])
+    expect_result(run, ["robot", "info", "--urdf", folder / "07-plain-stl.urdf"])
     sentence = "joint 'j': axis: expected a direction, got '0 0 0': link 'l1' would never move"
     for words in (["info"], ["check"], ["spheres", "-o", out / "s.yaml"]):
-        told(run, ["robot", words[0], "--urdf", folder / "27-axis0.urdf", *words[1:]], sentence, code=4)
+        expect_result(run, ["robot", words[0], "--urdf", folder / "27-axis0.urdf", *words[1:]], sentence, code=4)
 
 
 AXES = {
@@ -108,7 +108,7 @@ BALL = '<sphere radius="0.05"/>'
 
 def _examine_axes(folder: Path, out: Path, run: Run) -> None:
     for name, (_, _, sentence) in AXES.items():
-        told(run, ["robot", "info", "--urdf", folder / f"{name}.urdf"], sentence, code=4 if sentence else 0)
+        expect_result(run, ["robot", "info", "--urdf", folder / f"{name}.urdf"], sentence, code=4 if sentence else 0)
 
 
 def _dae(folder: Path) -> None:
@@ -146,7 +146,7 @@ def _examine_other_meshes(folder: Path, out: Path, run: Run) -> None:
     words = ["--packages", folder, "--spheres", out / "areas.yaml", *ANY]
     for name, bytes_ in (("tail", 63), ("tail50", 50), ("solid_tail", 1)):
         sentence = f"{name}.stl: {bytes_} bytes after its 12 faces are ignored"
-        told(run, ["robot", "check", "--urdf", folder / f"{name}.urdf", *words], sentence)
+        expect_result(run, ["robot", "check", "--urdf", folder / f"{name}.urdf", *words], sentence)
     sentences = {
         "millimetres": "expected a length of 1 mm to 10 m, got 300 m; looks like millimetres: scale=",
         "no_unit": "expected a length of 1 mm to 10 m, got 30 m; looks like millimetres: scale=",
@@ -154,7 +154,9 @@ def _examine_other_meshes(folder: Path, out: Path, run: Run) -> None:
     }
     for name, sentence in sentences.items():
         for command in (["check", *words], ["spheres", *words[:2], "-o", out / "other.yaml"]):
-            told(run, ["robot", command[0], "--urdf", folder / f"{name}.urdf", *command[1:]], sentence, code=4)
+            expect_result(
+                run, ["robot", command[0], "--urdf", folder / f"{name}.urdf", *command[1:]], sentence, code=4
+            )
 
 
 SPHERES = {"base": [{"center": [0, 0, 0], "radius": 0.08}], "l1": [{"center": [0, 0, 0], "radius": 0.04}]}
@@ -184,7 +186,7 @@ def _sphere_files(folder: Path) -> None:
 def _examine_sphere_files(folder: Path, out: Path, run: Run) -> None:
     def checked(name: str, *more: str, code: int = 0, says: str = "") -> dict[str, Any]:
         words = ["robot", "check", "--urdf", folder / "robot.urdf", "--spheres", folder / name, *more, "--json"]
-        found: dict[str, Any] = json.loads(told(run, words, says, code=code).out)
+        found: dict[str, Any] = json.loads(expect_result(run, words, says, code=code).out)
         return found
 
     wanted = {"lula.yaml": (2, 10.0), "twice.yaml": (3, 10.0), "robot.xrdf": (2, 6.603), "two.xrdf": (2, 10.0)}

@@ -12,7 +12,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from splatctrl_cli.formats.ply import read_points, read_positions
-from tests.cases.case import Case, Run, told
+from tests.cases.case import Case, Run, expect_result
 
 SIDE = 20  # splats along a side of the plane
 
@@ -84,10 +84,10 @@ def _double(folder: Path) -> None:
 def _examine_double(folder: Path, out: Path, run: Run) -> None:
     source = folder / "10-double-utm.ply"
     moves = "has steps of 0.5 m there and would move them by 0.2"
-    told(run, ["sdf-bake", source, "-o", out / "field"], moves, "'splatctrl export", code=4)
+    expect_result(run, ["sdf-bake", source, "-o", out / "field"], moves, "'splatctrl export", code=4)
     for suffix, bound, is_kept in ((".ply", 1e-6, True), (".glb", 1e-6, True), (".spz", 2e-4, False)):
         file = out / f"moved{suffix}"
-        said = told(run, ["export", source, "-o", file], "centres are less the origin 500000 5400000 300 m")
+        said = expect_result(run, ["export", source, "-o", file], "centres are less the origin 500000 5400000 300 m")
         assert ("not kept: origin" in said.text) is not is_kept
         assert 0 < exported(run, source, out / f"again{suffix}")["differences"]["center"] <= bound
         baked(run, file, out / f"field{suffix}")
@@ -206,7 +206,7 @@ def _examine_faces(folder: Path, out: Path, run: Run) -> None:
             assert np.array_equal(read_positions(out / file.name)[:, 2].astype(np.float32), wanted["z"])
         assert np.array_equal(read_positions(folder / f"points {name}.ply")[:, 0].astype(np.float32), wanted["x"])
     for name, sentence in (("cut.ply", "cut short"), ("long.ply", "longer than its header says")):
-        told(run, ["export", folder / name, "-o", out / name], sentence, code=4)
+        expect_result(run, ["export", folder / name, "-o", out / name], sentence, code=4)
 
 
 def spz_parts(degree: int = 0) -> list[bytes]:
@@ -306,17 +306,17 @@ CASES: tuple[Case, ...] = (
 
 def exported(run: Run, source: Path, out: Path) -> dict[str, Any]:
     """What `export --json` says of a file that it could write."""
-    found: dict[str, Any] = json.loads(told(run, ["export", source, "-o", out, "--json"]).out)
+    found: dict[str, Any] = json.loads(expect_result(run, ["export", source, "-o", out, "--json"]).out)
     return found
 
 
 def baked(run: Run, source: Path, out: Path) -> None:
     """Assert that a field is made of all splats; a coarse one, for speed."""
     words = ["sdf-bake", source, "-o", out, "--json", "--voxel", "0.1", "--set", "field.max_loss=1", "--no-report"]
-    assert f'"num_splats": {SIDE * SIDE}' in told(run, words).out
+    assert f'"num_splats": {SIDE * SIDE}' in expect_result(run, words).out
 
 
 def neither(run: Run, source: Path, out: Path, *parts: str) -> None:
     """Assert that `export` and `sdf-bake` refuse a file with these words."""
     for command in ("export", "sdf-bake"):
-        told(run, [command, source, "-o", out / f"{command}.ply"], *parts, code=4)
+        expect_result(run, [command, source, "-o", out / f"{command}.ply"], *parts, code=4)

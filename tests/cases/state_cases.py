@@ -13,9 +13,9 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
-from tests.cases.case import Case, Run, told
+from tests.cases.case import Case, Run, expect_result
 from tests.recording.log.make_log import START_NS, built, encoded, header, write_raw
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 PERIOD_NS = 20_000_000
 
@@ -83,9 +83,9 @@ def two_robots(folder: Path, out: Path, run: Run) -> None:
     """Refused with both topics; each can be chosen, and gives other positions."""
     path = sorted(folder.glob("*a-and-b.mcap"))[-1]
     topics = [f"/robot_{name}/joint_states" for name in "ab"]
-    told(run, ["check", path], *(f"--joint-topic {topic}" for topic in topics), code=1)
+    expect_result(run, ["check", path], *(f"--joint-topic {topic}" for topic in topics), code=1)
     names = [f"joint{i}" for i in range(1, 8)]
-    refused("both have joint1", open_states, path, SourceOptions(), names)
+    expect_refusal("both have joint1", open_states, path, SourceOptions(), names)
     a, b = (open_states(path, SourceOptions(joint_topic=topic), names).states for topic in topics)
     assert np.abs(a.position[:40] - b.position[:40]).max() > 0.1
 
@@ -167,7 +167,7 @@ def not_evaluable(folder: Path, out: Path, run: Run) -> None:
         "cannot start, or would be wrong: replay",
     )
     model = RobotModel.from_urdf(next(folder.glob("*.urdf")))
-    refused(
+    expect_refusal(
         "two publishers take turns",
         lambda: open_states(next(folder.glob("*.mcap")), SourceOptions(), model.joint_names),
         error=NotEvaluableError,
@@ -200,7 +200,7 @@ def asks_for_urdf(folder: Path, out: Path, run: Run) -> None:
     """Two arms under prefixes fit one robot: nothing is guessed, and --lock is no remedy."""
     model = RobotModel.from_urdf(folder / "r.urdf")
     source = open_states(folder / "log.mcap", SourceOptions(), model.joint_names)
-    refused(r"left_shoulder.*; give the URDF of the robot", model.joint_columns, source.joint_names)
+    expect_refusal(r"left_shoulder.*; give the URDF of the robot", model.joint_columns, source.joint_names)
 
 
 def swing(t: float) -> Sequence[float]:

@@ -108,7 +108,7 @@ def test_an_old_scene_is_stale(desk: Desk) -> None:
 
 
 def test_the_names_of_gates_are_those_of_the_metrics(desk: Desk) -> None:
-    """Those of the other modes: test_the_recorded_commands_of_ours_make_the_same_steps."""
+    """This is the audit. test_the_recorded_commands_of_ours_make_the_same_steps does the other modes."""
     assert desk.replay(*scene_of(desk, BALL), "-q") == 0
     names = metric_names("audit", ("exact", "barrier"), has_truth=False)
     assert set(desk.metrics()) == set(names) and len(set(names)) == len(names)

@@ -41,7 +41,7 @@ def gaps(arm: PlanarArm | RobotModel, field: DistanceField, states: Float64) -> 
 
 
 def bound_of_ends(arm: PlanarArm, balls: Balls, states: Float64) -> float:
-    """By the reference, of two states."""
+    """Reference bound between two states."""
     return interval_bound(*gaps(arm, balls, states), states[1] - states[0], Reach.of(arm).levers)
 
 

@@ -52,14 +52,14 @@ def above(height: float) -> Seen:
 
 
 @cache
-def beside_the_arm(margin: float) -> list[tuple[Float64, float, int]]:
+def near_points(margin: float) -> list[tuple[Float64, float, int]]:
     return list(points_beside(PlanarArm(), LATER, margin, NEAR_LATTICE))
 
 
 def test_the_account_is_that_of_the_reference() -> None:
     hidden = EvidenceClass.HIDDEN_BY_ARM
     found = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(half_seen))
-    beside, wide = beside_the_arm(0.03), beside_the_arm(0.03 + NEAR_LATTICE / 2)
+    beside, wide = near_points(0.03), near_points(0.03 + NEAR_LATTICE / 2)
     assert len(beside) > 100
     assert found.shares.sum() == pytest.approx(1.0)
     assert found.shares[hidden] == pytest.approx(np.mean([point[2] < 0 for point, *_ in beside]))
@@ -189,7 +189,7 @@ def test_an_unseen_pocket_anywhere_within_a_wide_margin_is_found(away: float) ->
 @pytest.mark.parametrize("height", [-0.3, 0.0, 0.05, 0.4])
 def test_unseen_space_is_as_near_to_a_surface_as_by_the_reference(height: float) -> None:
     found = NearSpace(PlanarArm(), 0.03).look(0, LATER, above(height), lambda points: height - points[:, 2] + 1e-9)
-    never = [height - point[2] for point, *_ in beside_the_arm(0.03) if point[2] <= height]
+    never = [height - point[2] for point, *_ in near_points(0.03) if point[2] <= height]
     assert found.unseen_to_surface == (pytest.approx(min(never), abs=1e-8) if never else np.inf)
     assert bool(never) == (height > -0.3)
 

@@ -40,7 +40,7 @@ def run(
     has_distance: Bool = EVERY,
     later: DistanceField | None = None,
 ) -> OpenLoopTrace:
-    """In a field, or from half a second on in a later one."""
+    """Drive through a field, which `later` replaces after half a second."""
     fields = field, later or field
     given = asked or motion()
     return open_loop(PlanarArm(), CONFIG, given, task, lambda t: fields[t >= SECOND // 2], has_distance=has_distance)

@@ -53,7 +53,9 @@ def at_third(statement: str) -> tuple[str, ...]:
     return program(HELLO + LOOP % statement)
 
 
-def asked(command: tuple[str, ...], *, step_limit: float = 10.0, is_twice: bool = False) -> OutsideController:
+def make_controller(
+    command: tuple[str, ...], *, step_limit: float = 10.0, is_twice: bool = False
+) -> OutsideController:
     return OutsideController(
         "it", command, ARM, CONFIG, frame="tip", home=END, step_limit=step_limit, is_twice=is_twice
     )
@@ -61,7 +63,7 @@ def asked(command: tuple[str, ...], *, step_limit: float = 10.0, is_twice: bool 
 
 def driven(command: tuple[str, ...], **how: float) -> tuple[ReplayTrace, OutsideController]:
     """Half a second of a closed loop, and the controller that drove it."""
-    with asked(command, **how) as commander:  # type: ignore[arg-type]
+    with make_controller(command, **how) as commander:  # type: ignore[arg-type]
         trace = closed_loop(ARM, replace(CONFIG, max_time=0.5), TASK, lambda _: far_away(), commander=commander)
     return trace, commander
 
@@ -135,7 +137,7 @@ def test_a_fault_ends_the_motion_and_is_kept_by_name(name: str, monkeypatch: pyt
 )
 def test_what_does_not_start_is_refused(command: tuple[str, ...], words: str) -> None:
     with pytest.raises(InputError) as found:
-        asked(command)
+        make_controller(command)
     assert str(found.value).startswith("it: ") and words in str(found.value) and found.value.remedy
 
 
@@ -147,7 +149,7 @@ def test_a_program_that_prints_nothing_is_not_waited_for_nor_one_for_longer_than
     assert commander.failure is not None and commander.failure.fault is Fault.OUT_OF_TIME
     monkeypatch.setattr(outside, "START_LIMIT", 0.5)
     with pytest.raises(InputError, match=r"at the start: hung: no answer within 0\.5 s"):
-        asked(program("import time; time.sleep(60)"), step_limit=0.1)
+        make_controller(program("import time; time.sleep(60)"), step_limit=0.1)
 
 
 def test_a_program_and_what_it_started_are_ended(tmp_path: Path) -> None:
@@ -239,7 +241,7 @@ def recorded(classes: Path, steps: Sequence[ControlStep | None]) -> OutsideContr
     """A class that commands what these steps did."""
     velocities = [step.velocity.tolist() for step in steps if step is not None]
     (classes / "recorded.json").write_text(json.dumps(velocities))
-    return asked(class_command("own:Recorded"))
+    return make_controller(class_command("own:Recorded"))
 
 
 def test_the_recorded_commands_of_our_controller_drive_the_same_motion(classes: Path) -> None:
@@ -275,7 +277,7 @@ def test_in_open_loop_it_is_asked_at_every_state_until_it_fails(classes: Path) -
 
 def test_clearance_rows_are_given_on_request_and_broken_ones_are_told(classes: Path) -> None:
     ball = Balls([ARM.sphere_centers(START)[-1] + np.array([0.0, 0.12, 0.0])], [0.05])
-    with asked(class_command("own:Away")) as commander:
+    with make_controller(class_command("own:Away")) as commander:
         trace = closed_loop(ARM, replace(CONFIG, max_time=0.05), TASK, lambda _: ball, commander=commander)
     assert commander.failure is None
     broken = trace.steps[0].relaxed

@@ -132,7 +132,7 @@ def test_one_row_dearer_than_its_slack_gives_way_whatever_the_others_cost() -> N
 def test_residuals_vanish_at_the_optimum_and_nowhere_else(
     v: float, multiplier: float, kind: str, least: float, most: float
 ) -> None:
-    """Of min v^2 - 4 v with v <= 1: v = 1, multiplier 2."""
+    """The program min v^2 - 4 v with v <= 1 has its optimum at v = 1, with multiplier 2."""
     program = QuadraticProgram(H=np.array([[2.0]]), c=np.array([-4.0]), G=np.array([[1.0]]), h=np.array([1.0]))
     assert least <= getattr(residuals(program, np.array([v]), np.array([multiplier])), kind) <= most
 
@@ -217,7 +217,7 @@ def test_the_rotation_vector_is_the_axis_times_the_angle() -> None:
 
 
 def test_the_pose_error_carries_the_frame_to_the_goal() -> None:
-    """In the world's axes: not turned about the start's."""
+    """The error is in world axes, not in those of the start."""
     start, goal = (
         transform_from([1.0, 2, 3], [0.1, 0.2, -0.3, 0.9]),
         transform_from([1.5, 2, 2], [0.3, 0.0, 0.1, 1.0]),

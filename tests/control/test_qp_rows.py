@@ -46,7 +46,7 @@ def postures(arm: RobotModel, num: int) -> Float64:
 
 
 def state_at(arm: RobotModel, q: Float64, rate: float | Float64 = 0.0) -> State:
-    """In a box of velocities in which every row could bind."""
+    """State whose velocity box is wide enough for every row to bind."""
     wide = np.full(arm.num_joints, 1e3)
     return State(model=arm, frame=arm.frame_names[-1], q=q, box=(-wide, wide), distance_rate=rate)
 

@@ -20,7 +20,7 @@ SEEN = np.ones(400, np.bool_)
 
 
 def test_two_planes_are_as_far_apart_both_ways() -> None:
-    """Where nothing was seen that figure does not exist."""
+    """The completeness of seen surface is NaN if nothing was seen."""
     score = cloud_score(plane(0.003), plane(0.0), SEEN)
     near = ("accuracy", "completeness", "completeness_seen", "chamfer")
     assert [score[name] for name in near] == pytest.approx([0.003] * 4)
@@ -90,7 +90,7 @@ def test_rigid_motion_changes_no_figure() -> None:
 
 
 def test_thinning_leaves_one_point_to_a_cube() -> None:
-    """In parts it leaves what it does at once."""
+    """Thinning in two parts gives the same points as thinning at once."""
     points = np.array([[0.0, 0.0, 0.0], [0.0004, 0.0, 0.0], [0.0011, 0.0, 0.0], [0.0, 0.0, 0.0012]])
     np.testing.assert_array_equal(thinned(points, 0.001), points[[0, 2, 3]])
     assert len(thinned(np.empty((0, 3)), 0.001)) == 0

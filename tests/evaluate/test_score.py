@@ -149,7 +149,7 @@ def test_a_figure_of_views_rests_on_the_views_that_have_it() -> None:
 def test_mass_is_opacity_times_radius_squared_of_what_stands_in_free_voxels(
     x: list[float], opacities: ArrayLike, radii: ArrayLike, labels: ArrayLike, threshold: float, expected: float
 ) -> None:
-    """Of three voxels of 10 cm along x, from 0 on: free, full, never seen."""
+    """Three voxels of 10 cm lie along x from 0 on: free, full, never seen."""
     odds, updates = np.reshape([-2.0, 2.0, 0.0], (3, 1, 1)), np.reshape([4, 4, 0], (3, 1, 1))
     grid = plain_grid((3, 1, 1), 0.1, 0.05, log_odds=odds, num_updates=updates)
     scene = plain_splats([[value, 0.05, 0.05] for value in x], radii, opacities=opacities, labels=labels)
@@ -190,7 +190,7 @@ def disc() -> Bool:
 
 
 def lines_of(doubts: Doubts, numbers: tuple[int, ...], mask: Bool | None = None, shown: tuple[int, ...] = ()) -> str:
-    """What speaks against views, of which the renders may be those of others."""
+    """Doubts about views; `shown` names the renders that they are compared with."""
     for number, of in zip(numbers, shown or numbers, strict=True):
         doubts.look(view(number), render(of), mask)
     return "\n".join(doubts.lines())
@@ -229,7 +229,7 @@ def test_a_hair_beside_a_training_view_is_another_view() -> None:
 
 
 def test_photos_that_belong_to_other_cameras_are_found() -> None:
-    """Where things move a photo may resemble another time."""
+    """If objects move, a photo may resemble another time."""
     line = lines_of(Doubts(is_still=True), (0, 1, 2), shown=(1, 0, 2))
     assert line.startswith("holdout-0000's photo is nearer the render of holdout-0001 (")
     assert line.endswith("(and 1 more): do the cameras belong to these images, and in this order?")

@@ -62,7 +62,7 @@ def known(has_clock: bool, training: tuple[str, ...] = ("a", "b")) -> list[tuple
 
 
 def test_with_a_clock_the_newest_frame_of_each_camera_up_to_that_very_stamp_counts() -> None:
-    """Of training cameras only, and nothing is scored where no frame is."""
+    """Only training cameras count, and a recording without frames has no view."""
     assert known(has_clock=True) == [
         ("held_out-0000", []),
         ("held_out-0001", [("a", 1), ("b", 1)]),
@@ -160,7 +160,7 @@ def noise(seed: int, shape: tuple[int, ...] = (24, 31, 3)) -> Float64:
 
 
 def test_psnr_of_a_constant_offset_of_a_tenth_is_20_db() -> None:
-    """Of identical images it is infinite, and of an empty mask not a number."""
+    """Identical images give infinity, an empty mask gives NaN."""
     assert psnr(0.5 * noise(0) + 0.1, 0.5 * noise(0)) == pytest.approx(20.0, abs=1e-9)
     assert psnr(noise(0), noise(0)) == math.inf
     assert math.isnan(psnr(noise(0), noise(1), np.zeros((24, 31), dtype=bool)))

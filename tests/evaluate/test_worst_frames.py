@@ -79,7 +79,7 @@ def drawn(path: Path, moment: Moment, view: RgbdFrame) -> Float64:
 
 
 def test_the_worst_sphere_is_outlined_where_it_is(tmp_path: Path) -> None:
-    """At 0.2 m to the right, at 1 m; the caption is below."""
+    """The sphere is 0.2 m to the right at 1 m; the caption is below the image."""
     pixels = drawn(tmp_path / "worst.png", MOMENT, frame(SECOND))
     place = np.argwhere(np.all(np.abs(pixels[:720] - WORST) < 40, axis=2))
     np.testing.assert_allclose(place.mean(axis=0), 6 * np.array([59.5 + 0.5, 79.5 + 20.0 + 0.5]) - 0.5, atol=4)

@@ -54,10 +54,10 @@ def edited(splats: SplatSet, kind: str, rng: np.random.Generator, num: int = 4) 
     return replace(splats, centers=centers, radii=radii, labels=labels)
 
 
-def updated(
+def update_and_compare(
     before: SplatSet, after: SplatSet, config: FieldConfig, channels: Sequence[str], layout: GridLayout = LAYOUT
 ) -> Changes:
-    """What an update bakes, whose channels and counts are those of the full bake to the bit."""
+    """Update a bake, compare channels and counts with a full bake bit by bit, and return the changes."""
     of = ((before, 2), (after, 2), (after, 1))
     old, new, full = (Baker(splats, layout, config, channels=channels, threads=num) for splats, num in of)
     num = layout.shape[0]
@@ -81,7 +81,7 @@ def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distanc
     before = lattice() if seed % 2 else splat_set(*cloud(400, seed))
     after = edited(before, kind, np.random.default_rng(seed))
     channels = [name for name in CHANNELS if name != "se" or distance != "hard"]
-    changes = updated(before, after, replace(CONFIG, distance=distance), channels)
+    changes = update_and_compare(before, after, replace(CONFIG, distance=distance), channels)
     assert changes.num_baked < 0.8 * changes.num_blocks
     if kind != "order" or not seed % 2:
         assert (changes.num_baked > 0) == (kind != "order")
@@ -93,14 +93,14 @@ def test_an_edit_is_baked_as_far_as_its_kernel_reaches() -> None:
     layout = GridLayout.over(Box(lower=np.zeros(3), upper=extent), voxel)
     before = splat_set(np.array([[0.1, 0.015, 0.015], [0.1 + 10 * length, 0.015, 0.015]]), np.full(2, 0.01))
     config = replace(CONFIG, voxel=voxel, distance="se", length_scale=length, truncation=1e-8)
-    changes = updated(before, before.select(np.array([False, True])), config, ("sdf", "se"), layout)
+    changes = update_and_compare(before, before.select(np.array([False, True])), config, ("sdf", "se"), layout)
     assert 0.5 < changes.num_baked / changes.num_blocks < 1.0
 
 
 def test_a_far_edit_of_all_bakes_everything_it_must_and_none_bakes_nothing() -> None:
     before = splat_set(*cloud(300))
-    updated(before, replace(before, centers=before.centers + np.float32(0.07)), CONFIG, ("sdf", "hard"))
-    same = updated(before, before, CONFIG, ("sdf", "hard"))
+    update_and_compare(before, replace(before, centers=before.centers + np.float32(0.07)), CONFIG, ("sdf", "hard"))
+    same = update_and_compare(before, before, CONFIG, ("sdf", "hard"))
     assert (same.num_baked, same.reason) == (0, "")
 
 

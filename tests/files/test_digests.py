@@ -12,7 +12,7 @@ from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.formats.splat.splats import read_ply, read_world_splats, write_ply
 from splatctrl_cli.jobs.replay.known_scene import from_grid
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 BOX = ("--box=-0.1,-0.1,-0.1,0.1,0.1,0.1", "--voxel", "0.02", "--no-report")
 
@@ -45,10 +45,10 @@ def test_every_file_is_known_but_run_json_and_the_checkpoint(scene: Path) -> Non
     assert not {"run.json", "checkpoint/state.npz"} & set(digests)
     assert json.loads((scene / "run.json").read_text())["parts"].keys() == digests.keys()
     (scene / "other.ply").write_bytes(b"x")
-    refused("other.ply: not among the parts", Parts.beside(scene / "other.ply").checked, scene / "other.ply")
+    expect_refusal("other.ply: not among the parts", Parts.beside(scene / "other.ply").checked, scene / "other.ply")
     for parts in (3, {"splats.ply": 3}):
         without_parts(scene, parts=parts)
-        refused("run.json: parts: expected digests", open_scene(scene).splats)
+        expect_refusal("run.json: parts: expected digests", open_scene(scene).splats)
 
 
 @pytest.mark.parametrize(
@@ -71,10 +71,10 @@ def test_a_file_that_was_changed_or_removed_is_refused_by_name(
     spoil(scene / "snapshots" / "000002.ply")  # only what is opened is looked at
     look(open_scene(scene))
     spoil(scene / name)
-    refused(f"{name}: was changed after it was written.*; make it again", lambda: look(open_scene(scene)))
+    expect_refusal(f"{name}: was changed after it was written.*; make it again", lambda: look(open_scene(scene)))
     if name != "splats.ply":  # without which it is no scene
         (scene / name).unlink()
-        refused(f"{name}: missing; it was listed", lambda: look(open_scene(scene)))
+        expect_refusal(f"{name}: missing; it was listed", lambda: look(open_scene(scene)))
 
 
 def test_a_table_emptied_or_reversed_is_refused_in_an_old_scene_too_where_it_can_be(scene: Path) -> None:
@@ -82,10 +82,10 @@ def test_a_table_emptied_or_reversed_is_refused_in_an_old_scene_too_where_it_can
     head, *rows = table.read_text().splitlines(keepends=True)
     for lines in ([head], [head, *rows[::-1]]):
         table.write_text("".join(lines))
-        refused("snapshots.csv: was changed", lambda: open_scene(scene).snapshot_at(SECOND))
+        expect_refusal("snapshots.csv: was changed", lambda: open_scene(scene).snapshot_at(SECOND))
     without_parts(scene)
     said = "stamp 1000000000 after 2000000000: expected stamps that ascend"
-    refused(said, lambda: open_scene(scene).snapshot_at(SECOND))
+    expect_refusal(said, lambda: open_scene(scene).snapshot_at(SECOND))
 
 
 def test_a_scene_of_an_older_version_is_read_and_says_so(scene: Path) -> None:
@@ -106,7 +106,7 @@ def test_an_altered_field_is_refused_and_one_alone_is_read(scene: Path, tmp_path
         from_grid(path)
     spoil(field / "field.npz")
     for path in (field, field / "field.npz"):
-        refused("field.npz: was changed", from_grid, path)
+        expect_refusal("field.npz: was changed", from_grid, path)
     assert main(["sdf-bake", str(scene), "--update", str(field), "-o", str(tmp_path / "new"), *BOX, "-q"]) == 4
 
 
@@ -123,7 +123,7 @@ def test_splats_in_other_units_or_another_frame_are_refused(
         file.write_bytes(path.read_bytes())
     as_written(folder)
     for look in (open_scene(folder).splats, lambda: open_scene(folder).splats_at(0)):
-        refused(f"comment '{key}: {value}'", look)
+        expect_refusal(f"comment '{key}: {value}'", look)
     assert read_ply(path)[1][key] == value  # who only copies or shows them may
 
 

@@ -13,7 +13,7 @@ import pytest
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.files import output
 from splatctrl_cli.files.output import check_can_be_written, output_path, partial_path, write_durably
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 FULL = OSError(28, "No space left on device", "a")
 
@@ -241,9 +241,9 @@ def test_whether_an_output_can_be_written_is_known_without_trying(
 ) -> None:
     (tmp_path / "file").write_text("x")
     check_can_be_written(tmp_path / "a" / "b" / "c")
-    refused("file is no folder", check_can_be_written, tmp_path / "file" / "a" / "b", error=UsageError)
+    expect_refusal("file is no folder", check_can_be_written, tmp_path / "file" / "a" / "b", error=UsageError)
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    refused("is read-only", check_can_be_written, tmp_path / "a" / "b" / "c", error=UsageError)
+    expect_refusal("is read-only", check_can_be_written, tmp_path / "a" / "b" / "c", error=UsageError)
     assert names(tmp_path) == ["file"]
 
 

@@ -22,7 +22,7 @@ from splatctrl_cli.recording.folder.idr import read_idr
 from splatctrl_cli.recording.source import describe
 from tests.formats.make_npz import write_zeros
 from tests.properties import few
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 GIB4 = (1 << 14, 1 << 9, 1 << 9)  # of bytes
 
@@ -58,7 +58,7 @@ def test_gigabytes_of_zeros_in_a_small_file_are_refused_unread(
 ) -> None:
     path = write_zeros(tmp_path / "x.npz", {name: (GIB4, dtype)}, header="{}", origin=np.zeros(3), voxel=0.1)
     assert path.stat().st_size < 40_000_000
-    refused(said, read, path)
+    expect_refusal(said, read, path)
 
 
 @pytest.mark.parametrize("name", ["sdf", "features"])
@@ -68,7 +68,7 @@ def test_a_zip_of_a_later_version_is_no_fault_of_the_program(tmp_path: Path, nam
     content = bytearray(path.read_bytes())
     content[content.index(b"PK\x01\x02") + 6] = 255
     path.write_bytes(content)
-    refused("x.npz: not a readable .npz: zip file version 25.5", describe, path)
+    expect_refusal("x.npz: not a readable .npz: zip file version 25.5", describe, path)
 
 
 def test_arrays_that_are_missing_too_large_or_not_whole_raise(tmp_path: Path) -> None:

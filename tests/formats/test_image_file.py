@@ -15,7 +15,7 @@ from splatctrl_cli.formats import ply
 from splatctrl_cli.formats.image_file import ImageHead, decode_file, image_head, read_pfm
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.formats.ply import point_blocks
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 RNG = np.random.default_rng(3)
 
@@ -106,7 +106,7 @@ def test_pfm_of_either_byte_order_starts_at_the_bottom_row(tmp_path: Path, is_li
 )
 def test_damaged_pfm_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "a.pfm").write_bytes(content)
-    refused(message, read_pfm, tmp_path / "a.pfm")
+    expect_refusal(message, read_pfm, tmp_path / "a.pfm")
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_damaged_pfm_is_refused(tmp_path: Path, content: bytes, message: str) ->
 def test_files_that_are_no_mesh_are_named(tmp_path: Path, name: str, text: str | None, said: str) -> None:
     if text is not None:
         (tmp_path / name).write_text(text)
-    refused(f"{name}: {said}", load_mesh, tmp_path / name)
+    expect_refusal(f"{name}: {said}", load_mesh, tmp_path / name)
 
 
 def points_in(text: str) -> list[list[float]]:
@@ -167,4 +167,4 @@ def test_a_table_comes_in_blocks_that_are_bounded(monkeypatch: pytest.MonkeyPatc
     ],
 )
 def test_what_is_no_table_of_points_is_refused_by_its_line(text: str, said: str) -> None:
-    refused(said, points_in, text)
+    expect_refusal(said, points_in, text)

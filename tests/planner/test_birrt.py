@@ -30,13 +30,13 @@ def densest(room: Clearance, waypoints: Float64) -> float:
 
 
 def densest_of(room: Clearance, start: Float64, end: Float64) -> Float64:
-    """Of each straight edge (N,)."""
+    """Least sampled clearance (N,) [m] of straight edges."""
     return np.array([densest(room, np.array(edge)) for edge in zip(start, end, strict=True)])
 
 
 @pytest.mark.parametrize(("margin", "seed"), [(0.0, 0), (0.0, 1), (0.0, 2), (0.03, 0)])
 def test_a_way_round_a_wall_is_found_and_is_free(margin: float, seed: int) -> None:
-    """With its margin everywhere, within the limits, and the same for the same seed."""
+    """The path keeps margin and joint limits, and the same seed gives the same path."""
     room, arm = clearance(one_wall()), PlanarArm()
     assert densest(room, np.array([START, GOAL])) < 0  # the straight edge is not
     found, again = (plan(clearance(one_wall(), margin=margin), START, GOAL, CONFIG, seed=seed) for _ in range(2))

@@ -123,7 +123,7 @@ def test_a_start_and_a_goal_in_collision_are_named(posture: Float64, outcome: st
 
 
 def test_a_path_leads_to_the_nearest_goal_though_a_farther_one_is_found_at_once() -> None:
-    """Where the nearest goal is not found another is."""
+    """Without iterations for the nearest goal, the path leads to another."""
     room, beyond = Clearance.of(ARM, one_wall(), margin=CONFIG.margin), np.array([2.3, 0.5])
     goals, hopeless = np.array([beyond, GOAL]), replace(PLANNER, max_iterations=0)
     assert np.linalg.norm(beyond - START) > np.linalg.norm(GOAL - START)

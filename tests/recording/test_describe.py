@@ -18,7 +18,7 @@ from splatctrl_cli.voxels import SWEPT
 from tests.conftest import ROOT
 from tests.plain import known, plain_grid, plain_splats
 from tests.recording.log.make_log import LogRecipe, make_log
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_all_that_a_log_lacks_is_said_and_is_no_error(tmp_path: Path, recipe: Lo
     assert any(said in item for item in missing) and len(missing) == num, missing
     if recipe.num_frames:
         assert all("; " in item for item in missing), "each with its remedy"
-        remedy = refused("", lambda: list(open_source(log).records()), has_remedy=True).partition("; ")[2]
+        remedy = expect_refusal("", lambda: list(open_source(log).records()), has_remedy=True).partition("; ")[2]
         assert remedy in "\n".join(missing), "the one that ingest gives"
 
 
@@ -105,13 +105,13 @@ def test_what_is_no_recording_is_described_by_its_head_and_what_is_not_there_ref
     (tmp_path / "arm.urdf").write_text('<robot name="arm"><link name="base"/></robot>')
     assert "unexpanded xacro" in describe(tmp_path / "arm.urdf").notes[0]
     (tmp_path / "arm.urdf").write_text('<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>')
-    refused("not readable XML", describe, tmp_path / "arm.urdf")
+    expect_refusal("not readable XML", describe, tmp_path / "arm.urdf")
     (tmp_path / "field.json").write_text('{"shape": 3}')
     (tmp_path / "run.json").write_text('{"command": "replay", "config": {"scene": {"noise": 1}}, "seed": 0}')
     run = describe(tmp_path)
     assert (run.kind, run.facts["run"]) == ("run folder", {"command": "replay", "seed": 0}), "settings are left out"
     for name in ("nothing.mcap", "none/"):
-        refused("no such file or folder", describe, tmp_path / name)
+        expect_refusal("no such file or folder", describe, tmp_path / name)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from tests.recording.log.make_log import LogRecipe, make_log
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 def frames(path: Path, **perturb: float) -> list[RgbdFrame]:
@@ -75,4 +75,4 @@ def test_no_error_is_the_recording_itself_and_an_error_is_among_what_was_read(lo
     "given", [{"noise": 0.1}, {"depth-noise": -0.1}, {"seed": 0.5}, {"pose-error": float("nan")}]
 )
 def test_an_error_that_is_none_is_refused(given: dict[str, float]) -> None:
-    refused("--perturb", Perturbation.of, given, error=UsageError)
+    expect_refusal("--perturb", Perturbation.of, given, error=UsageError)

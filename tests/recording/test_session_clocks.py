@@ -28,7 +28,7 @@ from tests.recording.log.make_log import (
     transform,
     write_raw,
 )
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 def only(*words: str) -> Callable[[Message], list[Message]]:
@@ -90,7 +90,9 @@ def test_sim_time_in_the_headers_pairs_and_poses_as_any_clock_or_gives_way_on_re
 def test_what_is_no_log_is_not_read_beside_one(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap")
     (tmp_path / "images.toml").write_text("")
-    refused(r"images.toml: expected a log beside others, got none", open_session, [log, tmp_path / "images.toml"])
+    expect_refusal(
+        r"images.toml: expected a log beside others, got none", open_session, [log, tmp_path / "images.toml"]
+    )
 
 
 def test_headers_without_stamps_ask_for_the_times_of_logging(tmp_path: Path) -> None:
@@ -102,7 +104,7 @@ def test_headers_without_stamps_ask_for_the_times_of_logging(tmp_path: Path) -> 
         return [message]
 
     log = make_part(tmp_path / "log.mcap", unset)
-    refused("expected stamps, got 0 in all 5 headers; give --stamps log", open_source, log)
+    expect_refusal("expected stamps, got 0 in all 5 headers; give --stamps log", open_source, log)
     assert len(frames_of(log, SourceOptions(stamps="log"))) == 5
 
 
@@ -115,7 +117,7 @@ def looped(message: Message) -> list[Message]:
 def test_a_clock_that_goes_back_is_refused_and_the_times_of_logging_taken_on_request(tmp_path: Path) -> None:
     log = make_part(tmp_path / "log.mcap", looped, LogRecipe(num_frames=20))
     back = "image_raw/compressed: the clock of its headers goes back by 1.350 s at 1700000001.500 s"
-    message = refused(back, open_source, log)
+    message = expect_refusal(back, open_source, log)
     assert "4 images in all; give --stamps log" in message  # the fifth is less than a second behind
     assert any("goes back by 1.350 s" in lack for lack in describe(log).missing)
     frames = frames_of(log, SourceOptions(stamps="log"))
@@ -155,7 +157,7 @@ def test_images_that_are_video_do_not_decode_and_are_named(tmp_path: Path) -> No
         return [message]
 
     said = r"no image of /cam0/.*/compressed can be decoded \(compressed image \(h264\)"
-    refused(said, open_source, make_part(tmp_path / "log.mcap", as_video))
+    expect_refusal(said, open_source, make_part(tmp_path / "log.mcap", as_video))
 
 
 def test_images_that_did_not_come_are_counted_where_there_is_a_rate(tmp_path: Path) -> None:

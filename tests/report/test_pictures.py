@@ -112,7 +112,7 @@ DRAWN: dict[str, Callable[[Path], None]] = {
 
 @cache
 def drawn_bytes(name: str) -> bytes:
-    """Of a picture that several tests look at."""
+    """Bytes of a picture that several tests look at."""
     with TemporaryDirectory() as folder:
         DRAWN[name](Path(folder) / "a.png")
         return (Path(folder) / "a.png").read_bytes()

@@ -131,7 +131,7 @@ def test_a_splat_of_the_robot_that_depth_shows_to_be_the_floor_is_small_at_once(
 def test_splats_that_the_descent_moves_near_the_robot_go_back_onto_the_surface(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Those lifted into the air, and one moved behind the robot."""
+    """The descent lifts some into the air and moves one behind the robot."""
     target, robot, view = robot_over_the_floor()
     buffer, moved = target.buffer, []
 

@@ -27,8 +27,8 @@ def block_measured_at(depth: float, *, x: float = 0.0, camera: str = "cam0") -> 
     return seen
 
 
-def found_by(*frames: RgbdFrame) -> list[Contradicted]:
-    """What the others contradict of each."""
+def contradict_all(*frames: RgbdFrame) -> list[Contradicted]:
+    """Return what the other frames contradict of each frame."""
     return [*contradicted([(seen, object_mask(seen)) for seen in frames], is_drawn=False)]
 
 
@@ -39,9 +39,9 @@ OTHER = frame(x=BESIDE, camera="cam1")
 def test_depth_far_behind_what_another_camera_measures_is_contradicted(behind: float, is_wrong: bool) -> None:
     """The floor about it shows through a pixel of the block that lies under the floor."""
     shiny = block_measured_at(HEIGHT + behind)
-    found, none = found_by(shiny, OTHER)
+    found, none = contradict_all(shiny, OTHER)
     is_block, pixels = shiny.depth > HEIGHT, found.pixels(shiny.depth.shape)
-    assert not none.until.any() and not found_by(shiny)[0].until.any()  # nor does a lone camera
+    assert not none.until.any() and not contradict_all(shiny)[0].until.any()  # nor does a lone camera
     assert pixels.any() == is_wrong and not (pixels & ~is_block).any()
     assert not is_wrong or pixels.sum() > 0.7 * is_block.sum()
     assert ((without_contradicted(object_mask(shiny), found).kinds == PixelKind.CONTRADICTED) == pixels).all()
@@ -55,7 +55,7 @@ def test_depth_far_behind_what_another_camera_measures_is_contradicted(behind: f
 def test_a_ray_proves_nothing_free_where_another_camera_sees_through_what_it_measures() -> None:
     """A block is measured in the air behind which the other camera sees the floor."""
     shiny = block_measured_at(0.6)
-    found, beside = found_by(shiny, OTHER)
+    found, beside = contradict_all(shiny, OTHER)
     is_unproven = (found.unproven(shiny).depth == 0) & (shiny.depth > 0)
     assert is_unproven.sum() > 0.5 * (shiny.depth < HEIGHT).sum() and not found.until.any()
     assert not found.pixels(shiny.depth.shape).any()  # what it measures stays a surface of the map
@@ -77,13 +77,13 @@ def test_fewer_than_sixteen_pixels_seen_through_within_their_outline_are_noise(
     """And fewer than four that are contradicted."""
     floating = frame()
     floating.depth[30 : 30 + side, 40 : 40 + side] = depth
-    assert getattr(found_by(floating, OTHER)[0], of).any() != is_noise
+    assert getattr(contradict_all(floating, OTHER)[0], of).any() != is_noise
 
 
 def test_a_camera_without_depth_where_another_measures_a_surface_looked_in_vain() -> None:
     """It makes no surface of the other's doubtful."""
     dark = block_measured_at(0.0)
-    found, beside = found_by(dark, OTHER)
+    found, beside = contradict_all(dark, OTHER)
     points = found.points(dark, CONFIG, is_blank=True)
     assert len(points) and not found.pixels(dark.depth.shape).any() and not beside.through.any()
     assert np.linalg.norm(points - [0.0, 0.0, BLOCK / 2], axis=1).min() < CONFIG.voxel
@@ -103,8 +103,8 @@ def grazing(angle: float, away: float) -> RgbdFrame:
 
 @pytest.mark.parametrize("angle", [np.pi / 2, 0.6, 0.4])
 def test_a_floor_seen_at_any_angle_says_where_a_dark_block_returns_no_depth(angle: float) -> None:
-    """At 0.4 rad a pixel of the floor lies 4 cm behind its neighbour."""
-    found, _ = found_by(block_measured_at(0.0), grazing(angle, 1.2))
+    """The steepest step between two pixels of the floor is 4 cm at 0.4 rad."""
+    found, _ = contradict_all(block_measured_at(0.0), grazing(angle, 1.2))
     is_blank = found.is_blank & (found.until > 0)
     assert is_blank.sum() > 0.5 * found.is_blank.sum()
 
@@ -114,7 +114,7 @@ def test_depth_beside_a_step_is_no_surface() -> None:
     ribbed, dark = frame(x=BESIDE, camera="cam1"), block_measured_at(0.0)
     ribbed.depth[:, 0::4] += 0.05
     ribbed.depth[:, 1::4] += 0.05
-    found, _ = found_by(dark, ribbed)
+    found, _ = contradict_all(dark, ribbed)
     assert found.is_blank.any() and not found.until.any()
 
 
@@ -123,7 +123,7 @@ def test_where_no_camera_has_depth_nothing_is_missing() -> None:
     one, other = frame(), frame(x=BESIDE, camera="cam1")
     shift = round(BESIDE * INTRINSICS.fx / HEIGHT)
     one.depth[:, 30:60] = other.depth[:, 30 - shift : 60 - shift] = 0.0
-    assert not any(found.until.any() for found in found_by(one, other))
+    assert not any(found.until.any() for found in contradict_all(one, other))
 
 
 @pytest.mark.parametrize("is_drawn", [True, False])

@@ -163,7 +163,7 @@ def at_the_block(edges: LostEdges) -> np.ndarray:
 
 
 def test_the_lost_outline_of_a_block_is_as_wide_as_a_pixel_and_at_its_depth() -> None:
-    """Where nothing is lost there is no edge, nor where there is nothing beside it, at the image's border, too."""
+    """Images without lost pixels, and images without depth, have no lost edges."""
     edges, pixel, nothing = edges_of(with_lost_edges()), DEPTH / INTRINSICS.fx, frame()
     mine = at_the_block(edges)
     assert mine.sum() > 40

@@ -29,7 +29,7 @@ def views(depth: float = 0.1, *, is_flat: bool = False) -> list[RgbdFrame]:
 
 
 def test_what_the_camera_carries_is_found_and_the_world_is_not() -> None:
-    """What has a depth of the world is not mounted."""
+    """Surface at the depth of the world is not mounted."""
     mask, none = (mounted_pixels(views(depth), MIN_RANGE) for depth in (0.1, 0.8))
     assert mask is not None and mask[2:18, 2:20].all()
     assert not mask[30:].any() and not mask[:, 40:].any()
@@ -51,7 +51,7 @@ def test_a_camera_that_stands_still_carries_nothing() -> None:
 
 
 def test_the_map_does_not_explain_what_a_camera_carries() -> None:
-    """What has a depth beyond the least range is an object, for all one knows."""
+    """Surface beyond the least range may be an object."""
     far, near = (
         SceneFitter(SceneConfig(max_splats=600, first_iterations=30), OccupancyConfig(), WORKSPACE, threads=1)
         for _ in range(2)

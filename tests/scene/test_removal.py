@@ -73,7 +73,7 @@ def test_the_literal_rule_removes_the_never_seen_too(
 
 @pytest.mark.parametrize("counts_time", [True, False])
 def test_uncertainty_is_tolerated_for_a_while(counts_time: bool) -> None:
-    """What is no time step does not try the patience."""
+    """Only time steps count."""
     grid, slots = OccupancyMap(WORKSPACE, OccupancyConfig(uncertain_patience=2), 1), buffer()
     grid.integrate(frame())
     grid.log_odds[grid.num_updates > 0] = 0.0

@@ -82,7 +82,7 @@ def slanted(noise: float, seed: int = 0) -> Float32:
 
 @pytest.mark.parametrize("noise", [0.0005, 0.0015, 0.006])
 def test_the_noise_of_depth_is_found_on_slanted_surfaces_and_beside_edges(noise: float) -> None:
-    """Of several cameras the noisiest counts."""
+    """The noisiest of several cameras decides."""
     assert depth_noise([slanted(noise)]) == pytest.approx(noise, rel=0.15)
     assert depth_noise([slanted(noise, seed) for seed in range(3)]) == pytest.approx(noise, rel=0.15)
     frames = [replace(frame(camera=f"{each}"), depth=slanted(each)) for each in (0.0003, noise)]

@@ -46,7 +46,7 @@ def mappable_in(seen: RgbdFrame, *least: float) -> Bool:
 
 
 def seeds_of(edge: float, beside: Float32 = NOTHING, config: SceneConfig = CONFIG) -> Seeds:
-    """Of the floor in cubes of one size."""
+    """Seeds of the floor, one in each cube of a given edge."""
     source = candidates(frame(), np.ones((60, 80), bool))
     return seeds_at([source], beside, SeedDensity(edge=edge, tolerance=1e9), config)
 

@@ -45,7 +45,7 @@ def frame(depth: Float64, k: Intrinsics = K) -> RgbdFrame:
 
 
 def masked(depth: Float64, posture: RobotPosture | None = None, k: Intrinsics = K) -> SelfMask:
-    """Of one frame alone."""
+    """Self-mask of a lone frame."""
     return self_mask(frame(depth, k), posture or robot(), CONFIG)
 
 
@@ -311,7 +311,7 @@ def test_spheres_that_stand_for_a_link_enclose_it(extra: float) -> None:
 
 
 def test_a_carried_box_is_the_robots() -> None:
-    """What it holds need not fill the box."""
+    """Its content need not fill the box."""
     depth, posture = np.minimum(ball_depth(), FLOOR), robot()
     depth[100:110, 70:90] = 1.0
     assert posture.surface is not None and (kinds(depth)[100:110, 70:90] == PixelKind.OBJECT).all()

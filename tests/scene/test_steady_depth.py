@@ -52,7 +52,7 @@ def test_what_moves_along_the_ray_is_behind_by_less_than_a_few_sigma(per_frame: 
 
 
 def test_a_thing_that_comes_is_there_in_its_first_frame() -> None:
-    """What a camera measures first is not steady, and what stays is."""
+    """Depth is steady from the second image on."""
     still, thing = frame_of(1.0), frame_of(1.0)
     thing.depth[40:60, 60:90] = 0.95
     first, is_steady = steady(still)

@@ -35,7 +35,7 @@ def few_turns(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def meshes(folder: Path, shape: str, T: Float64) -> Meshes:
-    """Of one link with that shape, at a pose."""
+    """Meshes of one link with a shape, at a pose."""
     (solid,) = read_solids(read_urdf(written(folder, arm_of(shape, '<sphere radius="0.1"/>'))))["base"]
     owners = np.zeros(len(solid.surface.faces), np.int16)
     return Meshes(

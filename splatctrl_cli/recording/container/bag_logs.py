@@ -273,8 +273,8 @@ _PAGE_SIZE, _FILE_FORMAT = slice(16, 18), slice(18, 20)  # of its header (sqlite
 class Db3Log:
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal, so both are copied first. It takes what is missing of a page for zeros, so
-    a file that was cut is copied without its last page. Raises InputError for other tables, or an unreadable file.
+    SQLite writes while it reads a journal, so both are copied. It reads missing bytes of the last page as zeros,
+    so a file cut within a page is copied up to that page. Raises InputError for other tables, or an unreadable file.
     """
 
     container = "ROS 2 bag (sqlite3)"
@@ -293,7 +293,7 @@ class Db3Log:
             if has_journal or end < size:
                 self._copy(end)
             if has_journal:
-                self._merge()
+                self._merge(end)
             with closing(self._opened()) as database:
                 self._topics = _topics(database)
         except (sqlite3.Error, ValueError) as error:
@@ -318,13 +318,13 @@ class Db3Log:
         self._database = copies[0]
         os.truncate(self._database, size)
 
-    def _merge(self) -> None:
-        """Merge the journal into the copy."""
+    def _merge(self, size: int) -> None:
+        """Merge the journal into the copy; one that cannot be merged is left out of a new copy."""
         try:
             with closing(sqlite3.connect(self._database)) as database:
                 self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]
         except sqlite3.Error:
-            self._database = self.path  # what is whole of it is read without its journal
+            self._copy(size)
 
     def topics(self) -> tuple[Topic, ...]:
         return tuple(self._topics.values())

@@ -1,4 +1,4 @@
-"""What every file of a grid keeps: written, described, read back, refused where cut or not ours; bakes in slabs."""
+"""The contract of grid files: write, describe, read back, refuse cut and foreign files, bake in slabs."""
 
 import json
 import zipfile
@@ -18,7 +18,7 @@ from splatctrl_cli.formats.grid.vti import read_vti
 from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import DistanceGrid
 from tests.formats.grid.make_grid import HEADER, SHAPE, ball_grid, random_grid, with_unknown
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 PLACE = {"shape": [21, 22, 23], "voxel": 0.04}
 MADE = {key: HEADER[key] for key in ("distance", "splats_used", "labels", "frame")}
@@ -87,7 +87,7 @@ def test_every_file_is_described_and_refused_in_one_line_where_it_is_cut(tmp_pat
         for length, read in ((60, describe), (100, describe), (100, kind.read), (len(content) // 2, kind.read)):
             file.write_bytes(content[:length])
             if read is not None:
-                refused("", read, file, has_remedy=True)
+                expect_refusal("", read, file, has_remedy=True)
 
 
 @pytest.mark.parametrize("channels", [(), ("sdf",), ("label", "sdf", "gradient")])
@@ -117,7 +117,7 @@ def test_a_grid_is_read_back_from_the_files_that_hold_it_whole(
 def test_what_cannot_be_written_is_told_before_the_bake(
     names: list[str], channels: list[str], unknown: str, message: str
 ) -> None:
-    refused(message, check_formats, names, channels, unknown=unknown, error=UsageError)
+    expect_refusal(message, check_formats, names, channels, unknown=unknown, error=UsageError)
     check_formats([name for name in FORMATS if name != "vdb"], ["sdf", "bound"])
 
 
@@ -126,7 +126,7 @@ def test_a_curobo_file_whose_list_of_contents_is_damaged_is_refused(tmp_path: Pa
     content = bytearray(path.read_bytes())
     content[content.rindex(b"PK\x01\x02") + 42] ^= 0xFF  # the place of a member
     path.write_bytes(content)
-    refused(r"field.curobo.npz: not a readable .npz: .*; the file is damaged", describe, path)
+    expect_refusal(r"field.curobo.npz: not a readable .npz: .*; the file is damaged", describe, path)
 
 
 def test_the_head_of_an_npz_is_read_without_the_values_and_numpy_itself_reads_it(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_the_head_of_an_npz_is_read_without_the_values_and_numpy_itself_reads_it
     head = read_npz_head(path)
     assert (head.shape, head.channels, head.header) == ((9, 20, 40), tuple(grid.channels), grid.header)
     assert (head.voxel, head.origin.tolist()) == (grid.voxel, grid.origin.tolist())
-    refused("CRC", read_npz, path)
+    expect_refusal("CRC", read_npz, path)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_what_no_policy_leaves_is_refused(tmp_path: Path, policy: str, name: str
     blank.header["unknown"] = policy
     blank.channels[name].flat[7] = value
     write_npz(tmp_path / "field.npz", blank)
-    refused(f"{name}: expected finite values, got {value}; bake it again", read_npz, tmp_path / "field.npz")
+    expect_refusal(f"{name}: expected finite values, got {value}; bake it again", read_npz, tmp_path / "field.npz")
 
 
 def test_no_changed_byte_ends_in_another_error_or_another_grid(tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def rewrite(path: Path, **changes: object) -> None:
 def test_an_npz_that_is_not_ours_is_named(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     rewrite(tmp_path / "field.npz", **changes)
     for read in (read_npz, read_npz_head):
-        refused(message, read, tmp_path / "field.npz", has_remedy=True)
+        expect_refusal(message, read, tmp_path / "field.npz", has_remedy=True)
 
 
 def test_a_file_that_claims_more_than_it_holds_is_not_made_room_for(tmp_path: Path) -> None:
@@ -213,15 +213,15 @@ def test_a_file_that_claims_more_than_it_holds_is_not_made_room_for(tmp_path: Pa
     with zipfile.ZipFile(path, "a") as archive:
         claim = b"{'descr': '<f4', 'fortran_order': False, 'shape': (90000, 90000, 90000), }\n"
         archive.writestr("sdf.npy", b"\x93NUMPY\x01\x00" + len(claim).to_bytes(2, "little") + claim)
-    refused(r"sdf.npy: expected 2916\d+ bytes, got", read_npz, path)
+    expect_refusal(r"sdf.npy: expected 2916\d+ bytes, got", read_npz, path)
 
 
 def test_a_missing_file_a_folder_and_a_zip_of_something_else_are_named(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "other.npz", "w") as archive:
         archive.writestr("readme.txt", "hello")
-    refused("no such file", read_npz, tmp_path / "none.npz")
-    refused("got a folder", read_npz, tmp_path)
-    refused(f"{tmp_path / 'other.npz'}: not a whole distance grid", read_npz, tmp_path / "other.npz")
+    expect_refusal("no such file", read_npz, tmp_path / "none.npz")
+    expect_refusal("got a folder", read_npz, tmp_path)
+    expect_refusal(f"{tmp_path / 'other.npz'}: not a whole distance grid", read_npz, tmp_path / "other.npz")
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_a_missing_file_a_folder_and_a_zip_of_something_else_are_named(tmp_path:
 )
 def test_what_could_not_be_read_is_not_written(tmp_path: Path, channels: dict[str, object], message: str) -> None:
     grid = DistanceGrid(origin=np.zeros(3), voxel=0.1, channels=channels, header={})  # type: ignore[arg-type]
-    refused(message, write_npz, tmp_path / "field.npz", grid)
+    expect_refusal(message, write_npz, tmp_path / "field.npz", grid)
     assert not (tmp_path / "field.npz").exists()
 
 
@@ -259,10 +259,10 @@ def test_a_vti_that_is_not_ours_or_not_whole_is_named(tmp_path: Path, old: bytes
     content = path.read_bytes()
     assert old in content
     path.write_bytes(content.replace(old, new))
-    refused(message, read_vti, path, has_remedy=True)
+    expect_refusal(message, read_vti, path, has_remedy=True)
     path.write_bytes(content[:-300])
-    refused("sdf: expected 880 bytes, got", read_vti, path, has_remedy=True)
-    refused("no such file", read_vti, tmp_path / "none.vti")
+    expect_refusal("sdf: expected 880 bytes, got", read_vti, path, has_remedy=True)
+    expect_refusal("no such file", read_vti, tmp_path / "none.vti")
 
 
 CHANNELS = ("sdf", "gradient", "observed")
@@ -286,10 +286,10 @@ def test_an_interrupted_bake_goes_on_where_the_last_whole_slab_ended(tmp_path: P
         stream.write(b"\x01" * 40)
     slabs = resume_slabs(folder, PLAN)
     assert (slabs.num_layers, slabs.is_whole()) == (2, False)
-    refused("expected 5 layers, got 2; continue the bake", slabs.grid, {})
+    expect_refusal("expected 5 layers, got 2; continue the bake", slabs.grid, {})
     other = replace(PLAN, settings={"noise": 1e-3, "digest": "a"}, voxel=0.04)
     said = "voxel was 0.02, is 0.04, noise was 1e-06, is 0.001; bake without --resume"
-    refused(said, resume_slabs, folder, other, error=UsageError)
+    expect_refusal(said, resume_slabs, folder, other, error=UsageError)
     fill(slabs, grid, until=SHAPE[0], step=3)
     read = slabs.grid({"a": 1})
     assert (read.header, read.voxel, read.origin.tolist()) == ({"a": 1}, 0.02, [-0.1, 0.2, 0.3])
@@ -303,11 +303,11 @@ def test_an_interrupted_bake_goes_on_where_the_last_whole_slab_ended(tmp_path: P
 def test_damaged_remains_are_named(tmp_path: Path) -> None:
     start_slabs(tmp_path, PLAN)
     (tmp_path / "sdf.npy").unlink()
-    refused("sdf.npy: expected (5, 4, 11), got no such array", resume_slabs, tmp_path, PLAN)
+    expect_refusal("sdf.npy: expected (5, 4, 11), got no such array", resume_slabs, tmp_path, PLAN)
     np.save(tmp_path / "sdf.npy", np.zeros(3))
-    refused("sdf.npy: expected (5, 4, 11), got no such array", resume_slabs, tmp_path, PLAN)
+    expect_refusal("sdf.npy: expected (5, 4, 11), got no such array", resume_slabs, tmp_path, PLAN)
     (tmp_path / "progress.json").write_text(json.dumps({"plan": 3}))
-    refused("progress.json: not readable", resume_slabs, tmp_path, PLAN)
+    expect_refusal("progress.json: not readable", resume_slabs, tmp_path, PLAN)
 
 
 @pytest.mark.parametrize(
@@ -322,6 +322,6 @@ def test_a_slab_that_does_not_fit_is_refused(tmp_path: Path, change: dict[str, A
     grid, slabs = random_grid(*CHANNELS), start_slabs(tmp_path / "slabs", PLAN)
     slab = {name: grid.channels[name][:2] for name in CHANNELS}
     changed = {name: values for name, values in (slab | change).items() if values is not None}
-    refused(message, slabs.write, changed)
+    expect_refusal(message, slabs.write, changed)
     fill(slabs, grid, until=5)
-    refused("slab: sdf at layer 5 of 5", slabs.write, slab)
+    expect_refusal("slab: sdf at layer 5 of 5", slabs.write, slab)

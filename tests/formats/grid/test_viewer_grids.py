@@ -36,7 +36,7 @@ from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import Bool, DistanceGrid, Float64
 from tests.conftest import ROOT
 from tests.formats.grid.make_grid import HEADER, SHAPE, ball_grid, centers, random_grid, with_unknown
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 f32 = np.float32
 
@@ -127,17 +127,17 @@ def test_openvdb_reads_every_value_at_its_place(tmp_path: Path) -> None:
     assert ["sdf", "Tree_float_5_4_3", "level set", 20 * 9 * 13 - 12] in list(summary.grids[0].rows)
     for length in (9, 30, 70, 200):
         (tmp_path / "cut.vdb").write_bytes(content[:length])
-        refused("not a readable OpenVDB file", read_vdb_head, tmp_path / "cut.vdb")
+        expect_refusal("not a readable OpenVDB file", read_vdb_head, tmp_path / "cut.vdb")
 
 
 def test_without_openvdb_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "openvdb", None)
     monkeypatch.setitem(sys.modules, "pyopenvdb", None)
     remedy = "cannot be imported.*; install OpenVDB's Python module: conda-forge"
-    refused(remedy, openvdb, error=UsageError)
-    refused(remedy, write_vdb, tmp_path / "field.vdb", random_grid(), error=UsageError)
+    expect_refusal(remedy, openvdb, error=UsageError)
+    expect_refusal(remedy, write_vdb, tmp_path / "field.vdb", random_grid(), error=UsageError)
     write_npz(tmp_path / "field.npz", random_grid())
-    refused("expected an OpenVDB file", read_vdb_head, tmp_path / "field.npz")
+    expect_refusal("expected an OpenVDB file", read_vdb_head, tmp_path / "field.npz")
 
 
 @pytest.mark.parametrize("channels", [(), ("sdf",), ("sdf", "bound", "observed")])
@@ -214,12 +214,12 @@ def test_0_7_reads_the_value_of_the_cell_that_a_centre_lies_in(
 def test_what_planners_cannot_take_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "field.x"
     unknown = "got NaN; bake with field.unknown=obstacle or free"
-    refused(unknown, write_curobo, path, with_unknown(random_grid()))
+    expect_refusal(unknown, write_curobo, path, with_unknown(random_grid()))
     channels = "expected the channel bound or hard, got sdf; bake it with one of them"
-    refused(channels, write_moveit, path, random_grid("sdf"))
+    expect_refusal(channels, write_moveit, path, random_grid("sdf"))
     assert not path.exists()
     path.write_bytes(b"resolution: 0.1\nsize_x: inf\n")
-    refused("expected 'size_x: NUMBER', got b'size_x: inf", read_moveit_head, path)
+    expect_refusal("expected 'size_x: NUMBER', got b'size_x: inf", read_moveit_head, path)
 
 
 def read_from_stream(path: Path) -> tuple[Float64, float, Bool]:
@@ -378,4 +378,4 @@ def test_every_suffix_reads_back_as_the_same_triangles(tmp_path: Path) -> None:
 )
 def test_a_grid_without_a_surface_is_told_with_its_range(sdf: NDArray[np.float32], said: str) -> None:
     grid = DistanceGrid(origin=np.zeros(3), voxel=0.1, channels={"sdf": sdf}, header={})
-    refused(said, iso_surface, grid, error=NotEvaluableError)
+    expect_refusal(said, iso_surface, grid, error=NotEvaluableError)

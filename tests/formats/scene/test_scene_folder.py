@@ -27,7 +27,7 @@ from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.voxels import SWEPT, EvidenceClass, LostEdges, OccupancyGrid, Unseen
 from tests.plain import known, plain_grid, plain_splats
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 Row = make_dataclass("Row", [("stamp_ns", int)])
 FREE_BELOW = "run.json: config.occupancy.free_below: expected what reconstruct writes"
@@ -72,7 +72,7 @@ def finish(writer: SceneWriter, progress: dict[str, Any]) -> None:
 def test_a_scene_is_known_by_its_newest_snapshot(tmp_path: Path) -> None:
     scene = open_scene(written(tmp_path / "scene"))
     assert [len(scene.splats_at(stamp)) for stamp in (100, 199, 200, 10_000)] == [1, 1, 2, 3]
-    refused("no snapshot", scene.splats_at, 99, error=NotEvaluableError)
+    expect_refusal("no snapshot", scene.splats_at, 99, error=NotEvaluableError)
     assert (scene.cameras, scene.stamp_ns) == (("cam0",), 300)
 
 
@@ -120,7 +120,7 @@ def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path)
 def test_a_partial_scene_that_lacks_a_file_does_not_go_on(tmp_path: Path, name: str) -> None:
     folder = written(tmp_path / "scene.partial")
     (folder / name).unlink()
-    refused("start over", lambda: SceneWriter(folder, {}, read_checkpoint(folder)))
+    expect_refusal("start over", lambda: SceneWriter(folder, {}, read_checkpoint(folder)))
 
 
 def test_a_snapshot_that_was_changed_since_the_checkpoint_is_not_gone_on_with(tmp_path: Path) -> None:
@@ -128,7 +128,9 @@ def test_a_snapshot_that_was_changed_since_the_checkpoint_is_not_gone_on_with(tm
     checkpoint = read_checkpoint(folder)
     file = folder / "snapshots" / "000001.npz"
     file.write_bytes(file.read_bytes()[:-1] + b"x")
-    refused(r"000001.npz: was changed after it was written .*; start over", SceneWriter, folder, {}, checkpoint)
+    expect_refusal(
+        r"000001.npz: was changed after it was written .*; start over", SceneWriter, folder, {}, checkpoint
+    )
     SceneWriter(folder, {}, replace(checkpoint, parts=None))  # of an older version
 
 
@@ -182,7 +184,7 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
 
 @pytest.mark.parametrize("num_steps", [2, 245])
 def test_the_largest_number_of_an_older_file_is_looked_at_in_vain(tmp_path: Path, num_steps: int) -> None:
-    """In one byte, where 240 and more were time steps as well. Still older files are without evidence."""
+    """Its byte counted time steps beyond 240, too. Files that are older still have no evidence."""
     path, header = tmp_path / "a.npz", {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 3]}
     last_seen, steps = np.array([[[num_steps, 0, 0xFF]]], np.uint8), {"step_stamps_ns": list(range(num_steps))}
     np.savez(path, header=np.array(json.dumps(header | steps)), last_seen=last_seen)
@@ -211,9 +213,9 @@ def test_evidence_that_is_none_is_named(tmp_path: Path, changed: dict[str, NDArr
     path = tmp_path / "a.npz"
     write_occupancy(path, known(grid(), unrepresented=[[0.0, 0.25, 0.4]]))
     savez(path, {**read_arrays(path, most=1 << 20), **changed})
-    refused(said, read_known_occupancy, path)
+    expect_refusal(said, read_known_occupancy, path)
     if "unrepresented" not in changed:
-        refused(said, read_seen, path)
+        expect_refusal(said, read_seen, path)
 
 
 @pytest.mark.parametrize(
@@ -235,32 +237,32 @@ def test_a_run_json_that_reconstruct_did_not_write_is_named(tmp_path: Path, run:
     folder = written(tmp_path / "scene")
     (folder / "run.json").write_text(run)
     if said == FREE_BELOW:
-        refused(said, describe, folder)
+        expect_refusal(said, describe, folder)
     else:
-        refused(said, lambda: [open_scene(folder).cameras, open_scene(folder).background])
+        expect_refusal(said, lambda: [open_scene(folder).cameras, open_scene(folder).background])
 
 
 @pytest.mark.parametrize("row", ["300", "300,snapshots/000000.ply", "x,snapshots/000000.ply,3", "300,../evil.ply,3"])
 def test_a_row_of_snapshots_that_is_none_is_named(tmp_path: Path, row: str) -> None:
     file = written(tmp_path / "scene") / "snapshots.csv"
     file.write_text(f"{file.read_text()}{row}\n")
-    refused(r"snapshots.csv: cannot be read", lambda: open_scene(tmp_path / "scene").splats_at(300))
+    expect_refusal(r"snapshots.csv: cannot be read", lambda: open_scene(tmp_path / "scene").splats_at(300))
 
 
 def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
-    refused("no such scene", open_scene, tmp_path / "nowhere")
-    refused("expected a scene folder", open_scene, tmp_path)
+    expect_refusal("no such scene", open_scene, tmp_path / "nowhere")
+    expect_refusal("expected a scene folder", open_scene, tmp_path)
     partial = written(tmp_path / "scene.partial")
-    refused("an interrupted run; continue it: .*--resume", open_scene, partial)
+    expect_refusal("an interrupted run; continue it: .*--resume", open_scene, partial)
 
 
 def test_a_foreign_or_cut_occupancy_grid_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez(path, x=np.zeros(3))
-    refused("not an occupancy grid", read_occupancy, path)
+    expect_refusal("not an occupancy grid", read_occupancy, path)
     np.savez(path, header=np.array({"a": 1}, dtype=object))
-    refused("not an occupancy grid", read_occupancy, path)
+    expect_refusal("not an occupancy grid", read_occupancy, path)
     write_occupancy(path, known(grid()))
     path.write_bytes(path.read_bytes()[:-40])
-    refused("not an occupancy grid", read_occupancy, path)
-    refused("not the voxel states", read_states, path)
+    expect_refusal("not an occupancy grid", read_occupancy, path)
+    expect_refusal("not the voxel states", read_states, path)

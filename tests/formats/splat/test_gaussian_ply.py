@@ -15,7 +15,7 @@ from splatctrl_cli.formats.splat.gaussian_ply import NAMES, read_gaussian_ply, w
 from splatctrl_cli.formats.splat.splats import DTYPE, read_ply, write_ply
 from splatctrl_cli.records import GaussianSet, Label, SplatSet
 from tests.plain import plain_splats
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 def gaussian_set(num: int = 40, *, degree: int = 3, seed: int = 0) -> GaussianSet:
@@ -130,7 +130,7 @@ def test_an_empty_set_is_a_file_and_comments_come_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("comments", [{"a": "two\nlines"}, {"a:b": "c"}, {"": "c"}])
 def test_a_comment_that_would_break_the_header_is_refused(tmp_path: Path, comments: dict[str, str]) -> None:
-    refused("comment", lambda: write_ply(tmp_path / "a.ply", splat_set(1), comments), error=UsageError)
+    expect_refusal("comment", lambda: write_ply(tmp_path / "a.ply", splat_set(1), comments), error=UsageError)
     assert not (tmp_path / "a.ply").exists()
 
 
@@ -201,7 +201,7 @@ def test_a_set_that_the_format_cannot_hold_is_refused(
     tmp_path: Path, made: GaussianSet | SplatSet, message: str
 ) -> None:
     write: Any = write_ply if isinstance(made, SplatSet) else write_gaussian_ply
-    refused(message, write, tmp_path / "a.ply", made, {})
+    expect_refusal(message, write, tmp_path / "a.ply", made, {})
     assert not (tmp_path / "a.ply").exists()
 
 
@@ -231,10 +231,10 @@ def test_a_file_that_is_damaged_or_no_ply_is_refused(
     path = tmp_path / "a.ply"
     write_ply(path, splat_set(20), {})
     path.write_bytes(change(path.read_bytes()))
-    refused(rf"a\.ply: .*{message}", read_ply, path)
+    expect_refusal(rf"a\.ply: .*{message}", read_ply, path)
     path.unlink()
-    refused("a.ply: cannot be read: No such file", read_ply, path)
-    refused("a.ply: cannot be read: No such file", is_mesh, path)
+    expect_refusal("a.ply: cannot be read: No such file", read_ply, path)
+    expect_refusal("a.ply: cannot be read: No such file", is_mesh, path)
 
 
 def test_a_compressed_ply_is_refused_by_name(tmp_path: Path) -> None:
@@ -242,7 +242,7 @@ def test_a_compressed_ply_is_refused_by_name(tmp_path: Path) -> None:
     header += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
     (tmp_path / "a.ply").write_bytes("\n".join([*header, "end_header", ""]).encode() + bytes(20))
     for read in (read_ply, read_gaussian_ply):
-        refused("compressed PLY of SuperSplat .*; export it there as an uncompr", read, tmp_path / "a.ply")
+        expect_refusal("compressed PLY of SuperSplat .*; export it there as an uncompr", read, tmp_path / "a.ply")
 
 
 GOOD: list[object] = [0, 0, 0, 0, 0, 0, 0, -4, -4, -4]
@@ -284,13 +284,13 @@ def with_value(row: list[object], index: int, value: object) -> list[object]:
 def test_values_that_are_none_of_these_are_refused(
     tmp_path: Path, read: Callable[[Path], object], names: list[str], rows: list[list[object]], message: str
 ) -> None:
-    refused(message, read, ascii_ply(tmp_path / "a.ply", names, rows))
+    expect_refusal(message, read, ascii_ply(tmp_path / "a.ply", names, rows))
 
 
 def test_ascii_with_a_line_missing_is_refused(tmp_path: Path) -> None:
     path = ascii_ply(tmp_path / "a.ply", MINIMAL, [GOOD] * 3)
     path.write_text(path.read_text().replace("element vertex 3", "element vertex 4"))
-    refused("expected 4 lines of data, got 3", read_ply, path)
+    expect_refusal("expected 4 lines of data, got 3", read_ply, path)
 
 
 def test_open3d_finds_the_same_values(tmp_path: Path) -> None:

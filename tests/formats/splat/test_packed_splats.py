@@ -19,7 +19,7 @@ from splatctrl_cli.formats.splat.splat_format import differences
 from splatctrl_cli.formats.splat.usd import read_usd, write_usd
 from splatctrl_cli.records import GaussianSet
 from tests.formats.splat.test_gaussian_ply import changed, gaussian_set
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 ROW = struct.Struct("<6f8B")
 
@@ -62,7 +62,7 @@ def test_a_file_of_another_tool_is_read(tmp_path: Path) -> None:
 )
 def test_rows_that_are_no_gaussians_are_refused(tmp_path: Path, row: bytes, message: str) -> None:
     (tmp_path / "a.splat").write_bytes(ROW.pack(0, 0, 0, 1, 1, 1, *[200] * 8) + row)
-    refused(message, read_splat, tmp_path / "a.splat")
+    expect_refusal(message, read_splat, tmp_path / "a.splat")
 
 
 HEADER = struct.Struct("<IIIBBBB")
@@ -139,7 +139,7 @@ def test_what_is_farther_than_2_km_is_held_in_larger_steps(tmp_path: Path) -> No
     ],
 )
 def test_what_is_no_file_of_these_versions_is_refused(tmp_path: Path, header: tuple[int, ...], message: str) -> None:
-    refused(message, read_spz, packed(tmp_path / "a.spz", HEADER.pack(*header)))
+    expect_refusal(message, read_spz, packed(tmp_path / "a.spz", HEADER.pack(*header)))
 
 
 SPLATS = "KHR_gaussian_splatting"
@@ -257,12 +257,14 @@ def test_what_is_no_plain_set_of_gaussians_is_refused(
     start = document["bufferViews"][scale["bufferView"]]["byteOffset"]
     logs = np.log(gaussians.scales).tobytes()
     drafts = with_document(path, document, binary[:start] + logs + binary[start + len(logs) :])
-    refused("splat 0: .*:SCALE: expected no negative sigma, got .*drafts", read_gltf, drafts)
+    expect_refusal("splat 0: .*:SCALE: expected no negative sigma, got .*drafts", read_gltf, drafts)
     accessors[0]["count"] = 10**6
-    refused(r"accessor 0: reaches beyond the \d+ bytes of data", read_gltf, with_document(path, document, binary))
+    expect_refusal(
+        r"accessor 0: reaches beyond the \d+ bytes of data", read_gltf, with_document(path, document, binary)
+    )
     accessors[0]["count"] = len(gaussians)
     change(primitive)
-    refused(message, read_gltf, with_document(path, document, binary))
+    expect_refusal(message, read_gltf, with_document(path, document, binary))
 
 
 @pytest.fixture
@@ -303,7 +305,7 @@ def test_what_is_no_particle_field_is_refused(tmp_path: Path) -> None:
         (good.replace("float3[] scales", "float3[] sizes"), "its ParticleField3DGaussianSplat has no scales"),
     ):
         path.write_text(text)
-        refused(said, read_usd, path, suffix=".usda")
+        expect_refusal(said, read_usd, path, suffix=".usda")
 
 
 @pytest.mark.usefixtures("usd_core")

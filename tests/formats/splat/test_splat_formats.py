@@ -24,7 +24,7 @@ from splatctrl_cli.formats.splat.splats import (
 from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import GaussianSet, SplatSet
 from tests.formats.splat.test_gaussian_ply import changed, gaussian_set, splat_set
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 @pytest.fixture(params=FORMATS.values(), ids=FORMATS)
@@ -71,14 +71,14 @@ def test_isotropic_splats_are_read_as_that_from_every_format(tmp_path: Path, kin
 def test_what_is_no_gaussian_or_no_whole_file_is_refused_in_one_line(tmp_path: Path, kind: SplatFormat) -> None:
     gaussians, path = gaussian_set(5), tmp_path / f"a{kind.suffix}"
     gaussians.centers[3, 1] = np.nan
-    refused("splat 3: center: expected finite, got", kind.write, path, gaussians, {})
+    expect_refusal("splat 3: center: expected finite, got", kind.write, path, gaussians, {})
     assert not list(tmp_path.iterdir())
-    refused("cannot be read", read_splats, path)
+    expect_refusal("cannot be read", read_splats, path)
     kind.write(path, gaussian_set(), {})
     content = path.read_bytes()
     for length, read in ((len(content) // 2 - 3, read_splats), (20, read_splats), (20, describe)):
         path.write_bytes(content[:length])
-        refused(f"a{kind.suffix}: ", read, path)
+        expect_refusal(f"a{kind.suffix}: ", read, path)
 
 
 def test_the_reference_layout_has_62_properties_whatever_the_labels(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_the_nearest_isotropic_set_keeps_volume_mean_colour_and_opacity() -> Non
     np.testing.assert_allclose(splats.colors, 0.5 + 0.28209479 * gaussians.harmonics[:, 0], rtol=1e-6)
     assert splats.opacities[0] == np.float32(0.3)
     said = "got 1 of 1 whose scales differ and 1 whose colour depends on the view; "
-    refused(said, as_splats, gaussians, "a.ply")
+    expect_refusal(said, as_splats, gaussians, "a.ply")
 
 
 def test_a_ply_without_rotation_is_read_where_it_is_round_and_refused_where_not(tmp_path: Path) -> None:
@@ -128,19 +128,19 @@ def test_a_ply_without_rotation_is_read_where_it_is_round_and_refused_where_not(
     assert isinstance(read_splats(path)[0], SplatSet)
     write_gaussian_ply(path, gaussian_set(3), {})
     path.write_bytes(path.read_bytes().replace(b"float rot_", b"float was_"))
-    refused("missing properties rot_0 rot_1 rot_2 rot_3", read_splats, path)
+    expect_refusal("missing properties rot_0 rot_1 rot_2 rot_3", read_splats, path)
 
 
 def test_an_unknown_suffix_names_the_known_and_a_library_that_lacks_its_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said = r"a\.{0}: expected a suffix of \.ply, \.splat, \.spz, .*, got \.{0}"
-    refused(said.format("stl"), format_of, Path("a.stl"), error=UsageError)
-    refused(said.format("txt"), read_splats, Path("a.txt"))
+    expect_refusal(said.format("stl"), format_of, Path("a.stl"), error=UsageError)
+    expect_refusal(said.format("txt"), read_splats, Path("a.txt"))
     assert format_of(Path("a")) is FORMATS[".ply"]
     monkeypatch.setitem(sys.modules, "pxr", None)
     lacks, given = "usd-core is not installed; pip install 'splatctrl-cli[usd]'", (gaussian_set(1), {})
-    refused(lacks, usd.write_usd, tmp_path / "a.usdc", *given, suffix=".usdc", error=UsageError)
+    expect_refusal(lacks, usd.write_usd, tmp_path / "a.usdc", *given, suffix=".usdc", error=UsageError)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -200,7 +200,7 @@ def test_a_verdict_that_turns_back_fools_bisection_and_is_caught() -> None:
     ids=["turns back", "ends that agree", "a third verdict", "none"],
 )
 def test_the_first_flip_from_the_start_is_found(judge: Counted, first: Any, outcome: str, is_monotone: bool) -> None:
-    """Where of the quarters only the middle fails, it turns back: the eighths are tried, of which the first fails."""
+    """If only the middle of the quarters fails, the search turns to the eighths, of which the first fails."""
     found = find_flip(judge, 0.0, 1.0, tolerance=0.001, is_monotone=True)
     assert (found.first, found.is_monotone) == (first, is_monotone)
     assert (judge.outcome(found.first) if found.first is not None else "") == outcome

@@ -35,7 +35,7 @@ from splatctrl_cli.records import JointState, Record, RgbdFrame
 from tests.conftest import ROOT
 from tests.recording.container.test_log_formats import as_ros2_folder, assert_same
 from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, frames_of, make_log
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 def captured(
@@ -131,10 +131,10 @@ def test_an_image_of_another_size_than_its_camera_is_left_out_and_counted(tmp_pa
 def test_options_that_a_capture_cannot_honour_and_newer_versions_are_refused(tmp_path: Path) -> None:
     _, folder = captured(tmp_path, LogRecipe())
     for change in ({"depth_scale": 1e-4}, {"world_frame": "base"}, {"holdout": ("0",)}, {"root": tmp_path}):
-        refused("does not apply to a capture", open_source, folder, replace(SourceOptions(), **change))
+        expect_refusal("does not apply to a capture", open_source, folder, replace(SourceOptions(), **change))
     text = (folder / "capture.json").read_text().replace('"version": 1', '"version": 99')
     (folder / "capture.json").write_text(text)
-    refused("expected version 1, got 99", open_source, folder)
+    expect_refusal("expected version 1, got 99", open_source, folder)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_an_index_that_was_changed_or_is_gone_is_refused(tmp_path: Path, name: s
     (folder / name).unlink()
     if is_there:
         (folder / name).write_bytes(content + b"\n")
-    refused(f"{name}: its checksum differs" if is_there else name, open_source, folder)
+    expect_refusal(f"{name}: its checksum differs" if is_there else name, open_source, folder)
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_frames_that_are_gone_from_a_log_are_counted_and_a_capture_that_shrinks_
     assert source.loss.damaged == 0
     os.truncate(file, int(file.stat().st_size * (kind if isinstance(kind, float) else 1 / 3)))
     if isinstance(kind, float):
-        refused("frames.csv: changed while it was read", list, records)
+        expect_refusal("frames.csv: changed while it was read", list, records)
         return
     found = 1 + sum(1 for _ in records)
     assert found < whole and source.loss.damaged == 1
@@ -270,7 +270,7 @@ def test_a_capture_whose_images_lie_outside_is_refused(tmp_path: Path) -> None:
     _, capture = captured(tmp_path, LogRecipe())
     text = (capture / "frames.csv").read_text().replace("color/cam0/000000.jpg", "../secret.jpg")
     replace_file(capture, "frames.csv", text.encode())
-    refused("../secret.jpg lies outside the capture", open_source, capture)
+    expect_refusal("../secret.jpg lies outside the capture", open_source, capture)
 
 
 def test_a_capture_of_a_capture_keeps_its_depth_unit(tmp_path: Path) -> None:
@@ -303,9 +303,9 @@ HEADER: dict[str, Any] = {
 def test_what_is_wrong_is_named(name: str, value: object) -> None:
     for depth_scale in (0.001, None):
         check_header(Path("x/capture.json"), HEADER | {"cameras": {"cam": CAMERA | {"depth_scale": depth_scale}}})
-    refused(f"x/capture.json: {name}: expected", check_header, Path("x/capture.json"), HEADER | {name: value})
+    expect_refusal(f"x/capture.json: {name}: expected", check_header, Path("x/capture.json"), HEADER | {name: value})
     lacking = {key: entry for key, entry in HEADER.items() if key != name}
-    refused(f"x/capture.json: {name} is missing", check_header, Path("x/capture.json"), lacking)
+    expect_refusal(f"x/capture.json: {name} is missing", check_header, Path("x/capture.json"), lacking)
 
 
 HEAD = ",".join(COLUMNS) + "\n"
@@ -350,7 +350,7 @@ def test_other_columns_and_what_is_no_row_are_refused(
     tmp_path: Path, head: str, lines: tuple[str, ...], said: str
 ) -> None:
     path = frames(tmp_path, *lines, head=head)
-    refused(f"frames.csv: {said}.*; run `splatctrl ingest` again", FrameRows, path, ("a",))
+    expect_refusal(f"frames.csv: {said}.*; run `splatctrl ingest` again", FrameRows, path, ("a",))
 
 
 def test_sums_are_found_by_name_and_the_last_line_of_a_name_holds(tmp_path: Path) -> None:
@@ -363,7 +363,7 @@ def test_sums_are_found_by_name_and_the_last_line_of_a_name_holds(tmp_path: Path
     assert sums.get("color/é200.jpg") is None and sums.get("") is None
     (tmp_path / "SHA256SUMS").write_text("")
     assert FileSums(tmp_path).get("a") is None
-    refused("missing; the capture was not finished", FileSums, tmp_path / "none")
+    expect_refusal("missing; the capture was not finished", FileSums, tmp_path / "none")
 
 
 def interrupted(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch, after: int = 2) -> Path:
@@ -414,8 +414,8 @@ def test_what_an_interrupted_ingest_left_is_named_and_without_resume_begun_again
     log, out = make_log(tmp_path / "log.mcap"), tmp_path / "x.capture"
     partial = interrupted(log, out, monkeypatch)
     said = "an ingest that was interrupted; continue it with the same command and --resume"
-    refused(said, open_source, partial)
-    refused(said, describe, partial)
+    expect_refusal(said, open_source, partial)
+    expect_refusal(said, describe, partial)
     (partial / "color/cam0/000000.jpg").write_bytes(b"wrong")
     assert main(["ingest", str(log), "-o", str(out), "-q"]) == 0
     source = open_source(out)
@@ -435,7 +435,7 @@ def test_going_on_with_other_options_or_frames_is_refused(
     assert main(again) == 2
     assert "sha256 of log.mcap" in capsys.readouterr().err
     moved = open_source(make_log(tmp_path / "moved.mcap", LogRecipe(tf_delay_ns=5_000_000)))
-    refused("color/cam0/000001.jpg: tx was 0.1, is ", write_capture, partial, moved, error=UsageError)
+    expect_refusal("color/cam0/000001.jpg: tx was 0.1, is ", write_capture, partial, moved, error=UsageError)
 
 
 POSITION = "joint_topics/0/position.npy"
@@ -470,7 +470,7 @@ def test_other_rows_than_those_of_the_stamps_or_fewer_than_announced_are_refused
     else:
         np.save(tmp_path / "x.npy", array)
         replace_file(capture, POSITION, (tmp_path / "x.npy").read_bytes())
-    refused("joint_topics: cannot be read", read, capture)
+    expect_refusal("joint_topics: cannot be read", read, capture)
 
 
 @pytest.mark.parametrize("place", ["..", "/tmp", "joint_topics/../.."])
@@ -479,4 +479,4 @@ def test_a_folder_outside_the_capture_is_refused(tmp_path: Path, place: str) -> 
     header = json.loads((capture / "capture.json").read_text())
     header["joint_topics"]["topics"][0]["streams"][0]["folder"] = place
     replace_file(capture, "capture.json", json.dumps(header).encode())
-    refused("lies outside the capture", read, capture)
+    expect_refusal("lies outside the capture", read, capture)

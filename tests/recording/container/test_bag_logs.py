@@ -25,7 +25,7 @@ from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 from tests.cases.container_cases import kill_recorder
 from tests.recording.log.make_log import T, encoded, write_bag
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
 
@@ -259,7 +259,7 @@ def test_a_journal_that_is_cut_gives_what_was_committed_before_and_a_missing_one
     assert stamps(file) == list(range(1, 14)) and "bag.db3-wal" in read(file)[1].all_notes[0]
     empty = make_killed(tmp_path / "empty")
     empty.with_name("bag.db3-wal").unlink()
-    refused("bag.db3-wal is not beside it.*; copy bag.db3-wal from where the bag was recorded", read, empty)
+    expect_refusal("bag.db3-wal is not beside it.*; copy bag.db3-wal from where the bag was recorded", read, empty)
 
 
 def test_values_of_the_wrong_type_are_counted_and_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path) -> None:
@@ -276,7 +276,7 @@ def test_values_of_the_wrong_type_are_counted_and_a_view_in_the_place_of_a_table
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("DROP TABLE messages")
         database.execute(f"CREATE VIEW messages AS {endless}")
-    refused("no tables named topics and messages", open_raw_log, path)
+    expect_refusal("no tables named topics and messages", open_raw_log, path)
 
 
 def test_a_compressed_file_that_is_cut_gives_what_precedes(tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_a_bomb_stops_on_disk_or_is_counted_and_a_nested_file_is_refused(
     found, damage = read(bomb)
     assert (found, damage.notes[0]) == ([], "bomb.mcap.zstd: unpacks to over 100 times its size")
     twice.write_bytes(zstandard.compress(zstandard.compress(magic)))
-    refused("compressed twice", open_raw_log, twice)
+    expect_refusal("compressed twice", open_raw_log, twice)
     bag = make_bag(tmp_path / "bag", num=3, mode=CompressionMode.MESSAGE)
     with closing(sqlite3.connect(bag / "bag.db3")) as database, database:
         database.execute("UPDATE messages SET data = ? WHERE id = 2", (zstandard.compress(bytes(1 << 28)),))

@@ -31,7 +31,7 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from tests.properties import few
 from tests.recording.log.make_log import STORE, LogRecipe, make_log, messages_of, rewritten, write_bag, write_raw
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 def as_ros2_folder(log: Path, folder: Path, plugin: StoragePlugin) -> Path:
@@ -192,7 +192,7 @@ def test_what_is_no_log_is_refused_by_its_bytes(tmp_path: Path, suffix: str, con
         f"does not begin like a {suffix} file (first bytes b'hello, t')" if content else "the file is empty (0 bytes)"
     )
     (tmp_path / f"x{suffix}").write_bytes(content)
-    refused(said, open_raw_log, tmp_path / f"x{suffix}")
+    expect_refusal(said, open_raw_log, tmp_path / f"x{suffix}")
 
 
 @pytest.mark.parametrize(("stamps", "num_frames"), [("header", 5), ("log", 4)])
@@ -225,14 +225,14 @@ HOLDING = [kind for kind in FOREIGN if kind.entry]
 def test_an_ending_names_its_format_in_either_case(tmp_path: Path, kind: Foreign, suffix: str) -> None:
     for name in (f"run{suffix}", f"run{suffix.upper()}"):
         (tmp_path / name).write_bytes(b"any content")
-        assert refused(kind.what, open_source, tmp_path / name).endswith(f"; {kind.remedy}")
+        assert expect_refusal(kind.what, open_source, tmp_path / name).endswith(f"; {kind.remedy}")
 
 
 @pytest.mark.parametrize("kind", MARKED, ids=lambda kind: kind.what)
 def test_first_bytes_name_a_format_under_another_ending(tmp_path: Path, kind: Foreign) -> None:
     (tmp_path / "run.dat").write_bytes(kind.magic + bytes(5000) + kind.mark)
     for read in (open_source, describe):
-        refused(kind.what, read, tmp_path / "run.dat")
+        expect_refusal(kind.what, read, tmp_path / "run.dat")
 
 
 @pytest.mark.parametrize("kind", HOLDING, ids=lambda kind: kind.what)
@@ -241,7 +241,7 @@ def test_an_entry_names_a_folder_or_a_zip_file(tmp_path: Path, kind: Foreign) ->
     with zipfile.ZipFile(tmp_path / "run.bin", "w") as archive:
         archive.writestr(f"{kind.entry}0.jpg" if kind.entry.endswith("/") else kind.entry, b"x")
     for path in (tmp_path / "run", tmp_path / "run.bin"):
-        refused(kind.what, describe, path)
+        expect_refusal(kind.what, describe, path)
 
 
 def test_marks_inside_a_log_that_is_read_name_nothing(tmp_path: Path) -> None:
@@ -262,4 +262,4 @@ def test_a_bag_folder_that_lacks_a_file_is_refused_and_one_named_twice_is_read_o
     bag = with_other_files(as_ros2_folder(log, tmp_path / "bag", StoragePlugin.SQLITE3), "- bag.db3\n  - bag.db3")
     assert_same(list(open_source(bag).records()), list(open_source(log).records()))
     (bag / "bag.db3").unlink()
-    refused("metadata.yaml names bag.db3, which is not there", open_source, bag)
+    expect_refusal("metadata.yaml names bag.db3, which is not there", open_source, bag)

@@ -31,7 +31,7 @@ from splatctrl_cli.recording.container.mcap_records import Chunk as StoredChunk
 from splatctrl_cli.recording.container.raw_log import MAX_NOTES, Damage
 from splatctrl_cli.recording.source import SourceOptions, open_source
 from tests.recording.log.make_log import LogRecipe, make_log
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 def small_log(compression: CompressionType = CompressionType.ZSTD, num: int = 40, size: int = 3000) -> bytes:
@@ -246,7 +246,7 @@ def test_a_log_whose_damage_took_what_is_missing_says_so(tmp_path: Path) -> None
         data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 0xFF
     log.write_bytes(bytes(data))
     expected = r"no tf .*; but the log is damaged: .*chunk.*; copy the file again; if this is all there is: "
-    refused(expected, open_source, log, SourceOptions(world_frame="world"))
+    expect_refusal(expected, open_source, log, SourceOptions(world_frame="world"))
 
 
 STEP = 211

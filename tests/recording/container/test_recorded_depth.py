@@ -19,7 +19,7 @@ from splatctrl_cli.recording.log.messages import read_image
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import JointState
 from tests.recording.log.make_log import HEIGHT, WIDTH, LogRecipe, built, encoded, frames_of, make_log, rewritten
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 def with_png_depth(
@@ -107,7 +107,7 @@ def test_a_frame_that_was_left_undecoded_is_refused_where_it_does_not_decode(tmp
     source = open_source(with_png_depth(tmp_path, change={2: b"\x89PNG\r\n\x1a\n" + b"".join(chunks)})[0])
     frames = [item for item in source.stored() if not isinstance(item, JointState)]
     said = "/cam0/depth/image_raw#2: compressed image .* not an image file; copy"
-    refused(said, lambda: frames[2].frame)
+    expect_refusal(said, lambda: frames[2].frame)
     assert len(frames_of(source)) == 4 and source.loss.damaged == 1  # and counted where it is decoded
 
 

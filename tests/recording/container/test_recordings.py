@@ -11,7 +11,7 @@ from splatctrl_cli.recording.log.stored_frame import StoredFrame
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from tests.conftest import ROOT
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 EXAMPLES = ROOT / "docs" / "examples"
 STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -82,7 +82,7 @@ def test_a_recording_is_read(real_data: Path, recording: Recording) -> None:
 
 @pytest.mark.parametrize("path", REFUSED)
 def test_a_recording_that_lacks_something_says_what(real_data: Path, path: str) -> None:
-    refused(REFUSED[path], open_source, real_data / path)
+    expect_refusal(REFUSED[path], open_source, real_data / path)
 
 
 def test_single_views_without_poses_are_read_as_a_camera_that_stands_still(real_data: Path, tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_single_views_without_poses_are_read_as_a_camera_that_stands_still(real_
         lens = f"width = 640\nheight = 480\nfx = {K[0][0]}\nfy = {K[1][1]}\ncx = {K[0][2]}\ncy = {K[1][2]}\n"
         frames = f'[frames]\ncolor = "{name}.color.png"\ndepth = "{name}.depth.png"\n'
         description.write_text(f'root = "{folder}"\n[camera]\n{lens}{frames}')
-        refused(r"\[poses\] is missing; .*--camera-pose NAME=identity", open_source, description)
+        expect_refusal(r"\[poses\] is missing; .*--camera-pose NAME=identity", open_source, description)
         _, stored = first_stored(description, SourceOptions(camera_poses={"camera": STILL}))
         assert (stored.frame.depth > 0).mean() > 0.01  # the background was cut away
         assert stored.frame.T_world_camera[2, 2] == 1.0
@@ -112,7 +112,7 @@ def test_every_bag_without_images_is_described_and_refused_for_that(real_data: P
         is_bag = is_bag_folder(path) if path.is_dir() else path.suffix in {".db3", ".mcap"}
         if is_bag:
             reason = "got wrong_format" if says_wrong(path) else "no image topics"
-            refused("holds no messages" if "empty_bag" in str(path) else reason, open_source, path)
+            expect_refusal("holds no messages" if "empty_bag" in str(path) else reason, open_source, path)
             assert describe(path).kind.startswith("ROS 2 bag" if path.is_dir() or path.suffix == ".db3" else "MCAP")
             num += 1
     assert num >= 60
@@ -121,4 +121,4 @@ def test_every_bag_without_images_is_described_and_refused_for_that(real_data: P
 def test_every_conformance_file_is_refused_for_its_missing_images(real_data: Path) -> None:
     for path in sorted((real_data / "mcap_conformance").rglob("*.mcap")):
         reason = "expected messages in cdr, .*, got a" if "Message" in path.parent.name else "holds no messages"
-        refused(reason, open_source, path)
+        expect_refusal(reason, open_source, path)

@@ -19,7 +19,7 @@ from splatctrl_cli.recording.folder.idr import decompose, projection, read_idr, 
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Intrinsics
 from tests.recording.log.make_log import frames_of
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 K = Intrinsics(fx=61.0, fy=62.0, cx=32.5, cy=23.0, width=64, height=48)
 
@@ -84,9 +84,9 @@ def test_a_written_scan_reads_back(scan: Path, idr: Path, layout: str) -> None:
     assert (source.layout, source.has_clock, source.joint_names, source.cameras) == (layout, False, (), ("camera",))
     assert len(source.digests()) == (16 if layout == "MVSNet" else 13), "camera, image, depth, what it shows, or mask"
     assert read(root, "scan7").name == "scan7"
-    refused("no scan 'scan9'; give --scan, one of: scan7", read, root, "scan9")
+    expect_refusal("no scan 'scan9'; give --scan, one of: scan7", read, root, "scan9")
     for folder in (scan, idr):
-        refused(r"a DTU data set, .*; give it as --dtu \(in a suite dtu = ", open_source, folder)
+        expect_refusal(r"a DTU data set, .*; give it as --dtu \(in a suite dtu = ", open_source, folder)
 
 
 def test_camera_files_hold_world_to_camera_in_millimetres_and_pairs_the_nearest_first(scan: Path) -> None:
@@ -196,7 +196,7 @@ def test_lengths_that_are_no_millimetres_are_told_by_the_depth_and_the_cameras(
     moved = np.array([*[[1.0, 1.0, 1.0, 1 / cameras]] * 3, [1.0] * 4])
     views = [replace(v, depth=v.depth / np.float32(depth), T_world_camera=v.T_world_camera * moved) for v in VIEWS]
     write_dtu(tmp_path, "scan7", views)
-    refused(message, read_dtu, tmp_path)
+    expect_refusal(message, read_dtu, tmp_path)
 
 
 def replaced(path: Path, old: str, new: str) -> None:
@@ -232,7 +232,7 @@ def replaced(path: Path, old: str, new: str) -> None:
 )
 def test_damage_of_a_scan_of_mvsnet_is_named(scan: Path, damage: Damage, message: str) -> None:
     damage(scan)
-    refused(message, read_dtu, scan)
+    expect_refusal(message, read_dtu, scan)
 
 
 def in_unit_sphere(folder: Path) -> None:
@@ -263,7 +263,7 @@ def in_unit_sphere(folder: Path) -> None:
 )
 def test_damage_of_a_scan_of_idr_is_named(idr: Path, damage: Damage, message: str) -> None:
     damage(idr)
-    refused(message, read_idr, idr.parent)
+    expect_refusal(message, read_idr, idr.parent)
 
 
 @pytest.mark.parametrize("scale", [1.0, -1.0, 0.37, -250.0])
@@ -273,7 +273,7 @@ def test_a_projection_of_any_scale_gives_the_camera_back(scale: float) -> None:
     np.testing.assert_allclose(T_world_camera, VIEWS[1].T_world_camera, atol=1e-12)
     assert np.linalg.det(T_world_camera[:3, :3]) == pytest.approx(1.0)
     said = "world_mat_2: expected a camera's projection, got a matrix that cannot be"
-    refused(said, decompose, np.ones((3, 4)), "world_mat_2")
+    expect_refusal(said, decompose, np.ones((3, 4)), "world_mat_2")
 
 
 def test_a_missing_image_leaves_the_others_their_cameras_and_masks(idr: Path) -> None:
@@ -294,9 +294,13 @@ def test_without_depth_a_view_of_idr_stays_and_depth_maps_may_lie_elsewhere(tmp_
     assert len(frames_of(source)) == 4
     assert source.loss.notes[0] == "000000.png: without depth"
     assert DtuSource(tmp_path / "plain", depths=scan / DEPTHS).has_depth
-    refused(r"nowhere: expected depth_map_0000.pfm", DtuSource, tmp_path / "plain", depths=tmp_path / "nowhere")
-    refused(r"--depths .*: MVSNet's layout has its own", DtuSource, scan, depths=tmp_path, error=UsageError)
-    refused(r"--masks .*: IDR's layout has its own", DtuSource, tmp_path / "plain", masks=tmp_path, error=UsageError)
+    expect_refusal(
+        r"nowhere: expected depth_map_0000.pfm", DtuSource, tmp_path / "plain", depths=tmp_path / "nowhere"
+    )
+    expect_refusal(r"--depths .*: MVSNet's layout has its own", DtuSource, scan, depths=tmp_path, error=UsageError)
+    expect_refusal(
+        r"--masks .*: IDR's layout has its own", DtuSource, tmp_path / "plain", masks=tmp_path, error=UsageError
+    )
 
 
 def test_held_out_views_are_a_camera_of_their_own_and_stamps_are_view_numbers(scan: Path) -> None:
@@ -307,9 +311,9 @@ def test_held_out_views_are_a_camera_of_their_own_and_stamps_are_view_numbers(sc
     assert view_numbers(["2", "5"]) == [2, 5]
     protocol = replace(score_protocol("holdout:1"), training=(3, 0))  # leaves out what neither trains nor scores
     assert places(DtuSource(scan, protocol=protocol)) == [("camera", 0), ("holdout", 1), ("camera", 3)]
-    refused("--holdout 4: .* has no such view; views: 0 to 3", DtuSource, scan, None, [0, 4], error=UsageError)
-    refused("all 4 views of .* are held out", DtuSource, scan, None, range(4), error=UsageError)
-    refused("expected view numbers such as 2,5, got 'two'", view_numbers, ["2", "two"], error=UsageError)
+    expect_refusal("--holdout 4: .* has no such view; views: 0 to 3", DtuSource, scan, None, [0, 4], error=UsageError)
+    expect_refusal("all 4 views of .* are held out", DtuSource, scan, None, range(4), error=UsageError)
+    expect_refusal("expected view numbers such as 2,5, got 'two'", view_numbers, ["2", "two"], error=UsageError)
 
 
 def test_a_view_of_mvsnet_without_depth_is_left_out_and_the_others_keep_their_numbers(scan: Path) -> None:
@@ -318,7 +322,7 @@ def test_a_view_of_mvsnet_without_depth_is_left_out_and_the_others_keep_their_nu
     assert places(source) == [("camera", 0), ("holdout", 2), ("camera", 3)]
     assert source.loss.unpaired_color == 1
     assert source.loss.notes == ["rect_002_3_r5000.png: without depth, left out"]
-    refused(r"--holdout 1: .* has no such view; views: 0, 2, 3", DtuSource, scan, None, [1], error=UsageError)
+    expect_refusal(r"--holdout 1: .* has no such view; views: 0, 2, 3", DtuSource, scan, None, [1], error=UsageError)
 
 
 def test_a_view_made_smaller_sees_the_same_points_at_the_same_places() -> None:
@@ -334,7 +338,7 @@ def test_a_view_made_smaller_sees_the_same_points_at_the_same_places() -> None:
     point = np.column_stack([(center_of_patch - [K.cx, K.cy]) / [K.fx, K.fy], [1.0]])
     np.testing.assert_allclose(project(full.intrinsics, point), center_of_patch)
     np.testing.assert_allclose(project(small.intrinsics, point), [[5.0, 2.0]])
-    refused("--downscale 5: expected a whole factor of 64x48", shrunk, full, 5, error=UsageError)
+    expect_refusal("--downscale 5: expected a whole factor of 64x48", shrunk, full, 5, error=UsageError)
 
 
 def test_a_protocol_makes_images_as_small_as_its_published_figures_are_of(tmp_path: Path) -> None:

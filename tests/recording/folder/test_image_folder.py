@@ -13,7 +13,7 @@ from splatctrl_cli.recording.folder.image_folder import open_image_folder
 from splatctrl_cli.recording.source import SourceOptions, open_source
 from tests.cli.test_reconstruct import write_folder
 from tests.recording.log.make_log import frames_of
-from tests.refused import refused
+from tests.refused import expect_refusal
 from tests.scene.wall import frame
 
 EXAMPLES = Path(__file__).parents[3] / "docs" / "examples"
@@ -78,7 +78,7 @@ def test_held_out_frames_belong_to_another_camera(tmp_path: Path, entry: str) ->
     assert [frame.camera for frame in frames] == ["camera", "camera", "holdout"]  # name 8 is at position 2
     assert len(frames_of(path, SourceOptions(holdout=(entry,), cameras=("camera",)))) == 2
     said = "--holdout: all 3 views are held out; leave some"
-    refused(said, open_source, path, SourceOptions(holdout=("0", "1", "2")), error=UsageError)
+    expect_refusal(said, open_source, path, SourceOptions(holdout=("0", "1", "2")), error=UsageError)
 
 
 def test_world_to_camera_and_opengl_poses_are_the_same_camera(tmp_path: Path) -> None:
@@ -88,10 +88,10 @@ def test_world_to_camera_and_opengl_poses_are_the_same_camera(tmp_path: Path) ->
     write_log(tmp_path / "images/t.log", invert_transform(opengl))
     assert frames_of(path)[0].T_world_camera == pytest.approx(POSE, abs=1e-12)
     write_log(tmp_path / "images/t.log", np.diag([2.0, 2.0, 2.0, 1.0]))
-    refused("expected a rigid transform", open_source, path)
+    expect_refusal("expected a rigid transform", open_source, path)
     (tmp_path / "images/t.log").unlink()
-    refused("t.log: No such file", open_source, path)
-    refused("no such folder", open_source, path, SourceOptions(root=tmp_path / "elsewhere"))
+    expect_refusal("t.log: No such file", open_source, path)
+    expect_refusal("no such folder", open_source, path, SourceOptions(root=tmp_path / "elsewhere"))
 
 
 def test_tum_poses_are_matched_by_the_stamps_in_file_names(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_a_description_that_cannot_be_meant_is_refused(
     tmp_path: Path, rig: Path, good: str, bad: str, said: str
 ) -> None:
     path = described(tmp_path / "one")
-    message = refused(said, frames_of, replaced(path if good in path.read_text() else rig, good, bad))
+    message = expect_refusal(said, frames_of, replaced(path if good in path.read_text() else rig, good, bad))
     assert ("--depth-scale" in message) == ("implausible" in said)
 
 
@@ -251,8 +251,8 @@ def test_masks_go_with_the_colour_image_of_the_same_name(tmp_path: Path) -> None
     assert source.loss.notes == ["1 of 3 colour images have no mask"]
     assert "who/7.png" in source.digests()
     said = "expected an 8-bit grey mask of 8x6, as the colour images, got 9x6"
-    refused(said, frames_of, with_masks(tmp_path / "a", ("7",), np.zeros((6, 9), np.uint8)))
-    refused("is named like a colour image", frames_of, with_masks(tmp_path / "b", ("99",), mask))
+    expect_refusal(said, frames_of, with_masks(tmp_path / "a", ("7",), np.zeros((6, 9), np.uint8)))
+    expect_refusal("is named like a colour image", frames_of, with_masks(tmp_path / "b", ("99",), mask))
 
 
 @pytest.mark.parametrize("change", ["", 'encoding = "uint16-rotated3"', "invalid = 10000"])
@@ -287,7 +287,7 @@ def test_each_camera_has_its_own_files_and_poses_by_stamp(rig: Path) -> None:
     assert [pose[:2] for pose in source.poses()] == [(f.stamp_ns, f.camera) for f in found]
     assert source.has_clock and len(source.digests()) == 1 + 3 * len(found)
     assert {f.camera for f in frames_of(rig, SourceOptions(cameras=("b",)))} == {"b"}
-    refused("no camera 'c'; use one of: a, b", frames_of, rig, SourceOptions(cameras=("c",)))
+    expect_refusal("no camera 'c'; use one of: a, b", frames_of, rig, SourceOptions(cameras=("c",)))
     still = frames_of(replaced(rig, 'poses = "a-*.txt"', 'poses = "a-1.txt"'))
     assert [f.T_world_camera[0, 3] for f in still if f.camera == "a"] == [0.1, 0.1], "without a star"
 

@@ -29,7 +29,7 @@ from tests.recording.folder.make_layout import (
     pcd_bytes,
 )
 from tests.recording.log.make_log import frames_of
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 SENS = "scene0000_00.sens"
 
@@ -42,7 +42,7 @@ def test_a_sensor_file_is_read_by_itself_too_and_kept_as_it_is(tmp_path: Path) -
     write_capture(tmp_path / "x.capture", open_source(file))
     check(frames_of(tmp_path / "x.capture"))
     (tmp_path / "scene" / "b.sens").write_bytes(file.read_bytes())
-    refused("2 files .*.sens; give one of them, such as .*b.sens", open_source, tmp_path / "scene")
+    expect_refusal("2 files .*.sens; give one of them, such as .*b.sens", open_source, tmp_path / "scene")
     frame = frames_of(make_sens(tmp_path / "jpeg", form=".jpg", is_packed=False))[1]
     assert np.abs(frame.color.astype(int) - color_of(1)).max() < 8
     assert frame.depth[3, 3] == np.float32(1370) * np.float32(1e-3)
@@ -82,7 +82,7 @@ def test_a_sensor_file_of_another_kind_is_refused(tmp_path: Path, at: int, value
     file = make_sens(tmp_path) / SENS
     data = file.read_bytes()
     file.write_bytes(data[:at] + value + data[at + len(value) :])
-    refused(words, open_source, file)
+    expect_refusal(words, open_source, file)
 
 
 def write_clouds(folder: Path, names: Sequence[str], poses: Sequence[Float64] = (np.eye(4),) * 3) -> None:
@@ -121,17 +121,17 @@ def test_a_lone_cloud_without_viewpoint_is_its_own_world_and_that_is_said(tmp_pa
     assert len(list(source.records())) == 1
     lens = SourceOptions(intrinsics={"camera": (10.0, 11.0, 4.0, 3.0, 0.1, 0.0, 0.0, 0.0)})
     said = "--intrinsics: expected FX,FY,CX,CY for a.pcd, got distortion"
-    refused(said, open_source, tmp_path / "a.pcd", lens, error=UsageError)
+    expect_refusal(said, open_source, tmp_path / "a.pcd", lens, error=UsageError)
     row = pcd_bytes(cloud_of(0).reshape(1, -1, 3), color_of(0).reshape(1, -1, 3), POSES[0])
     (tmp_path / "a.pcd").write_bytes(row)
-    refused("a.pcd: not organised: 48 points in one row; record clouds", open_source, tmp_path)
+    expect_refusal("a.pcd: not organised: 48 points in one row; record clouds", open_source, tmp_path)
 
 
 def test_clouds_without_viewpoints_ask_for_poses_and_names_that_are_seconds_are_stamps(tmp_path: Path) -> None:
     names = [f"1285627014.8331{index}0319" for index in range(2)]
     write_clouds(tmp_path, names)
     said = "VIEWPOINT is the origin in all 2 clouds; write poses as VIEWPOINT, or give"
-    refused(said, open_source, tmp_path)
+    expect_refusal(said, open_source, tmp_path)
     still = SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)})
     assert frames_of(tmp_path, still)[1].T_world_camera[:3, 3].tolist() == [1.0, 2.0, 3.0]
     write_clouds(tmp_path, names, POSES)
@@ -147,16 +147,16 @@ def test_a_grid_that_is_no_pinhole_camera_is_refused_with_its_residual(tmp_path:
         (turned, "not of a pinhole camera"),
     ):
         (tmp_path / "a.pcd").write_bytes(pcd_bytes(points, color_of(0), POSES[0]))
-        refused(f"a.pcd: .*{said}", open_source, tmp_path / "a.pcd")
+        expect_refusal(f"a.pcd: .*{said}", open_source, tmp_path / "a.pcd")
 
 
 def test_a_cloud_of_another_camera_than_the_first_and_wrong_intrinsics_are_refused(tmp_path: Path) -> None:
     folder = make_pcd(tmp_path)
     wide = cloud_of(1) * np.array([1.3, 1.3, 1.0], np.float32)
     (folder / "cloud_9.pcd").write_bytes(pcd_bytes(wide, color_of(1), POSES[1]))
-    refused(r"cloud_9.pcd: the grid is not that of cloud_8.pcd", frames_of, folder)
+    expect_refusal(r"cloud_9.pcd: the grid is not that of cloud_8.pcd", frames_of, folder)
     other = SourceOptions(intrinsics={"camera": (20.0, 11.0, 3.5, 2.5)})
-    refused("the grid is not that of --intrinsics", open_source, folder, other)
+    expect_refusal("the grid is not that of --intrinsics", open_source, folder, other)
     assert open_source(folder, GIVEN).cameras == ("camera",)
 
 
@@ -170,7 +170,7 @@ def test_a_cloud_without_colour_or_with_fewer_points_than_it_says_is_refused(tmp
     }
     for words, data in cases.items():
         (tmp_path / "a.pcd").write_bytes(data)
-        refused(words, open_source, tmp_path / "a.pcd")
+        expect_refusal(words, open_source, tmp_path / "a.pcd")
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_a_cut_depth_map_is_counted_and_a_centre_that_fits_no_image_refused(tmp_
     source = open_source(folder)
     assert (len(list(source.records())), source.loss.damaged) == (2, 1)
     camera.write_text(camera.read_text().replace(" 3.5\n", " 31.5\n"))
-    refused("00000002_cam.txt: principal point (31.5, 2.5) fits no image of 8x6", open_source, folder)
+    expect_refusal("00000002_cam.txt: principal point (31.5, 2.5) fits no image of 8x6", open_source, folder)
 
 
 @pytest.mark.parametrize("tail", ["0.5 0.01", "0.5 2.5", "0.5 0.01 192", "0.5 0.01 192 2.41", ""])

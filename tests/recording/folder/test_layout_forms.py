@@ -41,7 +41,7 @@ from tests.recording.folder.make_layout import (
     matrix_text,
 )
 from tests.recording.log.make_log import frames_of
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 DOCS = Path(__file__).parents[3] / "docs"
 
@@ -94,7 +94,7 @@ def described(folder: Path, name: str) -> Path:
 def test_a_layout_is_read_by_the_description_that_its_refusal_names(tmp_path: Path, name: str) -> None:
     make, unit = DESCRIBED[name]
     folder = make(tmp_path / name)
-    refused(f"write .*{name}.toml.* as `splatctrl help input`.*--root {folder}", open_source, folder)
+    expect_refusal(f"write .*{name}.toml.* as `splatctrl help input`.*--root {folder}", open_source, folder)
     source = open_source(described(tmp_path, name), SourceOptions(root=folder))
     check(frames_of(source), unit)
     assert source.loss.without_pose == (name == "icl_nuim")  # image 0
@@ -275,7 +275,7 @@ def test_a_transforms_file_that_cannot_be_used_is_refused(
     tmp_path: Path, changed: dict[str, Any], message: str
 ) -> None:
     folder = of_transforms(tmp_path, **changed)
-    refused(message, open_source, folder)
+    expect_refusal(message, open_source, folder)
     assert message != UNIT or frames_of(folder, SourceOptions(depth_scale=1e-3))[0].depth[1, 1] > 1.0
 
 
@@ -316,7 +316,7 @@ def test_a_stamp_keeps_every_nanosecond_that_is_written_and_is_none_without_a_ti
 def test_a_pose_of_tum_that_is_none_is_named_by_its_line(tmp_path: Path, word: str) -> None:
     file = make_tum(tmp_path / "fr3_x") / "groundtruth.txt"
     file.write_text(f"{file.read_text()}1305031109.0 {word} 0 0 {word} 0 0 1\n")
-    refused("groundtruth.txt:8: expected 'stamp tx ty tz qx qy qz qw'", open_source, file.parent)
+    expect_refusal("groundtruth.txt:8: expected 'stamp tx ty tz qx qy qz qw'", open_source, file.parent)
 
 
 @pytest.mark.parametrize(
@@ -329,4 +329,4 @@ def test_a_pose_of_tum_that_is_none_is_named_by_its_line(tmp_path: Path, word: s
 def test_a_lens_of_arkit_scenes_that_is_none_is_refused(tmp_path: Path, lens: str, said: str) -> None:
     folder = make_arkit(tmp_path)
     next((folder / "41069021_frames/lowres_wide_intrinsics").iterdir()).write_text(lens)
-    refused(said, open_source, folder)
+    expect_refusal(said, open_source, folder)

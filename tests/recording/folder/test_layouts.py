@@ -34,7 +34,7 @@ from tests.recording.folder.make_layout import (
     matrix_text,
 )
 from tests.recording.log.make_log import frames_of
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 @pytest.fixture(params=[layout for layout in LAYOUTS if layout.name in EXAMPLES], ids=lambda layout: layout.name)
@@ -83,7 +83,7 @@ def test_the_camera_of_a_tum_folder_is_known_by_its_name(tmp_path: Path) -> None
     frame = frames_of(make_tum(tmp_path / "rgbd_dataset_freiburg3_x"))[0]
     assert (frame.intrinsics.fx, frame.intrinsics.cy) == (535.4, 247.6)
     assert np.array_equal(frame.color, color_of(0))  # no distortion
-    refused(
+    expect_refusal(
         r"expected calibration.txt, or a name with.*give --intrinsics camera=",
         lambda: open_source(make_tum(tmp_path / "desk")),
     )
@@ -111,7 +111,7 @@ def test_an_open3d_scene_goes_by_number_where_there_are_more_poses(tmp_path: Pat
 def test_an_open3d_scene_without_intrinsics_asks_for_them(tmp_path: Path) -> None:
     folder = make_redwood(tmp_path / "scene")
     (folder / "camera_intrinsic.json").unlink()
-    refused("no camera_intrinsic.json in it or above it; give --intrinsics", open_source, folder)
+    expect_refusal("no camera_intrinsic.json in it or above it; give --intrinsics", open_source, folder)
     check(frames_of(folder, GIVEN))
 
 
@@ -128,7 +128,7 @@ def test_seven_scenes_need_no_default_where_intrinsics_are_given_or_their_own(tm
 
 def test_a_bop_scene_without_poses_needs_a_camera_that_stands_still(tmp_path: Path) -> None:
     folder = make_bop(tmp_path, with_poses=False)
-    refused("scene_camera.json has no pose for any image.*give --camera-pose", open_source, folder)
+    expect_refusal("scene_camera.json has no pose for any image.*give --camera-pose", open_source, folder)
     still = open_source(folder, SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)}))
     assert [frame.T_world_camera[:3, 3].tolist() for frame in frames_of(still)] == [[1.0, 2.0, 3.0]] * 3
     assert "camera camera: stands still where --camera-pose puts it" in still.loss.notes[0]
@@ -140,13 +140,13 @@ def test_frames_with_a_lens_of_their_own_become_a_camera_that_a_capture_keeps_ap
     assert found == [("camera", 10.0), ("camera-1", 20.0), ("camera", 10.0)]
     write_capture(tmp_path / "out", open_source(folder))
     held = open_source(folder, SourceOptions(holdout=("0", "1")))
-    refused("camera holdout changes its intrinsics", write_capture, tmp_path / "again", held)
+    expect_refusal("camera holdout changes its intrinsics", write_capture, tmp_path / "again", held)
 
 
 def test_a_nerfstudio_frame_without_depth_is_named(tmp_path: Path) -> None:
     folder = make_nerfstudio(tmp_path)
     changed_json(folder / "transforms.json", lambda content: content["frames"][2].pop("depth_file_path"))
-    refused("frame_2.png: depth_file_path is missing (1 of 3 frames)", open_source, folder)
+    expect_refusal("frame_2.png: depth_file_path is missing (1 of 3 frames)", open_source, folder)
 
 
 def test_a_folder_of_scenes_names_them(tmp_path: Path) -> None:
@@ -154,8 +154,8 @@ def test_a_folder_of_scenes_names_them(tmp_path: Path) -> None:
     make_scannet(tmp_path / "scene0000_00")
     (tmp_path / "notes").mkdir()
     (tmp_path / "run.bag").write_bytes(b"")
-    refused("give one that is in it: kitchen (Open3D scene), run.bag, scene0000_00", open_source, tmp_path)
-    refused("of no known kind; give one that is in it: kitchen", describe, tmp_path)
+    expect_refusal("give one that is in it: kitchen (Open3D scene), run.bag, scene0000_00", open_source, tmp_path)
+    expect_refusal("of no known kind; give one that is in it: kitchen", describe, tmp_path)
 
 
 def test_files_that_are_named_but_not_there_are_counted(tmp_path: Path) -> None:
@@ -167,14 +167,14 @@ def test_files_that_are_named_but_not_there_are_counted(tmp_path: Path) -> None:
     assert "1 of 3 views lack a file" in source.loss.notes[0]
     (folder / "rgb").rename(tmp_path / "rgb")
     (folder / "rgb.txt").write_text((folder / "rgb.txt").read_text().replace("rgb/", "../rgb/"))
-    refused("is not in", open_source, folder, GIVEN)
+    expect_refusal("is not in", open_source, folder, GIVEN)
 
 
 def test_a_name_that_no_camera_has_is_refused(tmp_path: Path) -> None:
     still = SourceOptions(camera_poses={"cam0": (0, 0, 0, 0, 0, 0, 1)})
-    refused("no camera 'cam0'; use one of: camera", open_source, make_redwood(tmp_path), still)
+    expect_refusal("no camera 'cam0'; use one of: camera", open_source, make_redwood(tmp_path), still)
     bop = make_bop(tmp_path / "bop")
-    refused("--intrinsics does not apply to a BOP scene", open_source, bop, GIVEN)
+    expect_refusal("--intrinsics does not apply to a BOP scene", open_source, bop, GIVEN)
     held = frames_of(bop, SourceOptions(holdout=("1",)))
     assert [frame.camera for frame in held] == ["camera", "holdout", "camera"]
 
@@ -182,7 +182,7 @@ def test_a_name_that_no_camera_has_is_refused(tmp_path: Path) -> None:
 def test_a_tum_folder_without_its_poses_names_the_file(tmp_path: Path) -> None:
     folder = make_tum(tmp_path / "rgbd_dataset_freiburg3_x")
     (folder / "groundtruth.txt").unlink()
-    refused("groundtruth.txt: no such file.*; copy it too, or give --camera-pose", open_source, folder)
+    expect_refusal("groundtruth.txt: no such file.*; copy it too, or give --camera-pose", open_source, folder)
     assert open_source(folder, SourceOptions(camera_poses={"camera": (0, 0, 0, 0, 0, 0, 1)})).cameras == ("camera",)
 
 
@@ -207,7 +207,7 @@ def without_depth(folder: Path, kind: str) -> Path:
 def test_views_without_depth_say_so_first_and_what_works_without(tmp_path: Path, kind: str) -> None:
     folder = without_depth(tmp_path / "set", kind)
     said = "depth is missing: none of its 3 views has any; add "
-    message = refused(said, open_source, folder)
+    message = expect_refusal(said, open_source, folder)
     assert "info, score and reconstruct --points CLOUD.ply work without depth" in message
     assert describe(folder).missing[0].startswith(said)
     frames = frames_of(open_source(folder, needs_depth=False))
@@ -225,4 +225,4 @@ def test_images_alone_say_that_depth_is_missing(tmp_path: Path, places: list[str
         (tmp_path / place).write_bytes(b"x")
     what = "images of a COLMAP model" if len(places) > 1 else "images"
     for look in (open_source, describe):
-        refused(f"depth is missing: {what} alone (1); describe colour", look, tmp_path)
+        expect_refusal(f"depth is missing: {what} alone (1); describe colour", look, tmp_path)

@@ -14,7 +14,7 @@ from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import JointState, RecordSource
 from tests.recording.log.make_log import START_NS, STORE, built, encoded, write_bag, write_raw
 from tests.recording.log.make_log import header as stamped_header
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 STEP_NS = 10_000_000
 POINT = "trajectory_msgs/JointTrajectoryPoint"
@@ -123,4 +123,4 @@ def states(source: Path | RecordSource) -> list[JointState]:
 
 def refusal(path: Path, joints: tuple[str, ...] = AB, **options: Any) -> str:
     """Why there are none."""
-    return refused("", opened, path, joints, has_remedy=True, **options)
+    return expect_refusal("", opened, path, joints, has_remedy=True, **options)

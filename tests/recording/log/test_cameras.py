@@ -19,7 +19,7 @@ from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
 from tests.recording.log.make_log import LogRecipe, Message, broken_log, built, make_log, messages_of, write_raw
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 
 def log_with(topics: Mapping[str, str]) -> Survey:
@@ -184,12 +184,12 @@ def test_a_jpeg_on_a_depth_topic_is_neither_depth_nor_colour(tmp_path: Path, *, 
     path = broken_log(tmp_path / "log.mcap", _as_jpeg, LogRecipe(num_frames=6))
     messages = [m for m in messages_of(path) if has_color or "color/image" not in m.topic.name]
     write_raw(tmp_path / "log.mcap", messages)
-    refused(r"/cam0/depth/image_raw/compressed \(.*JPEG loses depth: record PNG\)", open_source, path)
+    expect_refusal(r"/cam0/depth/image_raw/compressed \(.*JPEG loses depth: record PNG\)", open_source, path)
     if has_color:
         given = CameraTopics(
             name="c", color="/cam0/color/image_raw/compressed", depth="/cam0/depth/image_raw/compressed"
         )
-        refused("expected depth images, got mono8", open_source, path, SourceOptions(camera_topics=(given,)))
+        expect_refusal("expected depth images, got mono8", open_source, path, SourceOptions(camera_topics=(given,)))
 
 
 def test_colour_and_depth_in_one_message_are_named_with_what_to_record_instead(tmp_path: Path) -> None:

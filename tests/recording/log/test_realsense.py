@@ -21,7 +21,7 @@ from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from tests.recording.log.make_log import built, by_axis, camera_info, encoded, frames_of, image, write_bag
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 
@@ -82,7 +82,7 @@ def with_unit(message: RawMessage, units: Iterator[float]) -> RawMessage:
 
 def test_depth_is_registered_by_the_extrinsics_and_counted_in_its_own_unit(tmp_path: Path) -> None:
     path = make_bag(tmp_path / "rs.bag")
-    refused("no tf for frame '0'.*give --camera-pose device_0=", open_source, path)
+    expect_refusal("no tf for frame '0'.*give --camera-pose device_0=", open_source, path)
     source = open_source(path, STILL)
     frames = frames_of(source)
     assert [int(frame.color[0, 0, 0]) for frame in frames] == [40, 41]  # colour, not the infrared beside the depth
@@ -113,7 +113,7 @@ def test_images_of_newer_bags_say_their_depth_unit_which_comes_before_the_option
 
 def test_a_depth_unit_that_changes_in_one_bag_is_refused_and_one_that_is_none_is_damage(tmp_path: Path) -> None:
     path = make_bag(tmp_path / "rs.bag", units=(UNIT, 0.001))
-    refused("the depth unit changes, from 0.0005 to 0.001 m; cut the bag there", open_source, path, STILL)
+    expect_refusal("the depth unit changes, from 0.0005 to 0.001 m; cut the bag there", open_source, path, STILL)
     assert len(frames_of(path, replace(STILL, depth_scale=UNIT))) == 2
     for unit in (float("nan"), -0.001, 7.0):
         found = survey(open_raw_log(make_bag(tmp_path / "none.bag", units=(unit, unit))))
@@ -128,7 +128,7 @@ def test_the_edges_of_a_real_recording_meet_only_this_way_round(real_data: Path)
     between = found.T_between(f"{COLOR}/image/data", f"{DEPTH}/image/data")
     assert between is not None
     assert found.depth_unit(f"{DEPTH}/image/data") == 0.001
-    refused("no colour and depth image within 20 ms.*--pairing-tolerance 0.103", open_source, path, STILL)
+    expect_refusal("no colour and depth image within 20 ms.*--pairing-tolerance 0.103", open_source, path, STILL)
     frame = frames_of(path, replace(STILL, pairing_tolerance_s=0.103))[0]
     assert (frame.depth > 0).mean() > 0.9
     inverse = invert_transform(between)

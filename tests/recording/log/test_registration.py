@@ -10,7 +10,7 @@ from pinocchio.rpy import rpyToMatrix
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.recording.log.registration import DepthToColor, Undistortion
 from splatctrl_cli.records import Intrinsics
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 SMALL = Intrinsics(fx=40, fy=40, cx=19.5, cy=14.5, width=40, height=30)
 
@@ -53,7 +53,7 @@ def test_the_nearest_of_two_surfaces_on_a_pixel_counts() -> None:
 def test_coefficients_that_no_model_has_or_that_show_hardly_anything_are_refused(
     model: str, coefficients: list[float], said: str
 ) -> None:
-    refused(said, Undistortion, SMALL, model, np.array(coefficients))
+    expect_refusal(said, Undistortion, SMALL, model, np.array(coefficients))
     image = np.random.default_rng(1).integers(0, 256, (30, 40, 3)).astype(np.uint8)
     assert np.array_equal(Undistortion(SMALL, "plumb_bob", np.zeros(5)).color(image), image), "none changes nothing"
     barrel = Undistortion(SMALL, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0]))

@@ -31,7 +31,7 @@ from tests.recording.log.make_log import (
     make_log,
     mask_pixels,
 )
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 MASKED = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
 
@@ -158,7 +158,7 @@ def test_what_is_no_log_is_refused(tmp_path: Path, name: str) -> None:
     if content is not None:
         whole = make_log(tmp_path / name, LogRecipe(chunk_size=1 << 20)).read_bytes()
         (tmp_path / name).write_bytes(whole[:content] if isinstance(content, int) else content)
-    refused(words, open_source, tmp_path / name, has_remedy=True)
+    expect_refusal(words, open_source, tmp_path / name, has_remedy=True)
 
 
 CAMERA, EYE = SourceOptions(cameras=("cam7",)), CameraTopics(name="eye", color="/nope", depth="/cam0/depth/image_raw")
@@ -203,7 +203,7 @@ def test_a_log_names_what_it_lacks(
     tmp_path: Path, recipe: LogRecipe, options: SourceOptions | None, words: str
 ) -> None:
     log = make_log(tmp_path / "log.mcap", recipe)
-    said = refused("", lambda: list(open_source(log, options).records()), has_remedy=True)
+    said = expect_refusal("", lambda: list(open_source(log, options).records()), has_remedy=True)
     assert all(part in said for part in words.split("...")), said
 
 
@@ -258,7 +258,7 @@ def test_a_lens_or_a_unit_that_a_person_gives_comes_first(tmp_path: Path) -> Non
         k = frames_of(make_log(tmp_path / "log.mcap", LogRecipe(has_info=has_info)), given)[0].intrinsics
         assert (k.fx, k.fy, k.cx, k.cy, k.width, k.height) == (31.0, 32.0, 15.0, 11.0, WIDTH, HEIGHT)
     log = make_log(tmp_path / "log.mcap", LogRecipe(depth_counts=60000))
-    refused("--depth-scale 0.0001", frames_of, log)
+    expect_refusal("--depth-scale 0.0001", frames_of, log)
     assert frames_of(log, SourceOptions(depth_scale=1e-4))[0].depth[3, 3] == pytest.approx(6.0)
 
 

@@ -6,7 +6,7 @@ import pytest
 from splatctrl_cli.recording.log.state_topics import checked_stamps
 from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, differentiated, gaps_of, smoothed_seconds
 from splatctrl_cli.records import LossReport
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 MS = 1_000_000
 
@@ -99,10 +99,10 @@ def test_a_jump_from_simulated_to_wall_time_is_mixed_clocks_and_so_are_stamps_se
     stamps, log, loss = regular(num), regular(num), LossReport()
     stamps[: num // 2] -= START_NS
     said = f"mixed clocks: stamps jump by .* at state {num // 2}"
-    refused(said, checked_stamps, stamps, log, "t", loss)
+    expect_refusal(said, checked_stamps, stamps, log, "t", loss)
     stamps = regular(num)
     stamps[3] = 0
-    refused(f"t: mixed clocks: 1 of {num} states have no stamp", checked_stamps, stamps, log, "t", loss)
+    expect_refusal(f"t: mixed clocks: 1 of {num} states have no stamp", checked_stamps, stamps, log, "t", loss)
     assert np.array_equal(checked_stamps(np.zeros(num, np.int64), log, "t", loss), log), "never set: of logging"
     assert "no state has a stamp" in loss.notes[0]
 

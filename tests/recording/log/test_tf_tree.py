@@ -27,7 +27,7 @@ from tests.recording.log.make_log import (
     transform,
     write_raw,
 )
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -182,7 +182,7 @@ def test_a_pose_without_a_frame_is_the_cameras_own_unless_a_person_says_otherwis
     path = with_poses(tmp_path, ("/pose", kind, "map", ""), static=("rig", OPTICAL))
     assert positions(path, by_topic("/pose", "rig")) == pytest.approx(RAIL + ABOVE)
     said = f"tf has frame '{OPTICAL}' in 'rig' already; leave the option out"
-    refused(said, open_source, path, by_topic("/pose"))
+    expect_refusal(said, open_source, path, by_topic("/pose"))
     free = with_poses(tmp_path, ("/pose", kind, "map", ""))
     assert positions(free, by_topic("/pose")) == pytest.approx(RAIL)
     out = tmp_path / "x.capture"
@@ -207,7 +207,7 @@ def test_an_odometry_of_the_base_is_taken_where_its_world_is_asked_for(tmp_path:
 
 def test_two_odometries_of_one_frame_are_not_chosen_between(tmp_path: Path) -> None:
     path = with_poses(tmp_path, ("/a", ODOMETRY, "odom", OPTICAL), ("/b", ODOMETRY, "odom", OPTICAL))
-    refused(f"2 odometries place frame '{OPTICAL}': /a, /b; choose one with --camera-pose", open_source, path)
+    expect_refusal(f"2 odometries place frame '{OPTICAL}': /a, /b; choose one with --camera-pose", open_source, path)
     assert any("2 odometries place frame" in lack for lack in describe(path).missing)
     assert positions(path, by_topic("/b")) == pytest.approx(RAIL)
 
@@ -220,7 +220,7 @@ def test_topics_that_cannot_place_the_camera_are_refused_with_those_that_may(tmp
         (by_topic("/odom"), f"poses frame 'base', which tf does not join to the camera's frame '{OPTICAL}'"),
         (by_topic("/pose", camera="cam9"), "no camera 'cam9'; use one of: cam0"),
     ):
-        refused(said, open_source, path, options)
+        expect_refusal(said, open_source, path, options)
 
 
 @pytest.mark.parametrize("text", ["cam0=/pose@", "=/pose", "cam0=/pose@@"])

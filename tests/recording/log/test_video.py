@@ -43,7 +43,7 @@ from tests.recording.log.make_log import (
     messages_of,
     write_raw,
 )
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 NUM, GOP = 12, 5
 
@@ -189,24 +189,24 @@ def test_images_that_lack_one_before_them_are_left_out_up_to_the_next_key_frame_
 
 def test_video_without_any_key_frame_or_of_another_codec_is_refused(tmp_path: Path) -> None:
     log = video_log(tmp_path / "video.mcap", change=lambda numbered: [n for n in numbered if n[0] % GOP])
-    refused(r"no image of the video can be decoded \(.*: 9 images of video before its", open_source, log)
+    expect_refusal(r"no image of the video can be decoded \(.*: 9 images of video before its", open_source, log)
     log = video_log(tmp_path / "video.mcap", form="vp9")
-    refused(r"colour is video \(/cam0/.*\), which is neither H.264 nor H.265; decode it", open_source, log)
+    expect_refusal(r"colour is video \(/cam0/.*\), which is neither H.264 nor H.265; decode it", open_source, log)
 
 
 def test_video_of_another_codec_is_named_with_what_to_do(tmp_path: Path) -> None:
     log = video_log(tmp_path / "video.mcap", form="vp9")
-    refused(r"colour is video \(/cam0/.*\), which is neither H.264 nor H.265; decode it", open_source, log)
+    expect_refusal(r"colour is video \(/cam0/.*\), which is neither H.264 nor H.265; decode it", open_source, log)
 
 
 def test_without_the_library_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log, mp4 = video_log(tmp_path / "video.mcap"), write_mp4(tmp_path / "color.mp4")
     monkeypatch.setattr("splatctrl_cli.recording.log.video.is_installed", lambda name: False)
     monkeypatch.setattr(cameras, "is_installed", lambda name: False)
-    refused("the library av is not installed; pip install 'splatctrl-cli[video]'", open_source, log)
+    expect_refusal("the library av is not installed; pip install 'splatctrl-cli[video]'", open_source, log)
     monkeypatch.setattr(libraries, "import_module", Mock(side_effect=ImportError("av")))
     (tmp_path / "color.csv").write_text("0.0\n")
-    refused(r"video files need the library av.*splatctrl-cli\[video\]", open_logs, [mp4], error=UsageError)
+    expect_refusal(r"video files need the library av.*splatctrl-cli\[video\]", open_logs, [mp4], error=UsageError)
 
 
 def beside(folder: Path, lines: list[str], *, b_frames: int = 0) -> Path:
@@ -253,7 +253,7 @@ def test_a_video_file_beside_a_log_is_its_colour(tmp_path: Path, lines: list[str
 
 def test_stamps_that_are_missing_or_too_few_or_unreadable_are_named(tmp_path: Path) -> None:
     video = beside(tmp_path, [str(stamp) for stamp in STAMPS[1:]])
-    refused("color.mp4: 12 images, but 11 stamps in color.csv", open_session, [tmp_path / "run.mcap", video])
+    expect_refusal("color.mp4: 12 images, but 11 stamps in color.csv", open_session, [tmp_path / "run.mcap", video])
     for lines, words in (
         (["1 2", "2 3"], "expected a stamp a line, or columns whose first line names one"),
         (["frame,image", "0,1"], "expected a stamp a line"),
@@ -261,10 +261,10 @@ def test_stamps_that_are_missing_or_too_few_or_unreadable_are_named(tmp_path: Pa
         ([], "expected a stamp a line"),
     ):
         (tmp_path / "color.csv").write_text("\n".join(lines))
-        refused(words, VideoFileLog, video)
+        expect_refusal(words, VideoFileLog, video)
     (tmp_path / "color.csv").unlink()
-    refused("color.mp4: no stamps beside it; write color.csv", VideoFileLog, video)
+    expect_refusal("color.mp4: no stamps beside it; write color.csv", VideoFileLog, video)
     (tmp_path / "other.txt").write_text("\n".join(map(str, STAMPS)))
     mkv = write_mp4(tmp_path / "other.mkv")
     mkv.write_bytes(mkv.read_bytes()[: mkv.stat().st_size // 3])
-    refused(r"other\.mkv: \d images, but 12 stamps in other\.txt", open_session, [tmp_path / "run.mcap", mkv])
+    expect_refusal(r"other\.mkv: \d images, but 12 stamps in other\.txt", open_session, [tmp_path / "run.mcap", mkv])

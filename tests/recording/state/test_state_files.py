@@ -14,7 +14,7 @@ import pytest
 from splatctrl_cli import libraries
 from splatctrl_cli.errors import UsageError
 from tests.recording.log.make_states import AB, opened, refusal, states
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 NUM = 5000  # rows, more than a block
 
@@ -132,7 +132,7 @@ def test_without_the_library_the_extra_is_named(tmp_path: Path, monkeypatch: pyt
     path = described(tmp_path, file="run.h5", joints=list(AB), time="t", position=["q"])
     monkeypatch.setattr(libraries, "import_module", Mock(side_effect=ImportError("No module named 'h5py'")))
     said = r"HDF5 files need the library h5py.*pip install 'splatctrl-cli\[tables\]'"
-    refused(said, opened, path, error=UsageError)
+    expect_refusal(said, opened, path, error=UsageError)
 
 
 def lerobot(folder: Path, version: int, *, num_episodes: int = 3, names: Any = None) -> Path:

@@ -24,7 +24,7 @@ from tests.recording.log.make_states import (
     write_bag2,
     write_mcap,
 )
-from tests.refused import refused
+from tests.refused import expect_refusal
 
 ARM = tuple(f"panda_joint{i}" for i in range(1, 8))
 
@@ -88,7 +88,7 @@ def test_a_csv_of_no_known_kind_asks_for_a_description_and_a_cut_line_is_named(t
     path.write_text("time,success_rate,q[0]\n")
     assert "expected joint states, got none" in refusal(path)
     path.write_text("t,j1\n0,1\n")
-    refused("expected libfranka's columns.*describe the columns in a .toml", opened, path)
+    expect_refusal("expected libfranka's columns.*describe the columns in a .toml", opened, path)
 
 
 DESCRIPTION: dict[str, Any] = {
@@ -226,10 +226,10 @@ def of_log(store: Any = STORE) -> list[Message]:
 
 def test_what_is_no_topic_of_twists_is_said(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "log.mcap", [*of_log(), *states_of(np.zeros((1, 2)), ("a", "b"))])
-    refused(r"got sensor_msgs/msg/JointState; topics with twists: /cmd", read_twists, path, "/joint_states")
-    refused("got no message", read_twists, path, "/else")
+    expect_refusal(r"got sensor_msgs/msg/JointState; topics with twists: /cmd", read_twists, path, "/joint_states")
+    expect_refusal("got no message", read_twists, path, "/else")
     mixed = write_mcap(tmp_path / "mixed.mcap", [*of_log(), stamped(VALUES[0], START_NS + 60, "tool")])
-    refused("in one frame, got base, tool", read_twists, mixed, "/cmd")
+    expect_refusal("in one frame, got base, tool", read_twists, mixed, "/cmd")
 
 
 def test_a_table_beside_that_of_the_states_holds_twists(tmp_path: Path) -> None:
@@ -244,4 +244,4 @@ def test_a_table_beside_that_of_the_states_holds_twists(tmp_path: Path) -> None:
     assert len(states(opened(path, ("a",)))) == 2
     for rest, said in ((twists + 'angular = ["wx"]\n', "angular of 3 columns"), ("", "expected a table [twists]")):
         path.write_text(table + rest)
-        refused(said, read_twists, path, "twists")
+        expect_refusal(said, read_twists, path, "twists")
