@@ -106,6 +106,7 @@ STEADY_MOVED = 1.5  # of the sensor's error, by which the pixels about it may, o
 MASK_PLANES = 2, 3  # times the width of the robot's outline: half the sides of the squares that planes are fitted in
 MASK_UNSURE = 0.25  # largest variance of such a plane at a pixel, relative to that of one pixel's depth
 MASK_STEP = 0.02  # [m] between neighbouring pixels of one surface at most
+MASK_STEEP = 3.7  # depth over width of the steepest surface whose depth counts: 75 degrees
 MASK_SURE = 4.0  # of the sensor's error, beyond which a piece before the robot is none of it
 CONTRADICTED = 0.1  # [m] behind what another camera measures on its ray, depth is of no surface there
 CONTRADICTING_COLUMNS = 128  # of blocks of pixels in an image, which are held against the other cameras

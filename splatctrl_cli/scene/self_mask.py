@@ -20,6 +20,7 @@ from splatctrl_cli.config.fixed import (
     MASK_PIXELS,
     MASK_SIGMAS,
     MASK_SPECK,
+    MASK_STEEP,
     MASK_STEP,
     MASK_SURE,
     VOTE_SHARE,
@@ -132,9 +133,15 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
         is_explained[v, u] = gap <= tolerance[v, u]
         is_sure[v, u] &= gap > sure
     kinds[is_explained] = PixelKind.ROBOT
+    is_object = kinds == PixelKind.OBJECT
+    kinds[beside & _is_mixed(depth, is_object, tolerance, edge // 2, frame.intrinsics.fx)] = PixelKind.MIXED
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0).astype(np.float64)
     is_object, is_edge = kinds == PixelKind.OBJECT, np.isfinite(nearest_at_edge)
-    _judge(kinds, depth, beside, area, surface_steps(is_object, depth, is_edge, edge, tolerance, config.depth_error))
+    steps = surface_steps(is_object, depth, is_edge, edge, tolerance, config.depth_error)
+    fixed = [number for number, name in enumerate(surface.links) if name in surface.fixed]
+    foot = (is_robot & np.isin(link, fixed)).view(np.uint8)
+    steps[(foot > 0) & (cv2.erode(foot, _window(1)) == 0)] = 0.0  # else a table would run on into the foot
+    _judge(kinds, depth, beside, area, steps)
     offset = depth - rendered
     is_told = is_core & has_depth & (np.abs(offset) <= MASK_FAR_OFF)
     is_told &= link < len(surface.links) - surface.num_carried
@@ -148,6 +155,16 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
             name: len(found) for name, found in _by_link(inside[is_inside], inside[is_inside], surface.links).items()
         },
     )
+
+
+def _is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, fx: float) -> Bool:
+    """True for object pixels (H, W) between a nearer object and a farther surface, both within `reach` pixels.
+
+    A time-of-flight camera mixes their depths. The object is nearer than a surface tilted by `MASK_STEEP` would be.
+    """
+    apart = np.maximum(np.float32(MASK_STEP), np.float32(MASK_STEEP * reach / fx) * depth)
+    is_behind = depth - nearest_within(depth, is_object, reach) > apart
+    return np.asarray(is_object & is_behind & (farthest_within(depth, reach) - depth > tolerance))
 
 
 def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Float32) -> None:

@@ -177,6 +177,39 @@ def test_pixels_on_the_outline_that_lead_from_the_robot_down_to_the_floor_are_no
     assert (found == PixelKind.MIXED).sum() == (2 if lift else 0)
 
 
+def before_a_box(fixed: tuple[str, ...] = ()) -> tuple[Float64, RobotPosture]:
+    """Depth (H, W) of a floor and a robot's box before it: 0.8 m in rows 160 to 320, columns 240 to 400."""
+    box = trimesh.creation.box((0.2, 0.2, 0.2)).triangles + CENTER
+    depth = np.full((WIDE.height, WIDE.width), FLOOR)
+    depth[160:320, 240:400] = 0.8
+    return depth, replace(robot(), surface=RobotSurface.from_parts([], [("arm", box)], fixed=fixed))
+
+
+def test_depths_between_an_object_and_the_robot_behind_it_belong_to_neither() -> None:
+    """Two rows of pixels that a laser mixes, above a block 60 mm before the robot; a slope is a surface."""
+    mixed, posture = before_a_box()
+    slope, block = mixed.copy(), np.s_[240:300, 290:350]
+    mixed[block] = 0.74
+    mixed[238:240, 290:350] = np.random.default_rng(0).uniform(0.765, 0.785, (2, 60))
+    found = masked(mixed, posture, WIDE).kinds
+    assert (found[238:240, 290:350] == PixelKind.MIXED).all() and (found[block] == PixelKind.OBJECT).all()
+    slope[block] = np.linspace(0.785, 0.74, 60)[:, None]
+    assert (masked(slope, posture, WIDE).kinds[block] == PixelKind.OBJECT).all()
+
+
+@pytest.mark.parametrize(("depth", "fixed", "kind"), [
+    (0.788, ("arm",), PixelKind.MIXED), (0.788, (), PixelKind.OBJECT), (0.7, ("arm",), PixelKind.OBJECT),
+])  # fmt: skip
+def test_a_table_ends_at_the_outline_of_a_fixed_link_that_stands_on_it(
+    depth: float, fixed: tuple[str, ...], kind: PixelKind
+) -> None:
+    """Noise lifts the table and the foot: what is before the foot is an object of its own, or none."""
+    lifted, posture = before_a_box(fixed)
+    lifted[310:400, 280:360] = depth
+    found = masked(lifted, posture, WIDE).kinds
+    assert (found[311:319, 282:358] == kind).all() and (found[320:400, 280:360] == PixelKind.OBJECT).all()
+
+
 @pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
 def test_less_than_fifty_square_millimetres_before_the_robot_are_noise(columns: int, kind: PixelKind) -> None:
     """Beside the robot it may be all that is seen of a thing."""
