@@ -34,7 +34,7 @@ class Unseen(IntEnum):
     SWEPT = 0xFFF0  # the robot's body was in it
     OUT_OF_VIEW = 0xFFF1
     HIDDEN_BY_ARM = 0xFFF2
-    HIDDEN_BY_THING = 0xFFF3
+    HIDDEN_BY_THING = 0xFFF3  # also where an object arrived since the last view
     NO_RETURN = 0xFFF4  # a camera has no depth there now
     CONTRADICTED = 0xFFFE  # a ray passed it, through a surface that another camera measured
     UNANSWERED = 0xFFFF  # no return, though the ray meets a surface or depth surrounds it

@@ -1,5 +1,6 @@
 """The occupancy grid of III-C: space seen free, occupied, or never."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.config.fixed import HIDDEN
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
@@ -37,6 +39,7 @@ class OccupancyMap:
         self.step_stamps_ns: list[int] = []  # of the time steps that `last_seen` counts, from 1
         self.edges: dict[str, LostEdges] = {}  # of the newest image of each camera
         self._hits: NDArray[np.uint8] = np.zeros(shape, np.uint8)
+        self._was_free: Bool = np.zeros(shape, bool)  # before this time step
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
     def take_in(self, frames: Sequence[RgbdFrame]) -> None:
@@ -46,6 +49,7 @@ class OccupancyMap:
         clear the human bit, too. Occluded people stay.
         """
         self._begin_step(frames)
+        self._was_free = self.log_odds < 0
         masked = [(frame, frame.human) for frame in frames if frame.human is not None]
         entity, log_odds = self.entity.reshape(-1), self.log_odds.reshape(-1)
         known = np.flatnonzero(entity & (Label.HUMAN | SOLID))
@@ -139,6 +143,20 @@ class OccupancyMap:
         self.entity[self.entity & SOLID > 0] &= np.uint8(~Label.ROBOT & 0xFF)
         is_new = (self.entity & (SWEPT | SOLID) == SWEPT | SOLID) & ~was_solid
         self.log_odds[is_new] = np.minimum(self.log_odds[is_new], self.config.log_odds_hit)
+        arrived = np.argwhere(self._was_free & (self.entity & SOLID > 0))
+        self._hide_beside(arrived, math.ceil(len(self.edges) / max(len(seen), 1)))
+
+    def _hide_beside(self, arrived: NDArray[np.intp], num_steps: int) -> None:
+        """Forget views of the space within `HIDDEN` of voxels (K, 3), unless of the last `num_steps` time steps.
+
+        An object arrived in these, and its unseen side may fill that space. Every camera took part in so many steps.
+        """
+        reach = math.ceil(HIDDEN / self.config.voxel)
+        around = (arrived[:, None] + np.argwhere(np.ones(3 * [2 * reach + 1])) - reach).reshape(-1, 3)
+        i, j, k = around[np.all((around >= 0) & (around < self.last_seen.shape), axis=1)].T
+        last = self.last_seen[i, j, k]
+        is_old = (last > 0) & (last <= len(self.step_stamps_ns) - num_steps)
+        self.last_seen[i[is_old], j[is_old], k[is_old]] = Unseen.HIDDEN_BY_THING
 
     def forget_hidden(self, centers: Float64, radii: Float64, distance: Callable[[Float32], Float64]) -> None:
         """Clear solid voxels within the robot that connect to none outside.

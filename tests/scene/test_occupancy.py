@@ -11,12 +11,13 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, transform_points
 from splatctrl_cli.records import Box, Float64, Intrinsics, Label, RgbdFrame
 from splatctrl_cli.scene.occupancy import MAX_STEPS, OccupancyMap
-from splatctrl_cli.voxels import SWEPT
+from splatctrl_cli.voxels import NO_EDGES, SWEPT, Balls, EvidenceClass
 from tests.plain import plain_frame
 from tests.reference.occupancy import ray_walk
 from tests.scene.wall import WORKSPACE, frame
 
 CONFIG = OccupancyConfig(voxel=0.05)
+NO_BALLS = Balls.of_voxels(np.zeros((0, 3), np.float32), 0.05, np.zeros(0, np.uint8))
 AROUND = Box(lower=np.array([-0.63, -0.61, -0.17]), upper=np.array([0.98, 0.94, 1.02]))  # the tilted camera is in it
 
 
@@ -161,6 +162,39 @@ def test_robot_bits_are_where_a_sphere_is_and_swept_bits_where_one_was() -> None
         grid.mark_robot(np.array([[x, 0.0, 0.3]]), np.array([0.1]))
     points = np.float32([[0.0, 0.0, 0.3], [0.09, 0.0, 0.3], [0.3, 0.0, 0.3], [5.0, 0.0, 0.0]])
     assert (grid.entity_at(points) == [Label.ROBOT | SWEPT, Label.ROBOT | SWEPT, SWEPT, 0]).all()
+
+
+def look(grid: OccupancyMap, view: RgbdFrame, cameras: str) -> None:
+    """Take in an image of one of `cameras`, with a robot far away."""
+    grid.keep_edges(dict.fromkeys(cameras, NO_EDGES))
+    grid.take_in([view])
+    nothing = np.zeros(view.depth.shape, bool)
+    grid.label_robot(np.array([[0.4, 0.3, 0.55]]), np.array([0.01]), [(view, nothing, ~nothing)])
+
+
+@pytest.mark.parametrize(("cameras", "cls"), [("A", EvidenceClass.HIDDEN_BY_THING), ("AB", EvidenceClass.FREE)])
+def test_behind_an_object_that_arrived_no_earlier_view_counts(cameras: str, cls: int) -> None:
+    """But those of cameras that expose in turn since the last round; and 25 cm behind it all of them."""
+    grid = OccupancyMap(WORKSPACE, CONFIG, 1)
+    behind = np.array([[0.0, 0.0, 0.27], [0.0, 0.0, 0.05], [0.2, 0.0, 0.3]])  # the last stays in view
+    look(grid, frame(1), cameras)
+    look(grid, frame(2, block=0.3), cameras)
+    assert grid.known(NO_BALLS).seen.look(behind)[1].tolist() == [cls, EvidenceClass.FREE, EvidenceClass.FREE]
+    look(grid, frame(3), cameras)
+    stamps, classes = grid.known(NO_BALLS).seen.look(behind)
+    assert stamps.tolist() == 3 * [3] and (classes == EvidenceClass.FREE).all()
+
+
+def test_behind_an_object_that_stands_still_earlier_views_count() -> None:
+    """As where the robot hides the space beside a table."""
+    grid = OccupancyMap(WORKSPACE, CONFIG, 1)
+    for stamp in range(1, 9):
+        look(grid, frame(stamp, block=0.3), "A")
+    under = grid.last_seen[8:10, 6:8, 6]
+    assert not under.any()
+    under[:] = 5  # by another camera
+    look(grid, frame(9, block=0.3), "A")
+    assert (under == 5).all()
 
 
 def test_a_workspace_too_large_for_its_voxels_is_refused() -> None:
