@@ -13,7 +13,7 @@ from splatctrl_cli.checks.check_times import TimesWatch
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
-from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.recording.container.raw_log import Damage, JoinedLog, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -36,16 +36,16 @@ _HEADED = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, "sensor_msgs/msg/JointState", "
 _FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
 
 
-class LogWatch:
+class LogWatch(JoinedLog):
     """A log that observes messages read by another, decoding images as needed.
 
     num_images: reading ends at this many of a topic. spans: first and last log time [ns] by file.
     """
 
     def __init__(self, log: RawLog, options: SourceOptions, num_images: int | None = None) -> None:
-        self._log, self._scale, self._num_images = log, options.depth_scale, num_images
+        super().__init__(log.path, (log,), log.container)
+        self._scale, self._num_images = options.depth_scale, num_images
         self._by_log_time = options.stamps == "log"
-        self.path, self.files, self.container = log.path, log.files, log.container
         self.times: dict[str, TimesWatch] = {}
         self.transforms: dict[str, TimesWatch] = {}
         self.images: dict[str, ImageWatch] = {}
@@ -61,13 +61,9 @@ class LogWatch:
         """The first log time or stamp."""
         return min((t.first_ns for t in self.times.values() if t.first_ns), default=None)
 
-    def topics(self) -> tuple[Topic, ...]:
-        """The log's topics."""
-        return self._log.topics()
-
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """The log's messages, each observed."""
-        for message in self._log.messages(damage, names):
+        for message in super().messages(damage, names):
             self._take(message)
             yield message
             images = self.images.get(message.topic.name)

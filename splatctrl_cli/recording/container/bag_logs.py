@@ -24,7 +24,7 @@ from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import standing_in
 from splatctrl_cli.recording.container.mcap_log import ros_type_name
-from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.records import SECOND_NS
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
@@ -46,145 +46,7 @@ class BagRecord(NamedTuple):
     is_cut: bool = False
 
 
-class BagFile:
-    """A reader of one file's records."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.size = path.stat().st_size
-
-    def records(self, damage: Damage) -> Iterator[BagRecord]:
-        """Yield all records in order; only chunks, connections and messages have bodies. Losses go to `damage`."""
-        with self.path.open("rb") as stream:
-            if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
-                damage.add(f"{self.path.name}: is not a bag of format 2.0")
-                return
-            while stream.tell() < self.size:
-                offset = stream.tell()
-                record = self._record(stream, offset)
-                if record is not None and not record.is_cut:
-                    yield record
-                    continue
-                place = self._next_chunk(stream, offset)
-                if place is None:
-                    damage.add(f"{self.path.name}: cut or damaged after byte {offset}")
-                    if record is not None:
-                        yield record
-                    return
-                damage.add(f"{self.path.name}: bytes {offset} to {place} are damaged and were left out")
-                stream.seek(place)
-
-    def connections(self) -> list[BagRecord]:
-        """The index's connections, if any."""
-        with self.path.open("rb") as stream:
-            stream.readline(64)
-            first = self._record(stream, stream.tell())
-            place = number(first.fields, "index_pos") if first is not None and first.kind == BAG_HEADER else 0
-            if not 0 < place < self.size:
-                return []
-            stream.seek(place)
-            found = []
-            while (record := self._record(stream, stream.tell())) is not None and record.kind == CONNECTION:
-                found.append(record)
-            return found
-
-    def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
-        """Read a record or None; the stream is left after it."""
-        head = self._head(stream)
-        if head is None:
-            return None
-        kind, fields, length = head
-        end = stream.tell() + length
-        is_cut = end > self.size
-        is_read = kind in {MESSAGE, CHUNK, CONNECTION} or is_cut
-        body = stream.read(min(length, MAX_BLOCK)) if is_read else b""
-        stream.seek(min(end, self.size))
-        return BagRecord(offset, kind, fields, body, is_cut)
-
-    def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
-        """Kind, fields and body length; the stream is left at the body."""
-        length = self._length(stream)
-        if length is None or length > min(1 << 20, self.size - stream.tell()):  # those of connections hold a name
-            return None
-        fields = fields_of(stream.read(length))
-        kind = fields["op"][0] if fields is not None and len(fields.get("op", b"")) == 1 else 0
-        length = self._length(stream)
-        return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
-
-    def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
-        """Find the next whole chunk after `offset` by its header."""
-        stream.seek(offset + 1)
-        kept = b""
-        while block := stream.read(PIECE):
-            here = stream.tell()
-            base, block = here - len(block) - len(kept), kept + block
-            at = block.find(_MARK)
-            while at >= 0:
-                for back in _MARK_OFFSETS:
-                    place = base + at - back
-                    if place > offset and self._is_chunk(stream, place):
-                        return place
-                at = block.find(_MARK, at + 1)
-            stream.seek(here)
-            kept = block[-(len(_MARK) - 1) :]
-        return None
-
-    def _is_chunk(self, stream: BinaryIO, place: int) -> bool:
-        stream.seek(place)
-        head = self._head(stream)
-        return head is not None and head[0] == CHUNK and stream.tell() + head[2] <= self.size
-
-    @staticmethod
-    def _length(stream: BinaryIO) -> int | None:
-        content = stream.read(4)
-        return int(_U32.unpack(content)[0]) if len(content) == 4 else None
-
-
-def fields_of(header: bytes) -> Fields | None:
-    """A header's named fields; None if its lengths do not fit."""
-    found: Fields = {}
-    at = 0
-    while at < len(header):
-        if at + 4 > len(header):
-            return None
-        length = _U32.unpack_from(header, at)[0]
-        at += 4 + length
-        name, equals, value = header[at - length : at].partition(b"=")
-        if at > len(header) or not equals:
-            return None
-        found[name.decode("latin-1")] = value
-    return found
-
-
-def number(fields: Fields, name: str) -> int:
-    """A field of 4 or 8 bytes as a number; -1 if missing."""
-    value = fields.get(name, b"")
-    return int.from_bytes(value, "little") if len(value) in {4, 8} else -1
-
-
-def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
-    """Yield kind, fields and body of an unpacked chunk's records.
-
-    Raises ValueError at bytes that are not a record.
-    """
-    at = 0
-    while at < len(content):
-        if at + 4 > len(content):
-            raise ValueError(f"{len(content) - at} bytes are not a record")
-        start = at + 4
-        end = start + _U32.unpack_from(content, at)[0]
-        fields = fields_of(content[start:end]) if end + 4 <= len(content) else None
-        if fields is None:
-            raise ValueError(f"{len(content) - at} bytes are not a record")
-        body = end + 4
-        at = body + _U32.unpack_from(content, end)[0]
-        kind = fields.get("op", b"")
-        if at > len(content) or len(kind) != 1:
-            raise ValueError(f"{len(content) - body} bytes are not a record")
-        yield kind[0], fields, content[body:at]
-
-
-class Bag1Log:
+class Bag1Log(RawLog):
     """One ROS 1 bag; its index is not needed. Raises InputError without any record.
 
     rosbags (rosbags/rosbag1/reader.py) refuses a bag without index, and ends at the first damaged chunk.
@@ -195,20 +57,17 @@ class Bag1Log:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files = (path,)
-        self._file = BagFile(path)
+        self._size = path.stat().st_size
         self._topics: dict[int, Topic] = {}
-        if next(self._file.records(Damage()), None) is None:
+        if next(self.records(Damage()), None) is None:
             raise InputError(f"{path}: not a readable ROS 1 bag: no whole record", remedy="record or copy it again")
-        for record in self._file.connections():
+        for record in self._connections():
             self._connect(record.fields, record.body, Damage())
-
-    def topics(self) -> tuple[Topic, ...]:
-        return tuple(self._topics.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield in file order; skips bad chunks, reads a cut one to its cut."""
-        budget, num_indexed, num_chunks = Budget(self._file.size), 0, None
-        for record in self._file.records(damage):
+        budget, num_indexed, num_chunks = Budget(self._size), 0, None
+        for record in self.records(damage):
             if record.kind == BAG_HEADER:
                 num_chunks = number(record.fields, "chunk_count")
                 if number(record.fields, "index_pos") <= 0:
@@ -264,13 +123,139 @@ class Bag1Log:
         )
         self._topics[number(fields, "conn")] = standing_in(topic)
 
+    def records(self, damage: Damage) -> Iterator[BagRecord]:
+        """Yield all records in order; only chunks, connections and messages have bodies. Losses go to `damage`."""
+        with self.path.open("rb") as stream:
+            if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
+                damage.add(f"{self.path.name}: is not a bag of format 2.0")
+                return
+            while stream.tell() < self._size:
+                offset = stream.tell()
+                record = self._record(stream, offset)
+                if record is not None and not record.is_cut:
+                    yield record
+                    continue
+                place = self._next_chunk(stream, offset)
+                if place is None:
+                    damage.add(f"{self.path.name}: cut or damaged after byte {offset}")
+                    if record is not None:
+                        yield record
+                    return
+                damage.add(f"{self.path.name}: bytes {offset} to {place} are damaged and were left out")
+                stream.seek(place)
+
+    def _connections(self) -> list[BagRecord]:
+        """The index's connections, if any."""
+        with self.path.open("rb") as stream:
+            stream.readline(64)
+            first = self._record(stream, stream.tell())
+            place = number(first.fields, "index_pos") if first is not None and first.kind == BAG_HEADER else 0
+            if not 0 < place < self._size:
+                return []
+            stream.seek(place)
+            found = []
+            while (record := self._record(stream, stream.tell())) is not None and record.kind == CONNECTION:
+                found.append(record)
+            return found
+
+    def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
+        """Read a record or None; the stream is left after it."""
+        head = self._head(stream)
+        if head is None:
+            return None
+        kind, fields, length = head
+        end = stream.tell() + length
+        is_cut = end > self._size
+        is_read = kind in {MESSAGE, CHUNK, CONNECTION} or is_cut
+        body = stream.read(min(length, MAX_BLOCK)) if is_read else b""
+        stream.seek(min(end, self._size))
+        return BagRecord(offset, kind, fields, body, is_cut)
+
+    def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
+        """Kind, fields and body length; the stream is left at the body."""
+        length = self._length(stream)
+        if length is None or length > min(1 << 20, self._size - stream.tell()):  # those of connections hold a name
+            return None
+        fields = fields_of(stream.read(length))
+        kind = fields["op"][0] if fields is not None and len(fields.get("op", b"")) == 1 else 0
+        length = self._length(stream)
+        return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
+
+    def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
+        """Find the next whole chunk after `offset` by its header."""
+        stream.seek(offset + 1)
+        kept = b""
+        while block := stream.read(PIECE):
+            here = stream.tell()
+            base, block = here - len(block) - len(kept), kept + block
+            at = block.find(_MARK)
+            while at >= 0:
+                for back in _MARK_OFFSETS:
+                    place = base + at - back
+                    if place > offset and self._is_chunk(stream, place):
+                        return place
+                at = block.find(_MARK, at + 1)
+            stream.seek(here)
+            kept = block[-(len(_MARK) - 1) :]
+        return None
+
+    def _is_chunk(self, stream: BinaryIO, place: int) -> bool:
+        stream.seek(place)
+        head = self._head(stream)
+        return head is not None and head[0] == CHUNK and stream.tell() + head[2] <= self._size
+
+    @staticmethod
+    def _length(stream: BinaryIO) -> int | None:
+        content = stream.read(4)
+        return int(_U32.unpack(content)[0]) if len(content) == 4 else None
+
+
+def fields_of(header: bytes) -> Fields | None:
+    """A header's named fields; None if its lengths do not fit."""
+    found: Fields = {}
+    at = 0
+    while at < len(header):
+        length = int.from_bytes(header[at : at + 4], "little")
+        at += 4 + length
+        name, equals, value = header[at - length : at].partition(b"=")
+        if at > len(header) or not equals:
+            return None
+        found[name.decode("latin-1")] = value
+    return found
+
+
+def number(fields: Fields, name: str) -> int:
+    """A field of 4 or 8 bytes as a number; -1 if missing."""
+    value = fields.get(name, b"")
+    return int.from_bytes(value, "little") if len(value) in {4, 8} else -1
+
+
+def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
+    """Yield kind, fields and body of an unpacked chunk's records.
+
+    Raises ValueError at bytes that are not a record.
+    """
+    at = 0
+    while at < len(content):
+        start = at + 4
+        end = start + int.from_bytes(content[at:start], "little")
+        fields = fields_of(content[start:end]) if end + 4 <= len(content) else None
+        if fields is None:
+            raise ValueError(f"{len(content) - at} bytes are not a record")
+        body = end + 4
+        at = body + _U32.unpack_from(content, end)[0]
+        kind = fields.get("op", b"")
+        if at > len(content) or len(kind) != 1:
+            raise ValueError(f"{len(content) - body} bytes are not a record")
+        yield kind[0], fields, content[body:at]
+
 
 _WIDEST_HOLE = 1 << 40
 _WAL = b"\2\2"  # format versions of a database that keeps what is new in a journal, "-wal"
 _PAGE_SIZE, _FILE_FORMAT = slice(16, 18), slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
 
 
-class Db3Log:
+class Db3Log(RawLog):
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
     SQLite writes while it reads a journal, so both are copied. It reads missing bytes of the last page as zeros,
@@ -325,9 +310,6 @@ class Db3Log:
                 self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]
         except sqlite3.Error:
             self._copy(size)
-
-    def topics(self) -> tuple[Topic, ...]:
-        return tuple(self._topics.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield in written order; rows on damaged pages are skipped and counted."""

@@ -26,26 +26,28 @@ from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.container.raw_log import Topic
 
 
-class MessageTypes:
-    """A FileDescriptorSet's types. Raises ValueError for other bytes."""
+@lru_cache(maxsize=16)
+def _pool(descriptor_set: bytes) -> Any:
+    files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
+    try:
+        for file in FileDescriptorSet.FromString(descriptor_set).file:
+            files.Add(file)
+    except (DecodeError, DescriptorDatabaseConflictingDefinitionError) as error:
+        raise ValueError(f"protobuf: the schema is not usable: {error}") from None
+    return DescriptorPool(files)
 
-    def __init__(self, descriptor_set: bytes) -> None:
-        files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
-        try:
-            for file in FileDescriptorSet.FromString(descriptor_set).file:
-                files.Add(file)
-        except (DecodeError, DescriptorDatabaseConflictingDefinitionError) as error:
-            raise ValueError(f"protobuf: the schema is not usable: {error}") from None
-        self._pool = DescriptorPool(files)
 
-    def read(self, type_name: str, data: bytes) -> Any:
-        """Decode a message; unwritten fields have defaults. Raises ValueError if it does not decode."""
-        try:
-            return GetMessageClass(self._pool.FindMessageTypeByName(type_name)).FromString(data)
-        except KeyError:
-            raise ValueError(f"the schema does not define {type_name}") from None
-        except (DecodeError, TypeError) as error:
-            raise ValueError(f"protobuf: {error}") from None
+def read_protobuf(descriptor_set: bytes, type_name: str, data: bytes) -> Any:
+    """Decode a message by a FileDescriptorSet; unwritten fields have defaults.
+
+    Raises ValueError for another set, and if the message does not decode.
+    """
+    try:
+        return GetMessageClass(_pool(descriptor_set).FindMessageTypeByName(type_name)).FromString(data)
+    except KeyError:
+        raise ValueError(f"the schema does not define {type_name}") from None
+    except (DecodeError, TypeError) as error:
+        raise ValueError(f"protobuf: {error}") from None
 
 
 _STANDS_FOR = {
@@ -102,17 +104,12 @@ def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> A
     """
     if encoding == "json":
         return as_ros(schema, _object(json.loads(data)))
-    return as_ros(schema, _types(definition).read(schema, data))
+    return as_ros(schema, read_protobuf(definition.encode("latin-1"), schema, data))
 
 
 def as_ros(schema: str, message: Any) -> Any:
     """Convert a Foxglove message to its ROS message."""
     return _READERS[schema.replace("/", ".").rpartition(".")[2]](message)
-
-
-@lru_cache(maxsize=16)
-def _types(definition: str) -> MessageTypes:
-    return MessageTypes(definition.encode("latin-1"))
 
 
 def _object(value: Any) -> Any:

@@ -47,12 +47,7 @@ class FoxgloveLog:
         self._writer = writer
         self._register = register
         self._channels: dict[str, int] = {}
-        self._counts: dict[str, int] = {}
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """Messages by topic."""
-        return self._counts
+        self.counts: dict[str, int] = {}  # messages by topic
 
     def add_cloud(self, topic: str, stamp_ns: int, columns: Mapping[str, NDArray[Any]]) -> None:
         """Add a PointCloud of columns (N,) by name, float32 or uint8, among them x, y, z [m]."""
@@ -136,8 +131,8 @@ class FoxgloveLog:
         self._write(topic, stamp_ns, message.SerializeToString(deterministic=True))
 
     def _write(self, topic: str, stamp_ns: int, data: bytes) -> None:
-        sequence = self._counts.get(topic, 0)
-        self._counts[topic] = sequence + 1
+        sequence = self.counts.get(topic, 0)
+        self.counts[topic] = sequence + 1
         self._writer.add_message(
             self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, sequence=sequence, data=data
         )

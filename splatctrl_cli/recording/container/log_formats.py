@@ -58,9 +58,6 @@ def unpack(path: Path, target: Path) -> str:
 class UnpackedMessagesLog(JoinedLog):
     """A log of zstd messages."""
 
-    def __init__(self, log: RawLog) -> None:
-        super().__init__(log.path, (log,), log.container)
-
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield unpacked messages; failures are counted."""
         budget = Budget(sum(file.stat().st_size for file in self.files))
@@ -145,7 +142,7 @@ def open_raw_log(path: Path) -> RawLog:
         log = kind.open(path)
         first = () if isinstance(log, Bag1Log) else islice(log.messages(Damage()), 5)  # some may be damaged
         is_packed = any(m.topic.encoding == "cdr" and m.data.startswith(_ZSTD) for m in first)  # CDR begins with a 0
-        return UnpackedMessagesLog(log) if is_packed else log
+        return UnpackedMessagesLog(path, (log,), log.container) if is_packed else log
     if magic.startswith(_ZSTD):
         return _open_compressed(path)
     if path.suffix in SUFFIXES:

@@ -7,6 +7,7 @@ import bisect
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -22,7 +23,6 @@ from splatctrl_cli.recording.container.mcap_records import (
     MAGIC,
     BadRecordError,
     ChunkIndex,
-    DataEnd,
     Footer,
     parse_record,
 )
@@ -79,14 +79,10 @@ class McapFile:
 
     def chunk_indexes(self) -> list[ChunkIndex]:
         """The summary's chunks in file order."""
-        found = []
+        found: list[ChunkIndex] = []
         for part in self.summary():
-            try:
-                record = parse_record(part.opcode, part.content) if part.opcode == CHUNK_INDEX else None
-            except BadRecordError:
-                continue
-            if isinstance(record, ChunkIndex):
-                found.append(record)
+            with suppress(BadRecordError):
+                found += [parse_record(CHUNK_INDEX, part.content)] if part.opcode == CHUNK_INDEX else []
         return sorted(found, key=lambda index: index.chunk_start_offset)
 
     def chunk_at(self, index: ChunkIndex) -> bytes:
@@ -199,13 +195,10 @@ class _Walk:
     def _check_data(self, opcode: int, length: int) -> None:
         if opcode != DATA_END or length > PIECE:
             return
-        here = self._stream.tell()
-        try:
-            record = parse_record(opcode, self._stream.read(length))
-        except BadRecordError:
-            record = None
+        here, expected = self._stream.tell(), 0
+        with suppress(BadRecordError):
+            expected = parse_record(DATA_END, self._stream.read(length)).data_section_crc
         self._stream.seek(here)
-        expected = record.data_section_crc if isinstance(record, DataEnd) else 0
         if expected and self._crc is not None and self._crc != expected:
             self._add("checksum of the data section differs")
         self._crc = None
@@ -231,8 +224,6 @@ class _Walk:
         try:
             footer = parse_record(FOOTER, part.content)
         except BadRecordError:
-            footer = None
-        if not isinstance(footer, Footer):
             self._add("its footer is damaged")
             return
         after = self._stream.tell()
@@ -277,9 +268,7 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
     opcode, length = HEAD.unpack_from(content)
     if opcode != FOOTER or length != 20 or not content.endswith(MAGIC):
         return None
-    footer = parse_record(FOOTER, content[HEAD.size : _FOOTER_SIZE])
-    assert isinstance(footer, Footer)
-    return footer
+    return parse_record(FOOTER, content[HEAD.size : _FOOTER_SIZE])
 
 
 def _attachment_length(head: bytes) -> int | None:

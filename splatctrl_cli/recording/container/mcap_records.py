@@ -68,7 +68,7 @@ _KINDS: dict[int, Any] = {  # by opcode
 }
 
 
-def parse_record(opcode: int, content: bytes) -> object:
+def parse_record(opcode: int, content: bytes) -> Any:
     """A record, None if not in `_KINDS`. Raises BadRecordError."""
     if opcode not in _KINDS:
         return None

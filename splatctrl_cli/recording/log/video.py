@@ -57,7 +57,7 @@ class _Stream:
     num_late: int = 0
 
 
-class VideoLog:
+class VideoLog(RawLog):
     """A log with video as images."""
 
     def __init__(self, log: RawLog) -> None:
@@ -188,7 +188,7 @@ def open_log(path: Path) -> RawLog:
     return VideoLog(log) if has_video and is_installed(LIBRARY) else log
 
 
-class VideoFileLog:
+class VideoFileLog(RawLog):
     """The images of ``X.mp4`` as topic ``/X``, at the times in ``X.csv`` or its kin.
 
     That file has a stamp per line, or a column named time or stamp. Before the point, 10 digits are seconds since
