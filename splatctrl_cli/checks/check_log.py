@@ -93,14 +93,18 @@ def check_log(
             states_lack=of_states.lack,
         ),
     )
-    evidence = Evidence(
-        frames=list(chain.from_iterable(frames.values())),
-        depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
-        motion=image_motion(watch, whole, frames),
-        states=of_states.states,
-        cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
+    return judged(
+        report,
+        Evidence(
+            frames=list(chain.from_iterable(frames.values())),
+            depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
+            motion=image_motion(watch, whole, frames),
+            states=of_states.states,
+            cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
+        ),
+        of_states.model,
+        only_errors=only_errors,
     )
-    return judged(report, evidence, of_states.model, only_errors=only_errors)
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
@@ -134,8 +138,7 @@ def _span(found: Survey) -> tuple[int, int]:
 
 def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopics]) -> list[Finding]:
     names = [n for n, e in sorted(found.topics.items()) if e.topic.type_name in (*IMAGES, *STATE_TYPES)]
-    judged = [name for name in names if name in watch.times and not _is_beside(watch, name, cameras)]
-    times = [watch.times[name] for name in judged]
+    times = [watch.times[n] for n in names if n in watch.times and not _is_beside(watch, n, cameras)]
     each = [f for t in times for f in time_findings(t, "images" if t.topic in watch.images else "states")]
     each += [
         replace(f, code="tf-gap") if f.code == "gap" else f
@@ -164,13 +167,19 @@ def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Co
     """Findings on image topics; notes if no camera uses them. unlike: topics with only depth's encoding."""
     findings = []
     for name, images in sorted(watch.images.items()):
-        its = image_findings(images)
+        its = list(image_findings(images))
         kinds = set(images.encodings)
         unread = sorted(kinds - set(DEPTH_ENCODINGS) - set(COLOR_CONVERSIONS))
         if unread:
             known = ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
-            remedy = f"record another topic of this camera, or convert it; read: {known}"
-            its.append(warning("encoding", name, f"encoding {unread[0]!r} is not read", remedy))
+            its.append(
+                warning(
+                    "encoding",
+                    name,
+                    f"encoding {unread[0]!r} is not read",
+                    f"record another topic of this camera, or convert it; read: {known}",
+                )
+            )
         if _is_beside(watch, name, cameras):
             its = [replace(f, severity=Severity.NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
         elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded and name not in unlike:

@@ -159,9 +159,17 @@ def _overlap_findings(
     (fits, most), scale = max((_fitting(views, pairs, cameras, s), s) for s in tried)
     if most < limits.VIEWS_LANDED or plain > limits.VIEWS_TRUSTED * most or fits < limits.VIEWS_LEAST_FIT * most:
         return []
-    text = f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times it"
     said = warning if is_sure else error
-    return [said("views-scale", "cameras", text, f"if so, {rescaled(used.values(), scale)}", value=scale)]
+    return [
+        said(
+            "views-scale",
+            "cameras",
+            f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times"
+            " it",
+            f"if so, {rescaled(used.values(), scale)}",
+            value=scale,
+        )
+    ]
 
 
 def _scaled(frames: Sequence[RgbdFrame], scales: Mapping[str, float]) -> list[RgbdFrame]:
@@ -185,14 +193,26 @@ def _scale_findings(scales: Mapping[str, float], used: Mapping[str, float | None
     units = {used[camera] or 1.0 for camera in scales}
     if is_all and len(units) == 1:
         factor = shared.pop()
-        text = f"views of one scene fit together only where all depths are multiplied by {factor:.3g}"
-        remedy = f"{rescaled(units, factor)}, or correct the poses' unit"
-        return [error("views-scale", "cameras", text, remedy, value=factor)]
+        return [
+            error(
+                "views-scale",
+                "cameras",
+                f"views of one scene fit together only where all depths are multiplied by {factor:.3g}",
+                f"{rescaled(units, factor)}, or correct the poses' unit",
+                value=factor,
+            )
+        ]
     found = []
     for camera, factor in sorted(scales.items()):
-        text = f"its views fit those of the other cameras only where its depths are multiplied by {factor:.3g}"
-        remedy = "set the depth unit of its driver as that of the others, or leave it out with --cameras"
-        found.append(error("views-scale", f"camera {camera}", text, remedy, value=factor))
+        found.append(
+            error(
+                "views-scale",
+                f"camera {camera}",
+                f"its views fit those of the other cameras only where its depths are multiplied by {factor:.3g}",
+                "set the depth unit of its driver as that of the others, or leave it out with --cameras",
+                value=factor,
+            )
+        )
     return found
 
 
@@ -207,8 +227,14 @@ def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
         where, what = f"cameras {' and '.join(cameras)}", f"their views fit where {move.camera} is moved by {by}"
         remedy = "calibrate both cameras' poses again (splatctrl calibrate): two do not tell which of them is wrong"
     falls = f"points then lie {1e3 * move.after:.1f} mm off surfaces instead of {1e3 * move.before:.1f}"
-    text = f"{what}: {falls} (mean, each counted as {1e3 * limits.MOVE_CUT:.0f} mm at most)"
-    return warning("views-pose", where, text, remedy, value=round(1e3 * move.distance, 1), unit="mm")
+    return warning(
+        "views-pose",
+        where,
+        f"{what}: {falls} (mean, each counted as {1e3 * limits.MOVE_CUT:.0f} mm at most)",
+        remedy,
+        value=round(1e3 * move.distance, 1),
+        unit="mm",
+    )
 
 
 def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:

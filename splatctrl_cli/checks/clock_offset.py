@@ -40,8 +40,7 @@ class ImageMotion:
         """Take the next frame."""
         camera = self.cameras.get(frame.camera)
         if camera is None:
-            small = thumbnail_lens(frame.intrinsics)
-            camera = CameraMotion(intrinsics=small, T_world_camera=frame.T_world_camera)
+            camera = CameraMotion(intrinsics=thumbnail_lens(frame.intrinsics), T_world_camera=frame.T_world_camera)
             self.cameras[frame.camera] = camera
         if len(camera.stamps_ns) == limits.MOTION_FRAMES:
             return
@@ -164,8 +163,9 @@ def estimate_clock_offset(
     interval = step * limits.OFFSET_STEPS
     fixed = sorted((c for c in cameras if c.is_fixed), key=lambda c: -float(np.sum(c.changes)))
     if robot is not None and fixed:
-        most = fixed[: limits.MOTION_CAMERAS]
-        scores = [_pixel_scores(seconds, robot, step, camera, start, offsets) for camera in most]
+        scores = [
+            _pixel_scores(seconds, robot, step, camera, start, offsets) for camera in fixed[: limits.MOTION_CAMERAS]
+        ]
         return _peak(offsets, np.array(scores), num, limits.PIXEL_CORRELATION, limits.PIXEL_ERROR * interval)
     scores = [_sum_scores(seconds, position, camera, start, offsets) for camera in cameras]
     return _peak(offsets, np.array(scores), num, limits.OFFSET_CORRELATION, limits.OFFSET_SUM_ERROR * interval)
@@ -221,8 +221,9 @@ def _near(
 ) -> tuple[list[JointState], RobotPoints | None]:
     first, last = _span(cameras)
     near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
-    points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
-    return [states[index] for index in near], points
+    return [states[index] for index in near], (
+        None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
+    )
 
 
 def _pixel_scores(

@@ -134,8 +134,9 @@ class LogWatch(JoinedLog):
             edge = f"tf {item.header.frame_id.strip('/')} -> {child}"
             if child not in self.transforms:
                 self.transforms[child] = TimesWatch(edge, has_stamps=True)
-            stamp = message.log_time_ns if self._by_log_time else stamp_ns(item.header)
-            self.transforms[child].add(stamp, message.log_time_ns)
+            self.transforms[child].add(
+                message.log_time_ns if self._by_log_time else stamp_ns(item.header), message.log_time_ns
+            )
 
 
 def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
