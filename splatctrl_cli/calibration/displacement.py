@@ -130,12 +130,11 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, An
     moved = points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]
     by_pose = np.hstack([np.cross(np.eye(POSE // 2), points.mean(axis=0)).T, np.eye(POSE // 2)])  # of their middle
     variance = float(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T))
-    row = {
+    return {
         "distance_mm": round(1e3 * float(np.sqrt(np.square(moved).sum(axis=1).mean())), 2),
         "sigma_mm": round(1e3 * variance**0.5, 2),
         "num_pixels": len(points),
-    }
-    return row, T
+    }, T
 
 
 def _rows(arm: Arm, frame: RgbdFrame, T_recorded_camera: Float64) -> ArmRows | None:

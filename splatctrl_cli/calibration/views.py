@@ -79,8 +79,9 @@ def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
     depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
     lens = strided_lens(frame.intrinsics, stride)
     human = None if frame.human is None else frame.human[::stride, ::stride]
-    color = np.zeros((*depth.shape, 3), np.uint8)
-    return replace(frame, depth=depth, color=color, intrinsics=lens, human=human, valid=None)
+    return replace(
+        frame, depth=depth, color=np.zeros((*depth.shape, 3), np.uint8), intrinsics=lens, human=human, valid=None
+    )
 
 
 def surface_normals(surface: Float64, step: int = 1) -> Float64:
@@ -175,8 +176,9 @@ def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
     count = near.sum(axis=0)
     mean = np.where(near, inverse, 0.0).sum(axis=0) / np.maximum(count, 1)
     holds = is_seen & (2 * count >= len(frames)) & (mean > 0)
-    still = np.where(holds, 1 / np.where(holds, mean, 1.0), 0.0).astype(np.float32)
-    return replace(frames[len(frames) // 2], depth=still)
+    return replace(
+        frames[len(frames) // 2], depth=np.where(holds, 1 / np.where(holds, mean, 1.0), 0.0).astype(np.float32)
+    )
 
 
 def depth_sigma(depth: NDArray[np.floating]) -> Float64:

@@ -162,8 +162,14 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     if robots:
         facts[ROBOT] = robots
     rows = [_topic_row(found.topics[name]) for name in sorted(found.topics)]
-    unused = [name for name, topic in found.topics.items() if _first(topic) == "-" and not _is_read(topic)]
-    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=rows, unused=unused)]
+    grids = [
+        Grid(
+            name="topics",
+            header=_TOPIC_COLUMNS,
+            rows=rows,
+            unused=[name for name, topic in found.topics.items() if _first(topic) == "-" and not _is_read(topic)],
+        )
+    ]
     cameras = camera_topics(log, found, options)
     if cameras:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
@@ -325,5 +331,11 @@ def _describe_images(path: Path, source: ImageFolderSource, kind: str) -> Summar
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
     refusal = lacks_depth(source)
-    lacks = () if refusal is None else (str(refusal)[str(refusal).index("depth is missing") :],)
-    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,), missing=lacks, notes=tuple(loss.notes))
+    return Summary(
+        path=str(path),
+        kind=kind,
+        facts=facts,
+        grids=(grid,),
+        missing=() if refusal is None else (str(refusal)[str(refusal).index("depth is missing") :],),
+        notes=tuple(loss.notes),
+    )

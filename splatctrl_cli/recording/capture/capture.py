@@ -74,8 +74,7 @@ class CaptureSource(Recording):
             found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
             chosen = options if options.joint_topic is not None else replace(options, joint_topic=kept.chosen)
             self.joint_names, self.states = joint_records(found, chosen, loss, joints)
-            others = without_joints(self._loss, kept.loss, kept.first_note)
-            self._loss = with_joints(others, loss, kept.first_note)
+            self._loss = with_joints(without_joints(self._loss, kept.loss, kept.first_note), loss, kept.first_note)
 
     @property
     def loss(self) -> LossReport:

@@ -89,8 +89,7 @@ class Bag1Log(RawLog):
         size = number(record.fields, "size")
         try:
             unpack = unpacked_start if record.is_cut else budget.unpacked
-            content = unpack(record.body, compression, size)
-            for kind, fields, body in records_in(content):
+            for kind, fields, body in records_in(unpack(record.body, compression, size)):
                 yield from self._read(kind, fields, body, record.offset, damage, names)
         except (BadBlockError, ValueError) as error:
             if not record.is_cut:  # the cut has been counted
@@ -107,8 +106,13 @@ class Bag1Log(RawLog):
                 damage.add(f"{self.path.name}: a message without a connection or time")
             elif names is None or topic.name in names:
                 seconds, nanoseconds = int.from_bytes(time[:4], "little"), int.from_bytes(time[4:], "little")
-                at = seconds * SECOND_NS + nanoseconds
-                yield RawMessage(topic=topic, log_time_ns=at, data=body, file=self.path.name, offset=offset)
+                yield RawMessage(
+                    topic=topic,
+                    log_time_ns=seconds * SECOND_NS + nanoseconds,
+                    data=body,
+                    file=self.path.name,
+                    offset=offset,
+                )
 
     def _connect(self, fields: Fields, body: bytes, damage: Damage) -> None:
         told = fields_of(body)

@@ -175,8 +175,7 @@ def _open_folder(path: Path) -> RawLog:
         )
     parts = tuple(open_raw_log(file) for file in files)
     kind = "mcap" if ".mcap" in files[0].suffixes else "sqlite3"
-    container = f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})"
-    return JoinedLog(path, parts, container, note=note)
+    return JoinedLog(path, parts, f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})", note=note)
 
 
 def told_formats(path: Path) -> set[str]:

@@ -57,8 +57,7 @@ class McapFile:
         places = [index.chunk_start_offset for index in self.chunk_indexes()]  # where records are known to begin
         places += [part.offset for part in self.summary()[:1]]
         with self.path.open("rb") as stream:
-            walk = _Walk(stream, self.path.name, self.size, damage, places, has_crc=not is_known)
-            yield from walk.parts()
+            yield from _Walk(stream, self.path.name, self.size, damage, places, has_crc=not is_known).parts()
 
     def summary(self) -> list[Part]:
         """The summary section's records, if readable."""

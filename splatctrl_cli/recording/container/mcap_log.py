@@ -69,8 +69,9 @@ def index_by_heads(file: McapFile) -> LogIndex:
             elif opcode == MESSAGE_INDEX and chunks:
                 channel, size = struct.unpack_from("<HI", content)
                 counts[channel] = counts.get(channel, 0) + size // 16
-                offsets = {**chunks[-1].message_index_offsets, channel: offset}
-                chunks[-1] = replace(chunks[-1], message_index_offsets=offsets)
+                chunks[-1] = replace(
+                    chunks[-1], message_index_offsets={**chunks[-1].message_index_offsets, channel: offset}
+                )
             elif opcode == MESSAGE:
                 channel, _, stamp, _ = struct.unpack_from("<HIQQ", content)
                 counts[channel] = counts.get(channel, 0) + 1
@@ -202,8 +203,7 @@ class McapLog(RawLog):
             if is_cut or len(chunk.records) < chunk.compressed_size:
                 return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
             records = self._budget.unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
-            is_known = self._whole is not None
-            if chunk.uncompressed_crc and not is_known and zlib.crc32(records) != chunk.uncompressed_crc:
+            if chunk.uncompressed_crc and self._whole is None and zlib.crc32(records) != chunk.uncompressed_crc:
                 raise BadBlockError("checksum differs")
         except (BadRecordError, BadBlockError) as error:
             if not is_cut:  # the cut has been counted

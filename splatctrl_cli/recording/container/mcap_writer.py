@@ -71,8 +71,9 @@ class McapLog:
             )
             for parent, child, T in transforms
         ]
-        message = self._new("tf2_msgs/msg/TFMessage", transforms=stamped)
-        self._add("/tf_static" if is_static else "/tf", message, stamp_ns)
+        self._add(
+            "/tf_static" if is_static else "/tf", self._new("tf2_msgs/msg/TFMessage", transforms=stamped), stamp_ns
+        )
 
     def add_frame(self, frame: RgbdFrame) -> None:
         """Add JPEG colour, CameraInfo, depth and any mask, in one optical frame."""
@@ -146,7 +147,10 @@ class McapLog:
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
         sequence = self._sequence.get(topic, 0)
         self._sequence[topic] = sequence + 1
-        data = bytes(self._store.serialize_cdr(message, kind))
         self._writer.add_message(
-            self._channels[topic], log_time=stamp_ns, data=data, publish_time=stamp_ns, sequence=sequence
+            self._channels[topic],
+            log_time=stamp_ns,
+            data=bytes(self._store.serialize_cdr(message, kind)),
+            publish_time=stamp_ns,
+            sequence=sequence,
         )

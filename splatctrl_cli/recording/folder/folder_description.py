@@ -325,8 +325,7 @@ def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> 
     for key, f in declared.items():
         if key not in table and f.default is MISSING and f.default_factory is MISSING:
             raise _refused(f"{path}: {name}.{key} is missing")
-    values = {key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()}
-    return kind(**values)
+    return kind(**{key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()})
 
 
 def _typed(value: Any, hint: Any, where: str) -> Any:
@@ -347,8 +346,10 @@ def _typed(value: Any, hint: Any, where: str) -> Any:
 def _check_keys(table: dict[str, Any], known: set[str], where: str, prefix: str) -> None:
     for key in table:
         if key not in known:
-            remedy = did_you_mean(key, known, f"known here: {', '.join(sorted(known))}", prefix=prefix, cutoff=0.4)
-            raise InputError(f"{where}: unknown key {prefix}{key}", remedy=remedy)
+            raise InputError(
+                f"{where}: unknown key {prefix}{key}",
+                remedy=did_you_mean(key, known, f"known here: {', '.join(sorted(known))}", prefix=prefix, cutoff=0.4),
+            )
 
 
 def _check_choice(path: Path, key: str, value: str, choices: tuple[str, ...]) -> None:

@@ -214,13 +214,15 @@ class ImageFolderSource(Recording):
             )
             if depth_camera is not None:
                 bent = _undistortion(depth_camera)
-                warp = DepthToColor(
-                    depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
-                    color_intrinsics=lens.intrinsics,
-                    T_color_depth=self._description.T_color_depth,
-                    undistortion=bent,
+                lens = replace(
+                    lens,
+                    depth_to_color=DepthToColor(
+                        depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
+                        color_intrinsics=lens.intrinsics,
+                        T_color_depth=self._description.T_color_depth,
+                        undistortion=bent,
+                    ),
                 )
-                lens = replace(lens, depth_to_color=warp)
             self._lenses[table.name] = lens
         return self._lenses[table.name]
 
@@ -317,7 +319,12 @@ def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
     options.refuse(("holdout", "intrinsics", "camera_pose_topics"), "a description with several cameras", path)
     refuse_unknown_cameras(path, (*(options.cameras or ()), *options.camera_poses), rig)
     names = options.cameras or tuple(rig)
-    poses = {name: pose for name, pose in options.camera_poses.items() if name in names}
     return ImageFolderSource(
-        path, replace(options, cameras=names, camera_poses=poses), *(rig[name] for name in names)
+        path,
+        replace(
+            options,
+            cameras=names,
+            camera_poses={name: pose for name, pose in options.camera_poses.items() if name in names},
+        ),
+        *(rig[name] for name in names),
     )

@@ -108,8 +108,9 @@ class Pairs:
 
     def moved(self, change: Callable[[Float64], Float64]) -> "Pairs":
         """Apply `change` to each known pose."""
-        views = [v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in self.views]
-        return replace(self, views=views)
+        return replace(
+            self, views=[v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in self.views]
+        )
 
 
 def paired_by_name(

@@ -37,8 +37,9 @@ def read(folder: Path, options: SourceOptions) -> Description:
     """Describe the folder; depth defaults to millimetres."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
-    poses = PosesTable(format="nerfstudio", file=file, axes="opengl")
-    return with_transforms(Description(path=folder / file, root=folder, poses=poses))
+    return with_transforms(
+        Description(path=folder / file, root=folder, poses=PosesTable(format="nerfstudio", file=file, axes="opengl"))
+    )
 
 
 def with_transforms(description: Description) -> Description:
@@ -70,8 +71,13 @@ def with_transforms(description: Description) -> Description:
     is_short = len(set(stems)) == len(stems)  # else the path without suffix
     names = stems if is_short else [str(Path(view.name).with_suffix("")) for view in views]
     named = (replace(view, name=name) for view, name in zip(views, names, strict=True))
-    listed = tuple(sorted(named, key=lambda v: v.name))
-    return replace(description, camera=views[0].camera, listed=listed, is_depth_resized=True, supply=SUPPLY)
+    return replace(
+        description,
+        camera=views[0].camera,
+        listed=tuple(sorted(named, key=lambda v: v.name)),
+        is_depth_resized=True,
+        supply=SUPPLY,
+    )
 
 
 def _view(
@@ -157,8 +163,9 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
             distortion_model=_MODELS[model],
         )
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        remedy = "give [camera] and [frames] in a description"
-        raise InputError(f"{path}: no usable {error} in the intrinsics", remedy=remedy) from None
+        raise InputError(
+            f"{path}: no usable {error} in the intrinsics", remedy="give [camera] and [frames] in a description"
+        ) from None
 
 
 _DOCS = """

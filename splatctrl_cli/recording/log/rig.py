@@ -147,8 +147,12 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
 
 def _rectified(calibration: Calibration) -> Calibration:
     """The rectified camera: P if set, without distortion; valid if the lens is known."""
-    K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
-    pinhole = replace(calibration, K=K, distortion_model="plumb_bob", distortion=np.zeros(0))
+    pinhole = replace(
+        calibration,
+        K=calibration.projection if calibration.projection[0, 0] > 0 else calibration.K,
+        distortion_model="plumb_bob",
+        distortion=np.zeros(0),
+    )
     model = lens_model(calibration.distortion_model)
     if not is_distorted(model, calibration.distortion) or model not in DISTORTION_MODELS:
         return pinhole

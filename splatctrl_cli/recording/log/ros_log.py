@@ -69,8 +69,9 @@ class RosLogSource(Recording):
         self.world_frame = self._rig[0].world_frame
         loss, first_note = LossReport(), len(self._loss.notes)
         self.joint_names, self.states = joint_records(found, options, loss, joints)
-        topics = found.of_type(*STATE_TYPES)
-        self.joint_topics = JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=options.joint_topic)
+        self.joint_topics = JointTopics(
+            topics=found.of_type(*STATE_TYPES), loss=loss, first_note=first_note, chosen=options.joint_topic
+        )
         self._loss = with_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
         self._passes = [_Pass()]

@@ -165,30 +165,27 @@ def _array(values: Any) -> Float64:
 
 
 COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
+_NO_STAMPS = np.zeros(0, dtype=np.int64)
 
 
 class JointStream:
     """States with equal joints, in the first one's order."""
 
-    def __init__(self, names: tuple[str, ...], columns: Mapping[str, Iterable[Float64]] | None = None) -> None:
-        """columns: rows of known states, in blocks."""
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        stamp_ns: Stamps = _NO_STAMPS,
+        log_time_ns: Stamps = _NO_STAMPS,
+        columns: Mapping[str, Iterable[Float64]] | None = None,
+    ) -> None:
+        """Start with known states, columns of rows in blocks. Raises ValueError if they differ in length."""
         self.names = names
-        self._stamps, self._log_times = array("q"), array("q")
+        self._stamps, self._log_times = array("q", stamp_ns.tolist()), array("q", log_time_ns.tolist())
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
         shapes = {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}
         self._columns = ColumnWriter(shapes, columns or {})
-
-    @classmethod
-    def of(
-        cls, names: tuple[str, ...], stamp_ns: Stamps, log_time_ns: Stamps, columns: Mapping[str, Iterable[Float64]]
-    ) -> "JointStream":
-        """Build from blocks of rows. Raises ValueError for other lengths."""
-        stream = cls(names, columns)
-        stream._stamps.extend(stamp_ns.tolist())
-        stream._log_times.extend(log_time_ns.tolist())
-        if columns and len(stream._columns) != len(stream):
-            raise ValueError(f"columns of other lengths than {len(stream)}")
-        return stream
+        if columns and len(self._columns) != len(self):
+            raise ValueError(f"columns of other lengths than {len(self)}")
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -229,20 +226,12 @@ class JointStream:
 class JointLog:
     """States in file order; first_names: the first one's, or None; notes: counted."""
 
-    def __init__(self) -> None:
-        self.first_names: tuple[str, ...] | None = None
+    def __init__(self, streams: Sequence[JointStream] = (), num: int = 0) -> None:
+        """Start with the streams of `num` states."""
+        self.first_names = streams[0].names if streams else None
         self.notes: Counter[str] = Counter()
-        self._num = 0
-        self._streams: dict[frozenset[str], JointStream] = {}
-
-    @classmethod
-    def of(cls, num: int, streams: Sequence[JointStream]) -> "JointLog":
-        """Build from `num` states' streams."""
-        log = cls()
-        log._num = num
-        log._streams = {frozenset(stream.names): stream for stream in streams}
-        log.first_names = streams[0].names if streams else None
-        return log
+        self._num = num
+        self._streams = {frozenset(stream.names): stream for stream in streams}
 
     def __len__(self) -> int:
         return self._num

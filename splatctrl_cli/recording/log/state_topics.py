@@ -135,8 +135,9 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
         used.append(best.where)
     others = sorted({t.topic.name for t in topics} - set(used))
     if others:
-        taken = ", ".join(dict.fromkeys(used))
-        loss.notes.append(f"joint states are taken from {taken}, not from {', '.join(others)}")
+        loss.notes.append(
+            f"joint states are taken from {', '.join(dict.fromkeys(used))}, not from {', '.join(others)}"
+        )
     return track if missing else track.of_names(wanted)
 
 

@@ -126,10 +126,14 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
             for name in ("stamp_ns", "log_time_ns")
         )
         columns = {name: _blocks(checked(f"{place}/{name}.npy")) for name in stream["columns"]}
-        streams.append(JointStream.of(tuple(stream["joints"]), stamps, log_times, columns))
-    definition = "kept" if entry["has_definition"] else ""
-    topic = Topic(name=entry["topic"], type_name=entry["type"], encoding="cdr", definition=definition)
-    return TopicSurvey(topic=topic, count=int(entry["messages"]), joints=JointLog.of(int(entry["states"]), streams))
+        streams.append(JointStream(tuple(stream["joints"]), stamps, log_times, columns))
+    topic = Topic(
+        name=entry["topic"],
+        type_name=entry["type"],
+        encoding="cdr",
+        definition="kept" if entry["has_definition"] else "",
+    )
+    return TopicSurvey(topic=topic, count=int(entry["messages"]), joints=JointLog(streams, int(entry["states"])))
 
 
 def write_rows(stream: IO[bytes], rows: Table) -> None:

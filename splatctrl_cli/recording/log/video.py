@@ -130,8 +130,8 @@ def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[Ra
             _lose(stream, [frame.pts])
             continue
         message, header = stream.waiting.pop(frame.pts)
-        pixels = frame.to_ndarray(format="rgb24")
-        yield replace(message, topic=_decoded_topic(message.topic), data=pack_image(header, pixels))
+        data = pack_image(header, frame.to_ndarray(format="rgb24"))
+        yield replace(message, topic=_decoded_topic(message.topic), data=data)
 
 
 def _decode(context: Any, data: bytes | None, number: int) -> tuple[list[Any], bool]:
@@ -184,8 +184,7 @@ def open_log(path: Path) -> RawLog:
         return VideoFileLog(path)
     log = open_raw_log(path)
     topics = log.topics()  # none where there is no index
-    has_video = any(map(is_video, topics)) or not topics
-    return VideoLog(log) if has_video and is_installed(LIBRARY) else log
+    return VideoLog(log) if (any(map(is_video, topics)) or not topics) and is_installed(LIBRARY) else log
 
 
 class VideoFileLog(RawLog):

@@ -98,8 +98,9 @@ def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[st
     found = survey(log, by_log_time=options.stamps == "log")
     if not found.num_messages:
         raise reason
-    notes = [*found.damage.all_notes, f"no camera is used: {reason.message}"]
-    loss = LossReport(damaged=found.damage.count, notes=notes)
+    loss = LossReport(
+        damaged=found.damage.count, notes=[*found.damage.all_notes, f"no camera is used: {reason.message}"]
+    )
     names, states = joint_records(found, options, loss, joints)
     if not states:
         topics = ", ".join(f"{name} ({t.topic.type_name})" for name, t in sorted(found.topics.items()) if t.count)
