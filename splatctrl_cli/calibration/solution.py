@@ -189,7 +189,9 @@ def _with_depths(solution: Solution) -> Solution:
         for number, some in enumerate((unknowns.poses, unknowns.cameras))
     )
     found = _freed(solution, replace(unknowns, scales=scales, biases=biases))
-    return solution if any(_is_absurd(*found.estimate.depth_of(one)) for one in unknowns.cameras) else found
+    most_scale, most_bias = fixed.CALIBRATION_DEPTH_MOST
+    depths = map(found.estimate.depth_of, unknowns.cameras)
+    return solution if any(abs(scale - 1) > most_scale or abs(bias) > most_bias for scale, bias in depths) else found
 
 
 def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
@@ -256,11 +258,6 @@ def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
     change = off if at == unknowns.columns(camera)[-1] else off * _far(tried, camera)
     is_clear = abs(off) > fixed.CALIBRATION_DEPTH_SURE[1] * np.sqrt(variance)
     return bool(is_clear and abs(change) > fixed.CALIBRATION_DEPTH_LEAST)
-
-
-def _is_absurd(scale: float, bias: float) -> bool:
-    most = fixed.CALIBRATION_DEPTH_MOST
-    return abs(scale - 1) > most[0] or abs(bias) > most[1]
 
 
 def _freed(solution: Solution, unknowns: Unknowns) -> Solution:

@@ -179,25 +179,24 @@ class _CameraWatch:
         ]
 
 
-class _SourceWatch:
-    def __init__(self, num_joints: int) -> None:
-        self.cameras: dict[str, _CameraWatch] = {}
-        self.states = StateCollector(num_joints)
-        self.motion = ImageMotion()
-        self.is_whole = True
-
-    def read(self, source: FrameSource, num_images: int | None) -> None:
-        """Take all, or at most `num_images` per camera."""
-        for item in source.stored():
-            if isinstance(item, JointState):
-                self.states.add(item)
-                continue
-            if item.camera not in self.cameras:
-                self.cameras[item.camera] = _CameraWatch(item.intrinsics, f"camera {item.camera}", item.depth_unit)
-            self.cameras[item.camera].add(item, self.motion)
-            if len(self.cameras[item.camera].stamps) == num_images:
-                self.is_whole = False
-                return
+def _read(
+    source: FrameSource,
+    cameras: dict[str, _CameraWatch],
+    states: StateCollector,
+    motion: ImageMotion,
+    num_images: int | None,
+) -> bool:
+    """Take all (True), or at most `num_images` per camera."""
+    for item in source.stored():
+        if isinstance(item, JointState):
+            states.add(item)
+            continue
+        if item.camera not in cameras:
+            cameras[item.camera] = _CameraWatch(item.intrinsics, f"camera {item.camera}", item.depth_unit)
+        cameras[item.camera].add(item, motion)
+        if len(cameras[item.camera].stamps) == num_images:
+            return False
+    return True
 
 
 def check_folder(
@@ -214,20 +213,21 @@ def check_folder(
         source = open_source(path, options)
     except InputError as wrong:
         return _refused(path, kind if path.is_file() or is_capture(path) else "folder", wrong)
-    watch = _SourceWatch(len(source.joint_names))
+    cameras: dict[str, _CameraWatch] = {}
+    states, motion, is_whole = StateCollector(len(source.joint_names)), ImageMotion(), True
     findings: list[Finding] = []
     try:
-        watch.read(source, num_images)
+        is_whole = _read(source, cameras, states, motion, num_images)
     except InputError as wrong:
         findings.append(error("refused", path.name, wrong.message, wrong.remedy))
     findings += _losses(source, path.name)
-    cameras = dict(sorted(watch.cameras.items()))
+    cameras = dict(sorted(cameras.items()))
     if not cameras and not any(finding.code == "refused" for finding in findings):
         findings.append(error("missing", path.name, "no frame could be read", "copy or record it again"))
     for camera in cameras.values():
         findings += _camera_findings(camera, has_clock=source.has_clock)
     findings += sample_findings([camera.images for camera in cameras.values()])
-    logged = watch.states.columns()
+    logged = states.columns()
     of_states = RobotStates(
         model=model, lack="" if len(logged) else "no joint states; give them apart (splatctrl help replay, Logs)"
     )
@@ -254,10 +254,10 @@ def check_folder(
         Evidence(
             frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
             depth_units={name: camera.images.scale for name, camera in cameras.items()},
-            motion=watch.motion,
+            motion=motion,
             states=of_states.states,
             is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
-            cut="" if watch.is_whole else f"only the first {num_images} frames of a camera were read",
+            cut="" if is_whole else f"only the first {num_images} frames of a camera were read",
         ),
         of_states.model,
         only_errors=only_errors,

@@ -114,14 +114,12 @@ class ClockOffset:
     """The offset of two clocks, and its certainty.
 
     offset_s: a frame's stamp minus the joint state's at that instant [s], None if unknown, for `reason`.
-    uncertainty_s: the larger of camera disagreement and the method's error. correlation, runner_up: at the best and
-    next peak.
+    uncertainty_s: the larger of camera disagreement and the method's error. correlation: at the best peak.
     """
 
     offset_s: float | None
     uncertainty_s: float | None
     correlation: float
-    runner_up: float
     num_intervals: int
     reason: str = ""
 
@@ -293,13 +291,12 @@ def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: floa
     elif top - runner_up < limits.OFFSET_LEAD:
         reason = f"the motion repeats: offsets of {offsets[best]:+.2f} s and another fit alike"
     if reason:
-        return _unknown(num, reason, top, runner_up)
+        return _unknown(num, reason, top)
     single = np.array([_vertex(offsets, row, int(np.argmax(row))) for row in scores])
     return ClockOffset(
         offset_s=_vertex(offsets, score, best),
         uncertainty_s=max(float(single.std() / np.sqrt(len(single))), error),
         correlation=top,
-        runner_up=runner_up,
         num_intervals=num,
     )
 
@@ -316,7 +313,5 @@ def _vertex(offsets: Float64, score: Float64, best: int) -> float:
     return float(offsets[best]) + shift * width
 
 
-def _unknown(num: int, reason: str, top: float = 0.0, runner_up: float = 0.0) -> ClockOffset:
-    return ClockOffset(
-        offset_s=None, uncertainty_s=None, correlation=top, runner_up=runner_up, num_intervals=num, reason=reason
-    )
+def _unknown(num: int, reason: str, top: float = 0.0) -> ClockOffset:
+    return ClockOffset(offset_s=None, uncertainty_s=None, correlation=top, num_intervals=num, reason=reason)

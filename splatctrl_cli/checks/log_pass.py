@@ -187,12 +187,12 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
             T_color_depth=warp.T_color_depth,
         ).warp(depth)
     elif camera.undistortion is not None:
-        depth = _reduced(camera.undistortion.depth(_enlarged(depth, kept)), stride)
+        depth = camera.undistortion.nearest(_enlarged(depth, kept))[::stride, ::stride]
     pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
     if color is not None and color.color is not None:
         pixels = color.color
         if camera.undistortion is not None:
-            pixels = _reduced(camera.undistortion.color(_enlarged(pixels, color)), color.stride)
+            pixels = camera.undistortion.color(_enlarged(pixels, color))[:: color.stride, :: color.stride]
     if pixels.shape[:2] != depth.shape:
         pixels = np.zeros((*depth.shape, 3), np.uint8)
     return RgbdFrame(
@@ -208,10 +208,6 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
 def _enlarged(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
     rows = np.repeat(image, kept.stride, axis=0)[: kept.height]
     return np.repeat(rows, kept.stride, axis=1)[:, : kept.width]
-
-
-def _reduced(image: NDArray[Any], stride: int) -> NDArray[Any]:
-    return image[::stride, ::stride]
 
 
 def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:

@@ -29,12 +29,10 @@ from splatctrl_cli.recording.container.raw_log import RawLog
 from splatctrl_cli.recording.describe_file import describe_file
 from splatctrl_cli.recording.folder.image_folder import ImageFolderSource, open_image_folder
 from splatctrl_cli.recording.folder.layouts import (
-    BARE_REMEDY,
-    bare_images,
     has_views,
     layout_of,
     open_layout,
-    readable_in,
+    unknown_folder,
 )
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
 from splatctrl_cli.recording.log.rig import camera_topics, missing
@@ -236,14 +234,10 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
     if not ("run.json" in names or "splats.ply" in names or is_dtu):
         refuse_foreign(path)
-        inside = readable_in(path)
-        if not inside and (found := bare_images(path)):
-            raise InputError(f"{path}: {found}", remedy=BARE_REMEDY)
-        raise InputError(
-            f"{path}: a folder of no known kind",
-            remedy=f"give one that is in it: {inside}"
-            if inside
-            else "expected a capture, ROS 2 bag, dataset folder (splatctrl help formats), MVSNet scan or output;"
+        raise unknown_folder(
+            path,
+            "a folder of no known kind",
+            "expected a capture, ROS 2 bag, dataset folder (splatctrl help formats), MVSNet scan or output;"
             " for other images give their .toml",
         )
     field = _field_facts(path / "field.json") if "field.json" in names else {}

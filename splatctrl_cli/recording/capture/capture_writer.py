@@ -9,6 +9,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
@@ -63,10 +64,7 @@ class Journal:
         next(self._kept, None)
         self._stream = self._path.open("a", encoding="utf-8")
 
-    def __enter__(self) -> "Journal":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._stream.close()
 
     def kept(self) -> Entry | None:
@@ -168,7 +166,7 @@ def write_capture(
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}
     num_states = num_resumed = 0
-    with Journal(folder, identity or {}) as journal:
+    with closing(Journal(folder, identity or {})) as journal:
         for item in source.stored():
             if isinstance(item, JointState):
                 states.add(item)

@@ -281,11 +281,13 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         stamps=_optional(StampsTable, content, "stamps", path) or StampsTable(),
         split=_optional(SplitTable, content, "split", path) or SplitTable(),
     )
-    if description.poses is not None:
-        _check_choice(path, "poses.format", description.poses.format, FORMATS)
-        _check_choice(path, "poses.convention", description.poses.convention, CONVENTIONS)
-        _check_choice(path, "poses.axes", description.poses.axes, AXES)
-    _check_choice(path, "depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
+    choices = [("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)]
+    if (poses := description.poses) is not None:
+        conventions = (("poses.convention", poses.convention, CONVENTIONS), ("poses.axes", poses.axes, AXES))
+        choices = [("poses.format", poses.format, FORMATS), *conventions, *choices]
+    for key, value, allowed in choices:
+        if value not in allowed:
+            raise _refused(f"{path}: {key}: expected one of {', '.join(allowed)}, got {value!r}")
     for name, camera in (("camera", description.camera), ("depth_camera", description.depth_camera)):
         if camera is not None:
             check_camera(camera, f"{path}: {name}")
@@ -350,8 +352,3 @@ def _check_keys(table: dict[str, Any], known: set[str], where: str, prefix: str)
                 f"{where}: unknown key {prefix}{key}",
                 remedy=did_you_mean(key, known, f"known here: {', '.join(sorted(known))}", prefix=prefix, cutoff=0.4),
             )
-
-
-def _check_choice(path: Path, key: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise _refused(f"{path}: {key}: expected one of {', '.join(choices)}, got {value!r}")

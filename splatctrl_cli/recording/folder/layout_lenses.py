@@ -39,12 +39,12 @@ from splatctrl_cli.recording.folder.folder_description import (
 from splatctrl_cli.recording.folder.layout import (
     CAMERA,
     Layout,
-    Lenses,
     Pairs,
     described,
     image_size,
     images_of,
     marked,
+    named_lens,
     paired_by_stamp,
     read_json,
 )
@@ -63,13 +63,13 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
     trajectory = Trajectory(_poses(root / TRAJECTORY))
     pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, trajectory.at, options)
-    lenses = Lenses()
+    lenses: list[CameraTable] = []
     pincams = {
         stamp: path
         for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))
         if (stamp := _stamp_ns(path))
     }
-    views = [replace(view, camera=lenses.named(_arkit_lens(pincams, view), str(root))) for view in pairs.views]
+    views = [replace(view, camera=named_lens(lenses, _arkit_lens(pincams, view), str(root))) for view in pairs.views]
     return described(
         replace(pairs, views=views),
         root,
@@ -176,7 +176,8 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected an object by image number, got {type(content).__name__}", remedy=_REMEDY)
     entries = {int(key): entry for key, entry in content.items() if key.isdigit()}
-    lenses, views, prefix = Lenses(), [], sensor.removeprefix("_")
+    lenses: list[CameraTable] = []
+    views, prefix = [], sensor.removeprefix("_")
     size = image_size(next(iter(colors.values()))) if colors else (0, 0)  # that of all images of a scene
     for name, color in colors.items():
         entry = entries.get(int(name)) if name.isdigit() else None
@@ -191,7 +192,7 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
                 color=color,
                 depth=depths[name],
                 matrix=_pose(entry),
-                camera=lenses.named(lens, where),
+                camera=named_lens(lenses, lens, where),
                 depth_scale=float(entry["depth_scale"]) * MILLIMETRE,
             )
         except (KeyError, TypeError, ValueError) as error:
@@ -237,7 +238,8 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
     colors = _images(folder, set(files))
     depths, without = _depths(folder)
     notes += without
-    lenses, views = Lenses(), []
+    lenses: list[CameraTable] = []
+    views = []
     for stem, color in colors.items():
         (K, T_camera_world, _), depth = cameras[stem], depths.get(int(stem) if stem.isdigit() else -1)
         if depth is None and depths:
@@ -245,7 +247,7 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
         k = fitted_intrinsics(K, image_size(color), files[stem])
         T_camera_world[:3, 3] *= unit
         lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
-        lens = lenses.named(lens, str(files[stem]))
+        lens = named_lens(lenses, lens, str(files[stem]))
         views.append(ListedView(name=stem, color=color, depth=depth, matrix=T_camera_world, camera=lens))
     return described(
         Pairs(path=folder, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views))),

@@ -14,7 +14,7 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.folder.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.recording.folder.layout import Layout, Lenses, image_size, marked
+from splatctrl_cli.recording.folder.layout import Layout, image_size, marked, named_lens
 from splatctrl_cli.recording.folder.poses import read_nerfstudio
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -50,7 +50,7 @@ def with_transforms(description: Description) -> Description:
         return description
     path = description.root / table.file
     content, matrices = read_nerfstudio(path)
-    lenses = Lenses()
+    lenses: list[CameraTable] = []
     views = [_view(content, entry, path, lenses, description, matrices) for entry in content["frames"]]
     if not views:
         raise InputError(f"{path}: no frames", remedy="give a transforms.json with frames")
@@ -84,7 +84,7 @@ def _view(
     content: dict[str, Any],
     entry: dict[str, Any],
     path: Path,
-    lenses: Lenses,
+    lenses: list[CameraTable],
     description: Description,
     matrices: dict[str, Float64],
 ) -> ListedView:
@@ -104,7 +104,7 @@ def _view(
         color=color,
         depth=None if depth is None else path.parent / _with_slashes(str(depth)),
         matrix=matrix,
-        camera=description.camera or lenses.named(_camera(said, color, path), str(path)),
+        camera=description.camera or named_lens(lenses, _camera(said, color, path), str(path)),
         depth_scale=unit,
         valid=None if not mask else path.parent / _with_slashes(str(mask)),
     )

@@ -40,33 +40,36 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
         )
     if layout is None:
         names = ", ".join(known.name for known in LAYOUTS)
-        inside = readable_in(folder)
-        if not inside and (found := bare_images(folder)):
-            raise InputError(f"{folder}: {found}", remedy=BARE_REMEDY)
-        raise InputError(
-            f"{folder}: a folder that is neither a capture nor a ROS 2 bag, nor laid out as {names}",
-            remedy=f"give one that is in it: {inside}"
-            if inside
-            else "give the capture, the bag, one scene of the dataset, or a .toml for images (splatctrl help input)",
+        raise unknown_folder(
+            folder,
+            f"a folder that is neither a capture nor a ROS 2 bag, nor laid out as {names}",
+            "give the capture, the bag, one scene of the dataset, or a .toml for images (splatctrl help input)",
         )
     options.refuse(("root",), f"a folder laid out as {layout.name}", folder)
     return ImageFolderSource(folder, options, layout.read(folder, options))
 
 
-BARE_REMEDY = (
-    "describe colour, depth, lens and poses in a .toml (splatctrl help input); info, score and reconstruct --points"
-    " CLOUD.ply work without depth, but not without poses: a transforms.json (ns-process-data writes it)"
-)
+def unknown_folder(folder: Path, what: str, remedy: str) -> InputError:
+    """The error for a folder that is not read: it names readable parts, else missing depth."""
+    inside = _readable_in(folder)
+    if not inside and (found := _bare_images(folder)):
+        return InputError(
+            f"{folder}: {found}",
+            remedy="describe colour, depth, lens and poses in a .toml (splatctrl help input); info, score and"
+            " reconstruct --points CLOUD.ply work without depth, but not without poses: a transforms.json"
+            " (ns-process-data writes it)",
+        )
+    return InputError(f"{folder}: {what}", remedy=f"give one that is in it: {inside}" if inside else remedy)
 
 
-def bare_images(folder: Path) -> str:
+def _bare_images(folder: Path) -> str:
     """Words for missing depth in a folder of colour; "" without images."""
     num = max(len(images_of(place)) for place in (folder, *(folder / name for name in _COLORS)) if place.is_dir())
     is_colmap = any((folder / place).exists() for place in ("sparse", "images.bin", "images.txt"))
     return f"depth is missing: images{' of a COLMAP model' if is_colmap else ''} alone ({num})" if num else ""
 
 
-def readable_in(folder: Path) -> str:
+def _readable_in(folder: Path) -> str:
     """Names of readable parts, or ""."""
     found = []
     for name in names_in(folder)[:_MOST_LOOKED_AT]:

@@ -192,6 +192,8 @@ class _Builder:
         self._survey = survey
         self._options = options
         self._topics = topics
+        self._frame_id = frame_of(survey, topics.color, topics.depth)
+        self._is_registered = is_registered(survey, topics.color, topics.depth, topics.info, topics.depth_info)
 
     def build(self) -> Camera:
         """Build the camera. Raises InputError for the first problem."""
@@ -235,15 +237,6 @@ class _Builder:
             except InputError as error:
                 found.append(str(error).removeprefix(f"{self._path}: "))
         return list(dict.fromkeys(found))
-
-    @property
-    def _frame_id(self) -> str:
-        return frame_of(self._survey, self._topics.color, self._topics.depth)
-
-    @property
-    def _is_registered(self) -> bool:
-        topics = self._topics
-        return is_registered(self._survey, topics.color, topics.depth, topics.info, topics.depth_info)
 
     @property
     def _depth_scale(self) -> float | None:

@@ -96,7 +96,10 @@ class VideoLog(RawLog):
         for name, stream in streams.items():
             if stream is not None:
                 yield from _images(stream, None)
-                _count(name, stream, damage)
+                _lose(stream, list(stream.waiting))
+                for num, where in ((stream.num_early, _EARLY), (stream.num_late, _LATE)):
+                    if num:
+                        damage.add(f"{name}: {num} images of video {where} left out: {OFTENER}", num)
 
 
 def _stream(name: str) -> _Stream | None:
@@ -159,13 +162,6 @@ def _lose(stream: _Stream, numbers: list[int]) -> None:
         stream.num_early += len(numbers)
     else:
         stream.num_late += len(numbers)
-
-
-def _count(topic: str, stream: _Stream, damage: Damage) -> None:
-    _lose(stream, list(stream.waiting))
-    for num, where in ((stream.num_early, _EARLY), (stream.num_late, _LATE)):
-        if num:
-            damage.add(f"{topic}: {num} images of video {where} left out: {OFTENER}", num)
 
 
 SUFFIXES = (".mp4", ".mkv", ".mov", ".avi")
