@@ -28,7 +28,7 @@ from splatctrl_cli.checks.finding import (
 from splatctrl_cli.config.fixed import SCALE_DEPTH
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
-from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.capture.capture import is_capture
 from splatctrl_cli.recording.folder.image_folder import ImageFolderSource
 from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame

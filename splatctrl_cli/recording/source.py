@@ -14,16 +14,20 @@ from splatctrl_cli.formats.grid.grid_format import FORMAT, covers, header_facts
 from splatctrl_cli.formats.scene.scene_folder import run_value
 from splatctrl_cli.formats.scene.voxel_file import known_space, read_occupancy
 from splatctrl_cli.recording.calibrated import calibrated
-from splatctrl_cli.recording.capture.capture import CaptureSource, robot_description_of
-from splatctrl_cli.recording.capture.capture_header import is_capture, read_capture_header
+from splatctrl_cli.recording.capture.capture import (
+    CaptureSource,
+    is_capture,
+    read_capture_header,
+    robot_description_of,
+)
 from splatctrl_cli.recording.capture.capture_writer import check_not_partial
-from splatctrl_cli.recording.container.foreign import refuse_foreign
 from splatctrl_cli.recording.container.log_formats import (
     CONTAINERS,
     SUFFIXES,
     SessionLog,
     is_bag_folder,
     open_raw_log,
+    refuse_foreign,
 )
 from splatctrl_cli.recording.container.raw_log import RawLog
 from splatctrl_cli.recording.describe_file import describe_file

@@ -13,7 +13,7 @@ from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protoco
 from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.calibrated import LOGGED
-from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.capture.capture import is_capture
 from splatctrl_cli.recording.folder.dtu_source import DtuSource, view_numbers
 from splatctrl_cli.recording.folder.image_folder import ImageFolderSource
 from splatctrl_cli.recording.folder.layouts import has_views

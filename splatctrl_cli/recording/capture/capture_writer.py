@@ -23,7 +23,7 @@ from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.recording.capture.capture_header import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
+from splatctrl_cli.recording.capture.capture import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
 from splatctrl_cli.recording.log.messages import metres
 from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
 from splatctrl_cli.recording.log.stored_frame import (

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from splatctrl_cli.formats.unpacking import BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import standing_in, stands_for
-from splatctrl_cli.recording.container.mcap_file import McapFile
-from splatctrl_cli.recording.container.mcap_records import (
+from splatctrl_cli.recording.container.mcap_file import (
     CHANNEL,
     CHUNK,
     FIRST_OPCODE,
@@ -29,6 +28,7 @@ from splatctrl_cli.recording.container.mcap_records import (
     Channel,
     Chunk,
     ChunkIndex,
+    McapFile,
     Schema,
     Statistics,
     parse_record,

@@ -281,10 +281,15 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         stamps=_optional(StampsTable, content, "stamps", path) or StampsTable(),
         split=_optional(SplitTable, content, "split", path) or SplitTable(),
     )
-    choices = [("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)]
+    choices: list[tuple[str, str, tuple[str, ...]]] = [
+        ("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
+    ]
     if (poses := description.poses) is not None:
-        conventions = (("poses.convention", poses.convention, CONVENTIONS), ("poses.axes", poses.axes, AXES))
-        choices = [("poses.format", poses.format, FORMATS), *conventions, *choices]
+        choices[:0] = [
+            ("poses.format", poses.format, FORMATS),
+            ("poses.convention", poses.convention, CONVENTIONS),
+            ("poses.axes", poses.axes, AXES),
+        ]
     for key, value, allowed in choices:
         if value not in allowed:
             raise _refused(f"{path}: {key}: expected one of {', '.join(allowed)}, got {value!r}")

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_FEWEST_BACK, IMAGES_GAP, IMAGES_STEADY
+from splatctrl_cli.recording.container.mcap_file import ChunkIndex
 from splatctrl_cli.recording.container.mcap_log import LogIndex, McapLog
-from splatctrl_cli.recording.container.mcap_records import ChunkIndex
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import (
     CAMERA_INFO,

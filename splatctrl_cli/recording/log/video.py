@@ -17,8 +17,7 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.libraries import is_installed, of_extra
-from splatctrl_cli.recording.container.foreign import AZURE_KINECT, refuse_foreign
-from splatctrl_cli.recording.container.log_formats import open_raw_log
+from splatctrl_cli.recording.container.log_formats import AZURE_KINECT, open_raw_log, refuse_foreign
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import IMAGE, VIDEO, MessageDecoder, UndecodableMessageError, pack_image
 from splatctrl_cli.records import SECOND_NS, Stamps

@@ -7,8 +7,7 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.recording.calibrated import calibrated
-from splatctrl_cli.recording.capture.capture import CaptureSource
-from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.capture.capture import CaptureSource, is_capture
 from splatctrl_cli.recording.container.raw_log import RawLog
 from splatctrl_cli.recording.folder.folder_description import has_table
 from splatctrl_cli.recording.folder.layouts import has_views
@@ -21,9 +20,15 @@ from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.log.video import open_log
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.recording.state.lerobot import is_lerobot
-from splatctrl_cli.recording.state.state_csv import is_libfranka, libfranka_track, read_csv
-from splatctrl_cli.recording.state.state_table import ARRAY_FILES, dataset_track, described_track
+from splatctrl_cli.recording.state.state_table import (
+    ARRAY_FILES,
+    dataset_track,
+    described_track,
+    is_lerobot,
+    is_libfranka,
+    libfranka_track,
+    read_csv,
+)
 from splatctrl_cli.records import LossReport
 
 _FOR_CAMERAS = (
