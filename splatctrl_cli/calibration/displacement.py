@@ -25,8 +25,6 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.records import Float64, RgbdFrame, spread
 
-MEASURED = ("distance_mm", "sigma_mm", "num_pixels")
-
 
 def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, Any]]:
     """Rows of `displacement_of` by camera, without those that show too little of the robot.
@@ -39,7 +37,10 @@ def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[s
     found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
     rows = {camera: row for camera, row in found.items() if row is not None}
     if any(is_displaced(row) and not is_corrected(row) for row in rows.values()):
-        return {camera: {name: row[name] for name in MEASURED} for camera, row in rows.items()}
+        return {
+            camera: {name: row[name] for name in ("distance_mm", "sigma_mm", "num_pixels")}
+            for camera, row in rows.items()
+        }
     return rows
 
 

@@ -88,11 +88,6 @@ class LogWatch(JoinedLog):
         self._decoder = MessageDecoder()
         self._headed: dict[Topic, bool] = {}
 
-    @property
-    def first_ns(self) -> int | None:
-        """The first log time or stamp."""
-        return min((t.first_ns for t in self.times.values() if t.first_ns), default=None)
-
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """The log's messages, each observed."""
         for message in super().messages(damage, names):
@@ -339,7 +334,7 @@ def check_log(
         kind=log.container,
         duration_s=(last - first) * 1e-9,
         num_messages=found.num_messages,
-        start_ns=watch.first_ns,
+        start_ns=min((t.first_ns for t in watch.times.values() if t.first_ns), default=None),
         findings=[*findings, *of_states.findings],
         rates=[
             t.rate(is_read=found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS))

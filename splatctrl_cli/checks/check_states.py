@@ -20,8 +20,7 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Index, JointState, LossReport, spread
 from splatctrl_cli.robot.model import RobotModel
 
-TURN = 2 * np.pi
-DEGREES = 3.0 * TURN  # that no joint of an arm turns to, in radians
+DEGREES = 6 * np.pi  # [rad] that no joint of an arm turns to: three turns
 
 
 PoseVerdict = Literal["agree", "tool", "base", "disagree", "still"]  # of logged end-effector poses on a robot model
@@ -122,7 +121,8 @@ def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> 
     lower, upper, slack = model.lower[limited], model.upper[limited], limits.DEGREES_SLACK
     num_far = num_fit = 0
     worst, at_worst = np.full(len(lower), -np.inf), np.zeros(len(lower))  # of each joint
-    for q in _positions(states):
+    rows = states.position if isinstance(states, StateColumns) else np.array([state.position for state in states])
+    for q in blocks_of(rows):
         beyond = np.abs(q[:, limited]) - np.maximum(np.maximum(np.abs(lower), np.abs(upper)), 2 * np.pi)
         as_degrees = np.radians(q[:, limited])
         num_far += int((beyond.max(axis=1) > limits.ANGLES_FAR).sum())
@@ -181,14 +181,6 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
         offset, rest = bases[base]
         return _agreement("base", base, len(chosen), _spread(links[base], logged), invert_transform(offset), rest)
     return _agreement("disagree", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
-
-
-def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
-    return (
-        blocks_of(states.position)
-        if isinstance(states, StateColumns)
-        else iter([np.array([state.position for state in states])])
-    )
 
 
 def _posed(states: Sequence[JointState]) -> Index:

@@ -82,10 +82,12 @@ def _npz(path: Path, _head: bytes) -> Summary:
     ]
     names = {str(row[0]) for row in rows}
     kind = "occupancy grid" if "log_odds" in names else "distance grid" if {"sdf"} & names else "arrays"
-    return Summary(path=str(path), kind=kind, facts=facts, grids=(Grid(name="arrays", header=_ARRAY, rows=rows),))
-
-
-_ARRAY = ("array", "shape", "dtype")
+    return Summary(
+        path=str(path),
+        kind=kind,
+        facts=facts,
+        grids=(Grid(name="arrays", header=("array", "shape", "dtype"), rows=rows),),
+    )
 
 
 def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:

@@ -167,7 +167,7 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     grids = [
         Grid(
             name="topics",
-            header=_TOPIC_COLUMNS,
+            header=("topic", "type", "encoding", "count", "hz", "first message"),
             rows=rows,
             unused=[name for name, topic in found.topics.items() if _first(topic) == "-" and not _is_read(topic)],
         )
@@ -187,9 +187,6 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
         notes=tuple(notes),
         damaged=found.damage.count,
     )
-
-
-_TOPIC_COLUMNS = ("topic", "type", "encoding", "count", "hz", "first message")
 
 
 def _topic_row(entry: TopicSurvey) -> list[object]:
@@ -223,9 +220,6 @@ def _first(entry: TopicSurvey) -> str:
     return "-"
 
 
-_KNOWN_FILES = ("run.json", "splats.ply", "occupancy.npz", "field.json")
-
-
 def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     if is_capture(path):
         return _describe_capture(path)
@@ -234,7 +228,8 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
         return describe_log(open_log(path), options)
     if (layout := layout_of(path)) is not None:
         return _describe_images(path, open_layout(path, options), layout.name)
-    names = {name for name in _KNOWN_FILES if (path / name).is_file()}
+    known = ("run.json", "splats.ply", "occupancy.npz", "field.json")
+    names = {name for name in known if (path / name).is_file()}
     is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
     if not ("run.json" in names or "splats.ply" in names or is_dtu):
         refuse_foreign(path)

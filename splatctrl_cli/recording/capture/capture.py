@@ -37,7 +37,6 @@ from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceO
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, LossReport, UInt8
 
 FORMAT, VERSION = "splatctrl-capture", 1
-INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
 
 
 def check_header(file: Path, header: Mapping[str, Any]) -> None:
@@ -122,7 +121,7 @@ def read_capture_header(path: Path) -> dict[str, Any]:
 
 def _check_index(path: Path) -> None:
     sums = FileSums(path)
-    for name in INDEX_FILES:
+    for name in ("capture.json", "frames.csv", "joints.npz"):
         if not (path / name).is_file():
             raise InputError(f"{path / name}: missing", remedy=AGAIN)
         if sums.get(name) != sha256(path / name):
@@ -133,7 +132,6 @@ SUMS = "SHA256SUMS"
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
 MASKS = ("human", "valid")  # further columns, where the recording has such masks
 ROBOT = "robot_description.urdf"  # the URDF that the log itself brings, where it does
-_FURTHER = ((), *((mask,) for mask in MASKS), MASKS)  # columns of frames.csv after COLUMNS
 _MOST_ROW = 1 << 16  # bytes of a row
 _UNREADABLE = (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError)
 
@@ -166,7 +164,7 @@ class FrameRows:
             lines = iter(lambda: stream.readline(_MOST_ROW), b"")
             rows = csv.reader((line.decode("utf-8") for line in lines), strict=True)
             names = tuple(next(rows, ()))
-            if names[: len(COLUMNS)] != COLUMNS or names[len(COLUMNS) :] not in _FURTHER:
+            if names[: len(COLUMNS)] != COLUMNS or names[len(COLUMNS) :] not in ((), *zip(MASKS), MASKS):
                 raise InputError(f"{self._file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
             for values in filter(None, rows):
                 row = _checked(dict(zip(names, values, strict=True)))

@@ -44,10 +44,11 @@ class RawMessage:
 class Damage:
     """A record of what a pass over a log could not read.
 
-    remarks: counts of what is no damage, such as unsupported forms.
+    remarks: counts of what is no damage, such as unsupported forms. num_invalid: depth pixels that measure nothing.
     """
 
     count: int = 0
+    num_invalid: int = 0
     notes: list[str] = field(default_factory=list)
     remarks: Counter[str] = field(default_factory=Counter)
     _num_unsaid: int = 0

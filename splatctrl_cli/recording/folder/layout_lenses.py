@@ -127,12 +127,6 @@ def _arkit_lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
     return CameraTable(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy)
 
 
-_ARKIT_DOCS = """
-ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world to camera, interpolated | 1 mm, of
-    another size: nearest pixels | a `.pincam` per image
-"""
-
-
 FILE = "scene_camera.json"
 _REMEDY = "see BOP's format of datasets"
 COLOR_FOLDERS = ("rgb", "gray")
@@ -210,12 +204,6 @@ def _pose(entry: dict[str, Any]) -> Float64 | None:
     )
 
 
-_BOP_DOCS = """
-BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1.json`, `depth_cam1/` |
-    `cam_R_w2c`, `cam_t_w2c`; else `--camera-pose` | `depth_scale` of each image | `cam_K` of each image
-"""
-
-
 _CAMERAS = "cams/*_cam.txt"
 _NO_DEPTH = ("prob", "conf")  # in the names of maps beside depth
 _ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth, which stands behind a measured one
@@ -290,21 +278,37 @@ def _maps(folder: Path) -> Iterator[tuple[int, Path]]:
             yield int(number[0]), path
 
 
-_MVSNET_DOCS = """
-MVSNet scene: DTU's test set, BlendedMVS, Tanks and Temples, colmap2mvsnet | `cams/*_cam.txt`, with `images/`,
-    `blended_images/` or images beside it | world to camera, of the camera file | `.pfm` in a folder with `depth` in
-    its name; metres, or millimetres where the files' least depth is over 20, or `--depth-scale` for poses and depth |
-    of the camera file, for the image or a quarter of it
-"""
-
 ENTRIES = (
     Layout(
         name="ARKitScenes",
         order=7,
         matches=lambda folder: _frames(folder) is not None,
         read=read_arkit,
-        docs=_ARKIT_DOCS,
+        docs="""
+ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world to camera, interpolated | 1 mm, of
+    another size: nearest pixels | a `.pincam` per image
+""",
     ),
-    Layout(name="BOP scene", order=1, matches=lambda folder: bool(_sensors(folder)), read=read_bop, docs=_BOP_DOCS),
-    Layout(name="MVSNet scene", order=10, matches=marked(_CAMERAS), read=read_mvsnet, docs=_MVSNET_DOCS),
+    Layout(
+        name="BOP scene",
+        order=1,
+        matches=lambda folder: bool(_sensors(folder)),
+        read=read_bop,
+        docs="""
+BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1.json`, `depth_cam1/` |
+    `cam_R_w2c`, `cam_t_w2c`; else `--camera-pose` | `depth_scale` of each image | `cam_K` of each image
+""",
+    ),
+    Layout(
+        name="MVSNet scene",
+        order=10,
+        matches=marked(_CAMERAS),
+        read=read_mvsnet,
+        docs="""
+MVSNet scene: DTU's test set, BlendedMVS, Tanks and Temples, colmap2mvsnet | `cams/*_cam.txt`, with `images/`,
+    `blended_images/` or images beside it | world to camera, of the camera file | `.pfm` in a folder with `depth` in
+    its name; metres, or millimetres where the files' least depth is over 20, or `--depth-scale` for poses and depth |
+    of the camera file, for the image or a quarter of it
+""",
+    ),
 )

@@ -29,8 +29,6 @@ _COEFFICIENTS = {
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 SUPPLY = "add depth_file_path to each frame (16-bit PNG in mm, or .npy in m), or describe the files in a .toml"
-_DEPTHS = ("depth_file_path", "depth_path")
-_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 
 
 def read(folder: Path, options: SourceOptions) -> Description:
@@ -89,8 +87,9 @@ def _view(
     matrices: dict[str, Float64],
 ) -> ListedView:
     name, said = str(entry["file_path"]), {**content, **entry}
-    color = _image(path.parent / _with_slashes(name))
-    depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
+    color = _image(path.parent / name.replace("\\", "/"))
+    depth = _only(entry, ("depth_file_path", "depth_path"), path)
+    scale = _only(said, ("depth_unit_scale_factor", "integer_depth_scale"), path)
     mask = entry.get("mask_path")
     try:
         applied = float(content.get("applied_scale", 1.0))
@@ -102,11 +101,11 @@ def _view(
     return ListedView(
         name=name,
         color=color,
-        depth=None if depth is None else path.parent / _with_slashes(str(depth)),
+        depth=None if depth is None else path.parent / str(depth).replace("\\", "/"),
         matrix=matrix,
         camera=description.camera or named_lens(lenses, _camera(said, color, path), str(path)),
         depth_scale=unit,
-        valid=None if not mask else path.parent / _with_slashes(str(mask)),
+        valid=None if not mask else path.parent / str(mask).replace("\\", "/"),
     )
 
 
@@ -117,10 +116,6 @@ def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
         both = " and ".join(f"{key} = {value}" for key, value in found.items())
         raise InputError(f"{path}: {both} differ", remedy="leave one of them out")
     return next(iter(found.values()), None)
-
-
-def _with_slashes(name: str) -> str:
-    return name.replace("\\", "/")
 
 
 def _image(path: Path) -> Path:
@@ -168,9 +163,16 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
         ) from None
 
 
-_DOCS = """
+ENTRIES = (
+    Layout(
+        name="nerfstudio",
+        order=4,
+        matches=marked(*FILES),
+        read=read,
+        docs="""
 nerfstudio, instant-ngp, Blender | `transforms.json` or `transforms_train.json`, `depth_file_path` or `depth_path` |
     `transform_matrix`, without `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` too; of another size: nearest
     pixels | of the file or each frame; `mask_path` leaves pixels out
-"""
-ENTRIES = (Layout(name="nerfstudio", order=4, matches=marked(*FILES), read=read, docs=_DOCS),)
+""",
+    ),
+)

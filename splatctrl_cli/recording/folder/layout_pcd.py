@@ -247,9 +247,17 @@ def _depth_file(path: Path, camera: Intrinsics, first: Path, *, is_world: bool) 
     return stream.getvalue()
 
 
-_DOCS = """
+ENTRIES = (
+    Layout(
+        name="PCD clouds",
+        order=12,
+        matches=marked(f"*{SUFFIX}"),
+        read=read,
+        suffix=SUFFIX,
+        docs="""
 organised point clouds (extra `pcd`) | `X.pcd` of HEIGHT over 1, or a folder of them; ascii, binary, compressed |
     `VIEWPOINT` | z of the points in the camera; metres, or `--depth-scale` | fitted to the grid, to 0.5 px; so are
     `--intrinsics` checked
-"""
-ENTRIES = (Layout(name="PCD clouds", order=12, matches=marked(f"*{SUFFIX}"), read=read, suffix=SUFFIX, docs=_DOCS),)
+""",
+    ),
+)

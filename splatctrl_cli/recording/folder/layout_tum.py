@@ -169,18 +169,6 @@ def marker_to_camera(T_ground_truth: Float64) -> Float64:
     return np.asarray(_BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m"))
 
 
-_TUM_DOCS = """
-TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
-    within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
-    `--intrinsics`
-
-Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to the camera | as TUM; the published
-    transform's scale of 1.059 is left out | of its page
-
-ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
-"""
-
-
 def read_sun3d(folder: Path, options: SourceOptions) -> Description:
     """Describe images within the tolerance of a depth image."""
     colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
@@ -212,18 +200,31 @@ def _poses(path: Path) -> list[Float64]:
     return list(np.concatenate([rows, bottom], axis=1))
 
 
-_SUN3D_DOCS = """
-SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,
-    bits rotated by three, paired within 20 ms | `intrinsics.txt`, the first pixel's centre at 1
-"""
-
 ENTRIES = (
-    Layout(name="TUM RGB-D", order=0, matches=marked("rgb.txt depth.txt"), read=read_tum_folder, docs=_TUM_DOCS),
+    Layout(
+        name="TUM RGB-D",
+        order=0,
+        matches=marked("rgb.txt depth.txt"),
+        read=read_tum_folder,
+        docs="""
+TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
+    within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
+    `--intrinsics`
+
+Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to the camera | as TUM; the published
+    transform's scale of 1.059 is left out | of its page
+
+ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
+""",
+    ),
     Layout(
         name="SUN3D",
         order=8,
         matches=marked("image/ depth/ extrinsics/ intrinsics.txt"),
         read=read_sun3d,
-        docs=_SUN3D_DOCS,
+        docs="""
+SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,
+    bits rotated by three, paired within 20 ms | `intrinsics.txt`, the first pixel's centre at 1
+""",
     ),
 )

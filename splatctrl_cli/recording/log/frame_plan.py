@@ -74,11 +74,19 @@ class FramePlan:
         """Add frames (K,) with known poses (4, 4), masks by colour number; return their number."""
         first = len(self._poses)
         is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
-        number = self._cameras.index(camera)
         human = np.array([masks.get(index, NO_MASK) for index in color[is_known].tolist()], dtype=np.int64)
         num = int(is_known.sum())
         rows = first + np.arange(num)
-        fresh = np.stack([stamp_ns[is_known], np.full(num, number), color[is_known], depth[is_known], human, rows])
+        fresh = np.stack(
+            [
+                stamp_ns[is_known],
+                np.full(num, self._cameras.index(camera)),
+                color[is_known],
+                depth[is_known],
+                human,
+                rows,
+            ]
+        )
         columns = np.concatenate([self._columns, fresh], axis=1)
         self._columns = columns[:, np.lexsort((columns[2], columns[1], columns[0]))]
         return num

@@ -5,7 +5,7 @@ few at once as the log's order allows. For `ingest`, files that a capture can ke
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -33,14 +33,6 @@ from splatctrl_cli.recording.log.stored_frame import (
 from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, paired, survey
 from splatctrl_cli.recording.source_options import SourceOptions, still_note
 from splatctrl_cli.records import SECOND_NS, Float64, Index, LossReport, Record, UInt8, by_stamp
-
-
-@dataclass(kw_only=True)
-class _Pass:
-    """Findings of one pass, incomplete if it ends early."""
-
-    damage: Damage = field(default_factory=Damage)
-    num_invalid: int = 0
 
 
 class RosLogSource(Recording):
@@ -74,17 +66,17 @@ class RosLogSource(Recording):
         )
         self._loss = with_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
-        self._passes = [_Pass()]
+        self._passes = [Damage()]  # incomplete where a pass ends early
 
     @property
     def loss(self) -> LossReport:
         """The loss, with the undecodable images of the pass that met most."""
-        loss, most = self._loss, max(self._passes, key=lambda one: (one.damage.count, one.num_invalid))
+        loss, most = self._loss, max(self._passes, key=lambda one: (one.count, one.num_invalid))
         return replace(
             loss,
-            damaged=loss.damaged + most.damage.count,
+            damaged=loss.damaged + most.count,
             invalid_depth=most.num_invalid,
-            notes=[*loss.notes, *most.damage.all_notes],
+            notes=[*loss.notes, *most.all_notes],
         )
 
     def records(self) -> Iterator[Record]:
@@ -166,15 +158,15 @@ class RosLogSource(Recording):
 
     def _frames(self, *, lazily: bool = True) -> Iterator[StoredFrame]:
         """Yield frames; lazily: unchanged image files are decoded on demand."""
-        lost, decoder, checked = _Pass(), MessageDecoder(), set[str]()
+        lost, decoder, checked = Damage(), MessageDecoder(), set[str]()
         self._passes.append(lost)
-        for planned, messages in planned_images(self._log, self._plan, lost.damage, HeldMessages()):
+        for planned, messages in planned_images(self._log, self._plan, lost, HeldMessages()):
             camera = planned.camera
             is_whole = not lazily or camera.name not in checked  # the first depth is looked at
             try:
                 color, depth, *masks = _images(decoder, camera, messages, is_whole=is_whole)
             except UndecodableMessageError as error:
-                lost.damage.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
+                lost.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
                 continue
             where = f"{self._log.path}: topic {camera.human_topic}"
             human = [camera.labels(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]

@@ -23,8 +23,7 @@ NAMELESS = tuple(f"joint{number}" for number in range(1, 8))  # what a Franka's 
 _MAX_SKEW = 1e-2  # largest entry of R^T R - I of a pose that a robot logs
 
 
-def _none() -> Float64:
-    return np.zeros(0)
+_NONE: Float64 = np.zeros(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +39,7 @@ class RawJoints:
     position: Float64
     velocity: Float64
     log_time_ns: int = 0
-    commanded_velocity: Float64 = field(default_factory=_none)
+    commanded_velocity: Float64 = field(default_factory=lambda: _NONE)
     T_base_ee: Float64 | None = None
     note: str = ""
 
@@ -50,7 +49,7 @@ def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoint
     if type_name == JOINT_STATE:
         names, position = tuple(str(name) for name in message.name), _array(message.position)
         velocity = _array(message.velocity)
-        return [_checked("a JointState", message, names, position, velocity, _none(), log_time_ns, None)]
+        return [_checked("a JointState", message, names, position, velocity, _NONE, log_time_ns, None)]
     if type_name in FRANKA_STATES:
         return [_franka(message, log_time_ns)]
     if type_name == CONTROLLER_STATE:
@@ -102,7 +101,7 @@ def _controller(message: Any, log_time_ns: int) -> RawJoints:
     wanted = _filled(message, ("reference", "desired"), len(names))
     if actual is None:
         raise UndecodableMessageError(f"a controller state of {len(names)} joints without positions")
-    commanded = _none() if wanted is None else _array(wanted.velocities)
+    commanded = _NONE if wanted is None else _array(wanted.velocities)
     position, velocity = _array(actual.positions), _array(actual.velocities)
     return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
 
@@ -129,9 +128,9 @@ def _checked(
         stamp_ns=stamp_ns(message.header),
         names=names,
         position=position,
-        velocity=velocity if len(velocity) == len(names) else _none(),
+        velocity=velocity if len(velocity) == len(names) else _NONE,
         log_time_ns=log_time_ns,
-        commanded_velocity=commanded if len(commanded) == len(names) else _none(),
+        commanded_velocity=commanded if len(commanded) == len(names) else _NONE,
         T_base_ee=T_base_ee,
         note=f"{len(names)} names with {len(velocity)} velocities, which are not used" if is_odd else "",
     )
@@ -152,9 +151,9 @@ def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
                 stamp_ns=start_ns + after_ns,
                 names=names,
                 position=position,
-                velocity=velocity if len(velocity) == len(names) else _none(),
+                velocity=velocity if len(velocity) == len(names) else _NONE,
                 log_time_ns=log_time_ns + after_ns,
-                commanded_velocity=velocity if len(velocity) == len(names) else _none(),
+                commanded_velocity=velocity if len(velocity) == len(names) else _NONE,
             )
         )
     return states

@@ -26,8 +26,6 @@ from splatctrl_cli.recording.log.state_messages import NAMELESS, pose_of_columns
 from splatctrl_cli.recording.log.state_track import RawTrack
 from splatctrl_cli.records import Float64, Stamps
 
-_DESCRIBE = "describe the columns in a .toml (splatctrl help replay, Logs)"
-
 
 @dataclass(frozen=True, kw_only=True)
 class CsvTable:
@@ -141,7 +139,10 @@ def libfranka_track(table: CsvTable) -> RawTrack:
     num = len(NAMELESS)
     position = _block(table, "q", num)
     if position is None:
-        raise InputError(f"{table.path}: expected columns q[0] to q[6], got fewer", remedy=_DESCRIBE)
+        raise InputError(
+            f"{table.path}: expected columns q[0] to q[6], got fewer",
+            remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
+        )
     sent, desired = _sent(table, num), _block(table, "dq_d", num)
     wanted = {
         "position": position,
@@ -184,12 +185,12 @@ def _block(table: CsvTable, name: str, num: int) -> list[int] | None:
 def _sent(table: CsvTable, num: int) -> list[int] | None:
     sent = [table.names.index(n) for i in range(num) if (n := f"cmd.dq_d[{i}]") in table.names]
     if not sent:
-        sent = [_last(table.names, n) for i in range(num) if table.names.count(n := f"dq_d[{i}]") == 2]
+        sent = [
+            len(table.names) - 1 - table.names[::-1].index(n)
+            for i in range(num)
+            if table.names.count(n := f"dq_d[{i}]") == 2
+        ]
     return sent if len(sent) == num else None
-
-
-def _last(names: list[str], name: str) -> int:
-    return len(names) - 1 - names[::-1].index(name)
 
 
 INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_index"
@@ -236,8 +237,6 @@ def _file(folder: Path, episode: int) -> Path:
 
 UNITS = {"rad": 1.0, "deg": float(np.pi / 180.0)}
 TIME_UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-POSE_FRAMES = ("base", "world")
-POSE_ORDERS = ("rows", "columns")
 ARRAY_FILES: Mapping[str, type[ArrayFile]] = {
     ".npz": NpzFile,
     **dict.fromkeys([".h5", ".hdf5"], Hdf5File),
@@ -277,8 +276,8 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),
         "time_unit": tuple(TIME_UNITS_NS),
-        "pose_frame": POSE_FRAMES,
-        "pose_order": POSE_ORDERS,
+        "pose_frame": ("base", "world"),
+        "pose_order": ("rows", "columns"),
     }
     for key, allowed in choices.items():
         if getattr(table, key) not in allowed:
