@@ -189,20 +189,24 @@ def _joined(group: list[Finding]) -> Finding:
     return replace(worst, where=where, what=f"{len(names)} pause together; of {worst.where}: {worst.what}")
 
 
-def file_findings(spans: Mapping[str, tuple[int, int]]) -> Iterator[Finding]:
+def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
     """Files logged far apart; spans: first and last log time [ns]."""
+    found = []
     ordered = sorted((span, name) for name, span in spans.items() if name)
     for (before, name), (after, other) in pairwise(ordered):
         pause = (after[0] - before[1]) * _NS
         if pause > limits.FILES_APART:
-            yield warning(
-                "files-apart",
-                "files",
-                f"between {name} and {other} nothing was logged for {pause:.4g} s",
-                value=pause,
-                unit="s",
-                stamp_ns=before[1],
+            found.append(
+                warning(
+                    "files-apart",
+                    "files",
+                    f"between {name} and {other} nothing was logged for {pause:.4g} s",
+                    value=pause,
+                    unit="s",
+                    stamp_ns=before[1],
+                )
             )
+    return found
 
 
 def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:

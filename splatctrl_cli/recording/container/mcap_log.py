@@ -168,8 +168,9 @@ class McapLog(RawLog):
         """Yield these chunks' messages, anywhere in the file."""
         self._forget_changed()
         for index in chunks:
-            content = self._file.chunk_at(index)
-            yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
+            yield from self._chunk_messages(
+                self._file.chunk_at(index), index.chunk_start_offset, damage, names, is_cut=False
+            )
 
     def _forget_changed(self) -> tuple[int, int]:
         stat = self.path.stat()

@@ -146,8 +146,9 @@ class McapLog:
     def _add(self, topic: str, message: Any, stamp_ns: int) -> None:
         kind = message.__msgtype__
         if kind not in self._schemas:
-            text = self._store.generate_msgdef(kind, ros_version=2)[0]
-            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+            self._schemas[kind] = self._writer.register_schema(
+                kind, "ros2msg", self._store.generate_msgdef(kind, ros_version=2)[0].encode()
+            )
         if topic not in self._channels:
             qos = {"offered_qos_profiles": LATCHED} if topic == "/tf_static" else {}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
@@ -262,16 +263,20 @@ class FoxgloveLog:
         """Add numbers as a JSON object."""
         if topic not in self._channels:
             schema = {"type": "object", "properties": {name: {"type": ["number", "null"]} for name in values}}
-            made = self._writer.register_schema(f"splatctrl{topic}", "jsonschema", json.dumps(schema).encode())
-            self._channels[topic] = self._writer.register_channel(topic, "json", made)
+            self._channels[topic] = self._writer.register_channel(
+                topic,
+                "json",
+                self._writer.register_schema(f"splatctrl{topic}", "jsonschema", json.dumps(schema).encode()),
+            )
         self._write(topic, stamp_ns, json.dumps(dict(values), allow_nan=False).encode())
 
     def _add(self, topic: str, stamp_ns: int, message: Any) -> None:
         if hasattr(message, "timestamp"):
             message.timestamp.FromNanoseconds(stamp_ns)
         if topic not in self._channels:
-            schema = self._register(self._writer, type(message))
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema)
+            self._channels[topic] = self._writer.register_channel(
+                topic, "protobuf", self._register(self._writer, type(message))
+            )
         self._write(topic, stamp_ns, message.SerializeToString(deterministic=True))
 
     def _write(self, topic: str, stamp_ns: int, data: bytes) -> None:

@@ -60,8 +60,9 @@ class ImageFolderSource(Recording):
         self._lenses: dict[str, Lens] = {}
         self.guess = "" if self.has_clock else self._in_metres()
         """In which unit lengths look to be, in words; empty where they may be metres."""
-        lenses = sorted({view.lens.name for view in self._views})
-        refuse_unknown_cameras(path, (*options.camera_poses, *options.intrinsics), lenses)
+        refuse_unknown_cameras(
+            path, (*options.camera_poses, *options.intrinsics), sorted({view.lens.name for view in self._views})
+        )
         names = sorted({view.camera for view in self._views})
         self.cameras = tuple(names) if options.cameras is None else options.cameras
         refuse_unknown_cameras(path, self.cameras, names)

@@ -158,8 +158,9 @@ def _rectified(calibration: Calibration) -> Calibration:
         return pinhole
     lens, R = intrinsics_of(calibration), calibration.rotation if np.any(calibration.rotation) else None
     with suppress(InputError):  # of a lens that cannot be, nothing says what it saw
-        undone = Undistortion(intrinsics_of(pinhole), model, calibration.distortion, lens=lens, R=R)
-        return replace(pinhole, valid=undone.valid)
+        return replace(
+            pinhole, valid=Undistortion(intrinsics_of(pinhole), model, calibration.distortion, lens=lens, R=R).valid
+        )
     return pinhole
 
 

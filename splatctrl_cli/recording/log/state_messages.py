@@ -48,8 +48,9 @@ def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoint
     """States of a `STATE_TYPES` message, log time [ns]. Raises UndecodableMessageError."""
     if type_name == JOINT_STATE:
         names, position = tuple(str(name) for name in message.name), _array(message.position)
-        velocity = _array(message.velocity)
-        return [_checked("a JointState", message, names, position, velocity, _NONE, log_time_ns, None)]
+        return [
+            _checked("a JointState", message, names, position, _array(message.velocity), _NONE, log_time_ns, None)
+        ]
     if type_name in FRANKA_STATES:
         return [_franka(message, log_time_ns)]
     if type_name == CONTROLLER_STATE:
@@ -181,8 +182,9 @@ class JointStream:
         self.names = names
         self._stamps, self._log_times = array("q", stamp_ns.tolist()), array("q", log_time_ns.tolist())
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
-        shapes = {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}
-        self._columns = ColumnWriter(shapes, columns or {})
+        self._columns = ColumnWriter(
+            {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}, columns or {}
+        )
         if columns and len(self._columns) != len(self):
             raise ValueError(f"columns of other lengths than {len(self)}")
 

@@ -314,8 +314,10 @@ def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
         return survey(log), ()
     index = inner.index()
     found = _sampled(inner, index, video)
-    how = f"{size} bytes: described by index and first messages; neither checksums nor the rest were read"
-    return found, (*index.notes, how)
+    return found, (
+        *index.notes,
+        f"{size} bytes: described by index and first messages; neither checksums nor the rest were read",
+    )
 
 
 def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:

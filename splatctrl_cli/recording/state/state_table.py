@@ -217,12 +217,13 @@ def lerobot_preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
         ) from None
     if episode is None and num != 1:
         raise InputError(f"{folder}: {num} episodes", remedy="choose one in a .toml: [states] preset, file, episode")
-    found = {"time": "timestamp", "position": [POSITION], "episode": episode or 0}
-    return (
-        found
-        | ({"joints": names} if len(names) == size else {})
-        | {"file": str(_file(folder, episode or 0).absolute())}
-    )
+    return {
+        "time": "timestamp",
+        "position": [POSITION],
+        "episode": episode or 0,
+        **({"joints": names} if len(names) == size else {}),
+        "file": str(_file(folder, episode or 0).absolute()),
+    }
 
 
 def _file(folder: Path, episode: int) -> Path:

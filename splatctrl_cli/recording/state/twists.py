@@ -102,8 +102,9 @@ def _of_table(path: Path, name: str) -> LoggedTwists:
             remedy=_SEE,
         )
     columns = columns_of(path, TABLE, table.file)
-    groups = {"twist": [*table.linear, *table.angular]}
-    stamps, found = columns.read(table.time, TIME_UNITS_NS[table.time_unit], groups, table.epoch_ns)
+    stamps, found = columns.read(
+        table.time, TIME_UNITS_NS[table.time_unit], {"twist": [*table.linear, *table.angular]}, table.epoch_ns
+    )
     twists = found["twist"][: len(found["twist"])]
     if twists.shape != (len(stamps), 6):
         raise InputError(f"{path}: {TABLE}: expected 6 columns of {len(stamps)} rows, got {twists.shape[::-1]}")
