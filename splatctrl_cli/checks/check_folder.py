@@ -212,7 +212,15 @@ def check_folder(
     try:
         source = open_source(path, options)
     except InputError as wrong:
-        return _refused(path, kind if path.is_file() or is_capture(path) else "folder", wrong)
+        return CheckReport(
+            path=str(path),
+            kind=kind if path.is_file() or is_capture(path) else "folder",
+            duration_s=0.0,
+            num_messages=0,
+            start_ns=None,
+            findings=[error("refused", path.name, wrong.message.removeprefix(f"{path}: "), wrong.remedy)],
+            needs=needs(num_cameras=0, num_frames=0, states_lack=""),
+        )
     cameras: dict[str, _CameraWatch] = {}
     states, motion, is_whole = StateCollector(len(source.joint_names)), ImageMotion(), True
     findings: list[Finding] = []
@@ -261,18 +269,6 @@ def check_folder(
         ),
         of_states.model,
         only_errors=only_errors,
-    )
-
-
-def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:
-    return CheckReport(
-        path=str(path),
-        kind=kind,
-        duration_s=0.0,
-        num_messages=0,
-        start_ns=None,
-        findings=[error("refused", path.name, wrong.message.removeprefix(f"{path}: "), wrong.remedy)],
-        needs=needs(num_cameras=0, num_frames=0, states_lack=""),
     )
 
 

@@ -115,17 +115,13 @@ def read_capture_header(path: Path) -> dict[str, Any]:
             f"{file}: expected version {VERSION}, got {header.get('version')}", remedy="use a newer splatctrl"
         )
     check_header(file, header)
-    _check_index(path)
-    return header
-
-
-def _check_index(path: Path) -> None:
     sums = FileSums(path)
     for name in ("capture.json", "frames.csv", "joints.npz"):
         if not (path / name).is_file():
             raise InputError(f"{path / name}: missing", remedy=AGAIN)
         if sums.get(name) != sha256(path / name):
             raise InputError(f"{path / name}: its checksum differs from SHA256SUMS", remedy=AGAIN)
+    return header
 
 
 SUMS = "SHA256SUMS"

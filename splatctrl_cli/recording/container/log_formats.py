@@ -163,7 +163,10 @@ def is_bag_folder(path: Path) -> bool:
 
 def _open_folder(path: Path) -> RawLog:
     told, note = _metadata(path)
-    files = _ordered_files(path, told)
+    names = told.get("relative_file_paths")  # in recording order; else by numbers in names
+    files = [path / Path(name).name for name in dict.fromkeys(names or ())] or sorted(
+        _storage_files(path), key=lambda p: [int(n) for n in re.findall(r"\d+", p.name)]
+    )
     missing = [file.name for file in files if not file.is_file()]
     if missing:
         raise InputError(f"{path}: metadata.yaml names {missing[0]}, which is not there", remedy="copy the whole bag")
@@ -211,14 +214,6 @@ def _open_compressed(path: Path) -> RawLog:
         log = JoinedLog(path, (part,), part.container, files=(path,), note=f"{path.name}: {note}" if note else "")
         weakref.finalize(log, stack.pop_all().close)
     return log
-
-
-def _ordered_files(path: Path, told: dict[str, Any]) -> list[Path]:
-    """Files in recording order: metadata.yaml's, else by numbers in names."""
-    names = told.get("relative_file_paths")
-    if names:
-        return [path / Path(name).name for name in dict.fromkeys(names)]
-    return sorted(_storage_files(path), key=lambda p: [int(n) for n in re.findall(r"\d+", p.name)])
 
 
 def _storage_files(path: Path) -> list[Path]:

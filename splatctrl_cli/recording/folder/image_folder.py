@@ -27,7 +27,14 @@ from splatctrl_cli.recording.folder.folder_views import HOLDOUT, UNITS, View, fi
 from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
 from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
 from splatctrl_cli.recording.log.registration import DepthToColor, Lens, Undistortion, undistortion_of
-from splatctrl_cli.recording.log.stored_frame import Recording, StoredFrame, check_depth, human_mask, is_kept, is_png
+from splatctrl_cli.recording.log.stored_frame import (
+    Recording,
+    StoredFrame,
+    check_depth,
+    human_mask,
+    is_kept,
+    is_png,
+)
 from splatctrl_cli.recording.source_options import SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.records import Bool, Float32, Float64, LossReport, UInt8
 
@@ -52,6 +59,8 @@ class ImageFolderSource(Recording):
         self.name = path.name
         self._descriptions = tuple(map(with_transforms, descriptions))
         self._description = self._descriptions[0]
+        stamps = self._description.stamps
+        self.has_clock = stamps.rate is not None or stamps.names
         self._loss = LossReport()
         self._damaged: list[str] = []
         self._num_invalid = 0
@@ -79,12 +88,6 @@ class ImageFolderSource(Recording):
             f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
             remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
         )
-
-    @property
-    def has_clock(self) -> bool:
-        """True if [stamps] has a rate or names."""
-        stamps = self._description.stamps
-        return stamps.rate is not None or stamps.names
 
     @property
     def loss(self) -> LossReport:
