@@ -169,13 +169,12 @@ class _CameraWatch:
             RgbdFrame(
                 stamp_ns=depth.stamp_ns,
                 camera=camera,
-                color=color.color if color.color is not None else np.zeros((*depth.depth.shape, 3), np.uint8),
-                depth=depth.depth,
+                color=color.pixels,
+                depth=depth.pixels,
                 intrinsics=strided_lens(self.lens, depth.stride),
                 T_world_camera=poses[depth.stamp_ns],
             )
             for depth, color in zip(self.images.kept, self.colors.kept, strict=True)
-            if depth.depth is not None
         ]
 
 

@@ -3,9 +3,11 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_times import Thinned
@@ -24,23 +26,14 @@ class Kept:
     stride: int
     width: int
     height: int
-    depth: Float32 | None = None
-    color: UInt8 | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Thumbnail:
-    """An image of `limits.THUMBNAIL_COLUMNS` columns: depth (h, w) [m] or colour (h, w, 3)."""
-
-    stamp_ns: int
-    depth: Float32 | None = None
-    color: UInt8 | None = None
+    pixels: NDArray[Any]
 
 
 class ImageWatch:
     """Statistics of a topic's or camera's images, in bounded memory.
 
-    The first `limits.DECODED_IMAGES` are decoded, then every second, fourth, ... (`is_wanted`).
+    The first `limits.DECODED_IMAGES` are decoded, then every second, fourth, ... (`is_wanted`). thumbnails: stamp
+    [ns] and image of `limits.THUMBNAIL_COLUMNS` columns, depth (h, w) [m] or colour (h, w, 3).
     """
 
     def __init__(self, where: str, scale: float | None = None) -> None:
@@ -55,7 +48,7 @@ class ImageWatch:
         self.medians: Thinned[float] = Thinned(1000)
         self.shares: Thinned[float] = Thinned(1000)
         self.kept: Thinned[Kept] = Thinned(limits.KEPT_IMAGES)
-        self.thumbnails: list[Thumbnail] = []
+        self.thumbnails: list[tuple[int, NDArray[Any]]] = []
         self._wanted: Thinned[None] = Thinned(limits.DECODED_IMAGES)
 
     def is_wanted(self) -> bool:
@@ -77,14 +70,12 @@ class ImageWatch:
         height, width = color.shape[:2]
         self.add_undecoded(encoding, width, height)
         self.num_decoded += 1
-        if len(self.thumbnails) < limits.THUMBNAILS:
-            small = cv2.resize(color, thumbnail_size(width, height), interpolation=cv2.INTER_AREA)
-            self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, color=np.asarray(small, dtype=np.uint8)))
+        self._add_thumbnail(stamp_ns, color, cv2.INTER_AREA)
         if self.kept.is_next():
             stride = stride_of(height)
             small = cv2.resize(color, (-(-width // stride), -(-height // stride)), interpolation=cv2.INTER_AREA)
             kept = np.asarray(small, dtype=np.uint8)
-            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, color=kept))
+            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, pixels=kept))
 
     def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
         """Take a depth image (H, W) [m], 0 = none."""
@@ -104,11 +95,13 @@ class ImageWatch:
         if self.medians.is_next():
             self.medians.add(float(np.median(valid)) if valid.size else 0.0)
         if self.kept.is_next():
-            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, depth=small.copy()))
+            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, pixels=small.copy()))
+        self._add_thumbnail(stamp_ns, depth, cv2.INTER_NEAREST)
+
+    def _add_thumbnail(self, stamp_ns: int, image: NDArray[Any], interpolation: int) -> None:
         if len(self.thumbnails) < limits.THUMBNAILS:
-            size = thumbnail_size(width, height)
-            thumbnail = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
-            self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, depth=thumbnail))
+            size = thumbnail_size(image.shape[1], image.shape[0])
+            self.thumbnails.append((stamp_ns, cv2.resize(image, size, interpolation=interpolation)))
 
     def rescale(self, scale: float) -> None:
         """Set the scale [m per count] of a log that names it."""
@@ -117,8 +110,8 @@ class ImageWatch:
         if factor != 1.0:
             self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
             self.medians.change(lambda median: float(median * factor))
-            self.kept.change(lambda kept: kept if kept.depth is None else replace(kept, depth=kept.depth * factor))
-            self.thumbnails = [t if t.depth is None else replace(t, depth=t.depth * factor) for t in self.thumbnails]
+            self.kept.change(lambda kept: replace(kept, pixels=_scaled(kept.pixels, factor)))
+            self.thumbnails = [(stamp_ns, _scaled(image, factor)) for stamp_ns, image in self.thumbnails]
 
     @property
     def is_float(self) -> bool:
@@ -135,6 +128,11 @@ class ImageWatch:
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
+
+
+def _scaled(image: NDArray[Any], factor: np.float32) -> NDArray[Any]:
+    """The image, times a factor if it is depth."""
+    return image * factor if image.ndim == 2 else image
 
 
 def _constant(depth: Float32) -> list[float]:

@@ -202,11 +202,9 @@ def reduced_frames(
 
 def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
     """Depth in the undistorted colour view, reduced."""
-    assert kept.depth is not None
-    depth: NDArray[Any] = kept.depth
-    stride = kept.stride
+    depth, stride = kept.pixels, kept.stride
     if camera.depth_to_color is not None:
-        stride = max(1, round(camera.intrinsics.height / kept.depth.shape[0]))
+        stride = max(1, round(camera.intrinsics.height / kept.pixels.shape[0]))
         warp = camera.depth_to_color
         depth = DepthToColor(
             depth_intrinsics=strided_lens(warp.depth_intrinsics, kept.stride),
@@ -216,8 +214,8 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
     elif camera.undistortion is not None:
         depth = camera.undistortion.nearest(_enlarged(depth, kept))[::stride, ::stride]
     pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
-    if color is not None and color.color is not None:
-        pixels = color.color
+    if color is not None and color.pixels.ndim == 3:
+        pixels = color.pixels
         if camera.undistortion is not None:
             pixels = camera.undistortion.color(_enlarged(pixels, color))[:: color.stride, :: color.stride]
     if pixels.shape[:2] != depth.shape:
@@ -259,25 +257,23 @@ def image_motion(
 
 def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     """Depth with colour, where both share a view."""
-    colors = watch.images[topics.color].thumbnails if camera.depth_to_color is None else []
-    gray = {thumbnail.stamp_ns: thumbnail.color for thumbnail in colors}
+    gray = dict(watch.images[topics.color].thumbnails if camera.depth_to_color is None else ())
     at, frames = sorted(gray), []
     poses = {frame.stamp_ns: frame.T_world_camera for frame in posed}
     stamps = sorted(poses)
-    for thumbnail in watch.images[topics.depth].thumbnails:
-        near, depth = nearest(at, thumbnail.stamp_ns), thumbnail.depth
-        assert depth is not None
+    for stamp, depth in watch.images[topics.depth].thumbnails:
+        near = nearest(at, stamp)
         color = gray.get(near) if near is not None else None
-        if color is None or color.shape[:2] != depth.shape:
+        if color is None or color.shape != (*depth.shape, 3):
             color = np.zeros((*depth.shape, 3), np.uint8)
         frames.append(
             RgbdFrame(
-                stamp_ns=thumbnail.stamp_ns,
+                stamp_ns=stamp,
                 camera=camera.name,
                 color=color,
                 depth=depth,
                 intrinsics=thumbnail_lens(camera.intrinsics),
-                T_world_camera=poses[nearest(stamps, thumbnail.stamp_ns) or stamps[0]],
+                T_world_camera=poses[nearest(stamps, stamp) or stamps[0]],
             )
         )
     return frames

@@ -23,7 +23,7 @@ from splatctrl_cli.recording.folder.folder_description import (
     read_description,
     read_rig,
 )
-from splatctrl_cli.recording.folder.folder_views import HOLDOUT, UNITS, View, find_files, length_unit, views_of
+from splatctrl_cli.recording.folder.folder_views import UNITS, View, find_files, length_unit, views_of
 from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
 from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
 from splatctrl_cli.recording.log.registration import DepthToColor, Lens, Undistortion, undistortion_of
@@ -38,7 +38,6 @@ from splatctrl_cli.recording.log.stored_frame import (
 from splatctrl_cli.recording.source_options import SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.records import Bool, Float32, Float64, LossReport, UInt8
 
-__all__ = ["HOLDOUT", "ImageFolderSource"]
 _NOT_FOR_FOLDERS = (
     *("world_frame", "camera_topics", "camera_pose_topics", "human_topics"),
     *("joint_topic", "stamps"),

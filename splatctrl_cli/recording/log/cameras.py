@@ -28,7 +28,7 @@ from splatctrl_cli.recording.log.decoder import (
     is_ros,
     stamp_ns,
 )
-from splatctrl_cli.recording.log.image_names import DEPTH, is_other, word_of
+from splatctrl_cli.recording.log.messages import DEPTH, is_other, word_of
 from splatctrl_cli.recording.log.registration import is_distorted, lens_model
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.recording.log.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video
