@@ -190,7 +190,7 @@ def reduced_frames(
     kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
     frames = []
     for kept in depths.kept if depths is not None else ():
-        near = nearest(sorted(kept_colors), kept.stamp_ns)
+        near = min(sorted(kept_colors), key=lambda stamp: abs(stamp - kept.stamp_ns), default=None)
         is_near = near is not None and abs(near - kept.stamp_ns) <= options.pairing_tolerance_s * 1e9
         color = kept_colors[near] if near is not None and is_near else None
         stamp_ns = kept.stamp_ns if color is None else color.stamp_ns
@@ -235,14 +235,6 @@ def _enlarged(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
     return np.repeat(rows, kept.stride, axis=1)[:, : kept.width]
 
 
-def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:
-    """The nearest of sorted stamps."""
-    if not stamps:
-        return None
-    after = int(np.searchsorted(np.array(stamps), stamp_ns))
-    return min(stamps[max(0, after - 1) : after + 1], key=lambda stamp: abs(stamp - stamp_ns))
-
-
 def image_motion(
     watch: LogWatch, cameras: Sequence[tuple[CameraTopics, Camera]], frames: Mapping[str, Sequence[RgbdFrame]]
 ) -> ImageMotion:
@@ -259,10 +251,9 @@ def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Se
     """Depth with colour, where both share a view."""
     gray = dict(watch.images[topics.color].thumbnails if camera.depth_to_color is None else ())
     at, frames = sorted(gray), []
-    poses = {frame.stamp_ns: frame.T_world_camera for frame in posed}
-    stamps = sorted(poses)
+    poses = {frame.stamp_ns: frame.T_world_camera for frame in sorted(posed, key=lambda frame: frame.stamp_ns)}
     for stamp, depth in watch.images[topics.depth].thumbnails:
-        near = nearest(at, stamp)
+        near = min(at, key=lambda other: abs(other - stamp), default=None)
         color = gray.get(near) if near is not None else None
         if color is None or color.shape != (*depth.shape, 3):
             color = np.zeros((*depth.shape, 3), np.uint8)
@@ -273,7 +264,7 @@ def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Se
                 color=color,
                 depth=depth,
                 intrinsics=thumbnail_lens(camera.intrinsics),
-                T_world_camera=poses[nearest(stamps, stamp) or stamps[0]],
+                T_world_camera=poses[min(poses, key=lambda other: abs(other - stamp))],
             )
         )
     return frames

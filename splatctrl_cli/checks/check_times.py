@@ -67,18 +67,10 @@ class TimesWatch:
         """Take the next message."""
         self.count += 1
         self.num_zero += self.has_stamps and stamp_ns == 0
-        if self.count == 1:
-            self.first_ns = self.last_ns = self._latest_ns = stamp_ns
-        else:
-            self._step(stamp_ns)
-        if self.has_stamps and self._delays.is_next():
-            self._delays.add((log_ns * _NS, (log_ns - stamp_ns) * _NS))
-        self.first_ns, self.last_ns = min(self.first_ns, stamp_ns), max(self.last_ns, stamp_ns)
-        self._latest_ns = stamp_ns
-
-    def _step(self, stamp_ns: int) -> None:
         interval = stamp_ns - self._latest_ns
-        if interval == 0:
+        if self.count == 1:
+            self.first_ns = self.last_ns = stamp_ns
+        elif interval == 0:
             self.num_duplicates += 1
             self.first_duplicate_ns = self.first_duplicate_ns or stamp_ns
         elif interval < 0:
@@ -88,11 +80,13 @@ class TimesWatch:
         else:
             if self._intervals.is_next():
                 self._intervals.add(interval * _NS)
-            entry = (interval, self._latest_ns)
-            if len(self._longest) < limits.KEPT_GAPS:
-                heapq.heappush(self._longest, entry)
-            else:
-                heapq.heappushpop(self._longest, entry)
+            heapq.heappush(self._longest, (interval, self._latest_ns))
+            if len(self._longest) > limits.KEPT_GAPS:
+                heapq.heappop(self._longest)
+        if self.has_stamps and self._delays.is_next():
+            self._delays.add((log_ns * _NS, (log_ns - stamp_ns) * _NS))
+        self.first_ns, self.last_ns = min(self.first_ns, stamp_ns), max(self.last_ns, stamp_ns)
+        self._latest_ns = stamp_ns
 
     @property
     def median_interval(self) -> float | None:
