@@ -18,7 +18,7 @@ from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.recording.log.messages import metres
 from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_columns import StateColumns
-from splatctrl_cli.recording.log.stored_frame import FrameSource, JointTopics, Recording, StoredFrame
+from splatctrl_cli.recording.log.stored_frame import FrameSource, JointTopics, StoredFrame
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions
 from splatctrl_cli.records import SECOND_NS, Float32, Float64, LossReport, RgbdFrame
 
@@ -115,7 +115,7 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
     return source if perturbation is None else PerturbedSource(source, perturbation)
 
 
-class CalibratedSource(Recording):
+class CalibratedSource(FrameSource):
     """Another source's records, corrected by a calibration.
 
     Joint states move to the frames' clock. A moving camera takes its pose at the frame's time on the robot's clock:
@@ -283,7 +283,7 @@ class Perturbation:
         return np.random.default_rng([self.seed, zlib.crc32(camera.encode()), stamp_ns % 2**63])
 
 
-class PerturbedSource(Recording):
+class PerturbedSource(FrameSource):
     """Another source's records, perturbed in memory."""
 
     def __init__(self, source: FrameSource, perturbation: Perturbation) -> None:

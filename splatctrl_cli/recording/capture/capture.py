@@ -25,7 +25,7 @@ from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.recording.log.state_topics import joint_records
 from splatctrl_cli.recording.log.stored_frame import (
     AGAIN,
-    Recording,
+    FrameSource,
     StoredFrame,
     human_mask,
     read_topics,
@@ -222,7 +222,7 @@ _NOT_FOR_CAPTURES = (
 )
 
 
-class CaptureSource(Recording):
+class CaptureSource(FrameSource):
     """Records of a capture folder; files with a wrong checksum are skipped and counted as damage.
 
     joints: a robot's, merged from the kept topics as from the log; if None, or no topic was kept, the states are

@@ -28,7 +28,7 @@ from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
 from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
 from splatctrl_cli.recording.log.registration import DepthToColor, Lens, Undistortion, undistortion_of
 from splatctrl_cli.recording.log.stored_frame import (
-    Recording,
+    FrameSource,
     StoredFrame,
     check_depth,
     human_mask,
@@ -44,13 +44,12 @@ _NOT_FOR_FOLDERS = (
 )
 
 
-class ImageFolderSource(Recording):
+class ImageFolderSource(FrameSource):
     """Frames of an image folder, without joint states.
 
     The descriptions, one per camera, differ only in files, lens and poses.
     """
 
-    joint_names: tuple[str, ...] = ()
     world_frame = "world"
 
     def __init__(self, path: Path, options: SourceOptions, *descriptions: Description) -> None:

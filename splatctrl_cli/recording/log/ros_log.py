@@ -20,8 +20,8 @@ from splatctrl_cli.recording.log.rig import Camera, build_cameras, nearest_gap_n
 from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.state_topics import joint_records
 from splatctrl_cli.recording.log.stored_frame import (
+    FrameSource,
     JointTopics,
-    Recording,
     StoredFrame,
     check_depth,
     decoded,
@@ -35,10 +35,8 @@ from splatctrl_cli.recording.source_options import SourceOptions, still_note
 from splatctrl_cli.records import SECOND_NS, Float64, Index, LossReport, Record, UInt8, by_stamp
 
 
-class RosLogSource(Recording):
+class RosLogSource(FrameSource):
     """Records of an MCAP or ROS bag."""
-
-    has_clock = True
 
     def __init__(self, log: RawLog, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
         options.refuse(("root", "holdout"), "a log", log.path)

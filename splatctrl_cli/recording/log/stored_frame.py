@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import prod
 from pathlib import Path
-from typing import IO, Any, Protocol, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,6 @@ from splatctrl_cli.records import (
     JointState,
     LossReport,
     Record,
-    RecordSource,
     RgbdFrame,
     UInt8,
     by_stamp,
@@ -213,40 +212,39 @@ class StoredFrame:
             raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
 
 
-class FrameSource(RecordSource, Protocol):
-    """A record source with frames as stored."""
+class FrameSource:
+    """A `RecordSource` by stamp: joint states, and `_frames`, which are read as stored.
 
-    @property
-    def world_frame(self) -> str:
-        """The source's frame of poses."""
-        ...
+    world_frame: the source's frame of poses. states: by stamp, without reading frames.
+    """
 
-    @property
-    def states(self) -> StateColumns:
-        """Joint states by stamp, without reading frames."""
-        ...
-
-    def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Yield `records`, undecoded."""
-        ...
-
-    def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp [ns], camera, T_world_camera (4, 4) by stamp, without images."""
-        ...
-
-
-class Recording:
-    """Records by stamp: joint states, and `_frames`."""
-
+    name: str
+    cameras: tuple[str, ...] = ()
+    joint_names: tuple[str, ...] = ()
+    has_clock: bool = True
+    world_frame: str
     states: StateColumns = NO_STATES
+
+    @property
+    def loss(self) -> LossReport:
+        """Complete once `records` is exhausted."""
+        raise NotImplementedError
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of every input file, by name."""
+        raise NotImplementedError
 
     def records(self) -> Iterator[Record]:
         """Yield joint states and decoded frames."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Yield joint states and stored frames."""
+        """Yield `records`, undecoded."""
         return by_stamp(self.states, self._frames())
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Yield stamp [ns], camera, T_world_camera (4, 4) by stamp, without images."""
+        return iter(())
 
     def _frames(self) -> Iterator[StoredFrame]:
         return iter(())

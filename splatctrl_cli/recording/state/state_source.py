@@ -15,7 +15,7 @@ from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.log.state_topics import joint_records, with_prefix
 from splatctrl_cli.recording.log.state_track import RawTrack, cleaned
-from splatctrl_cli.recording.log.stored_frame import FrameSource, Recording
+from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.log.video import open_log
 from splatctrl_cli.recording.source import open_source
@@ -38,11 +38,8 @@ _FOR_CAMERAS = (
 _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 
 
-class StateSource(Recording):
+class StateSource(FrameSource):
     """Joint states without frames."""
-
-    cameras: tuple[str, ...] = ()
-    has_clock = True
 
     def __init__(
         self, name: str, files: Sequence[Path], names: tuple[str, ...], states: StateColumns, loss: LossReport
