@@ -215,7 +215,8 @@ class StoredFrame:
 class FrameSource:
     """A `RecordSource` by stamp: joint states, and `_frames`, which are read as stored.
 
-    world_frame: the source's frame of poses. states: by stamp, without reading frames.
+    world_frame: the source's frame of poses. states: by stamp, without reading frames. joint_topics: those that a log
+    has, None if unknown.
     """
 
     name: str
@@ -224,6 +225,7 @@ class FrameSource:
     has_clock: bool = True
     world_frame: str
     states: StateColumns = NO_STATES
+    joint_topics: JointTopics | None = None
 
     @property
     def loss(self) -> LossReport:
