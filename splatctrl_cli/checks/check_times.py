@@ -94,12 +94,6 @@ class TimesWatch:
         return float(np.median(list(self._intervals))) if len(self._intervals) else None
 
     @property
-    def is_regular(self) -> bool:
-        """True if messages have a steady rate."""
-        median = self.median_interval
-        return median is not None and float(np.quantile(list(self._intervals), 0.9)) <= limits.REGULAR * median
-
-    @property
     def delays(self) -> Float64:
         """Rows (K, 2) [s]: log time, log time minus stamp."""
         return np.array(list(self._delays), dtype=np.float64).reshape(-1, 2)
@@ -112,8 +106,8 @@ class TimesWatch:
     def gaps(self) -> list[tuple[float, int]]:
         """Intervals [s] far above the median, with the stamp before each; none without a rate."""
         median = self.median_interval
-        if median is None or not self.is_regular:
-            return []
+        if median is None or float(np.quantile(list(self._intervals), 0.9)) > limits.REGULAR * median:
+            return []  # no steady rate
         limit = max(limits.GAP_SECONDS, limits.GAP_RATIO * median)
         return sorted(((i * _NS, at) for i, at in self._longest if i * _NS > limit), key=lambda gap: gap[1])
 

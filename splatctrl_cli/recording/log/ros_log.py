@@ -51,7 +51,15 @@ class RosLogSource(FrameSource):
             )
         if not found.num_messages:
             raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
-        self._rig = _rig(log, found, options)
+        try:
+            self._rig = build_cameras(log, found, options)
+        except InputError as error:
+            if not found.damage.count:
+                raise
+            raise InputError(
+                f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
+                remedy=f"copy the file again; if this is all there is: {error.remedy}",
+            ) from None
         self._tf = found.tf
         self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.all_notes, *found.tf.notes])
         self.cameras = tuple(camera.name for camera in self._rig)
@@ -227,18 +235,6 @@ def _stored_frame(
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
         places=tuple(replace(message, data=b"") for message in messages),
     )
-
-
-def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
-    try:
-        return build_cameras(log, found, options)
-    except InputError as error:
-        if not found.damage.count:
-            raise
-        raise InputError(
-            f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
-            remedy=f"copy the file again; if this is all there is: {error.remedy}",
-        ) from None
 
 
 def _times(found: Survey, camera: Camera) -> str:
