@@ -147,7 +147,10 @@ def estimate_clock_offset(
     num = sum(len(camera.changes) for camera in cameras)
     if len(states) < 3 or num < limits.MOTION_INTERVALS:
         return _unknown(num, f"expected at least {limits.MOTION_INTERVALS} times between frames and 3 states")
-    states, robot = _near(states, robot, cameras)
+    first, last = _span(cameras)
+    near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
+    states = [states[index] for index in near]
+    robot = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
     if len(states) < 3:
         return _unknown(num, f"no joint states within {limits.OFFSET_REACH:g} s of the frames")
     position = np.array([state.position for state in states])
@@ -212,16 +215,6 @@ def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, f
 
 def _since(camera: CameraMotion, start: int) -> Float64:
     return np.array([stamp - start for stamp in camera.stamps_ns]) * 1e-9
-
-
-def _near(
-    states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
-) -> tuple[list[JointState], RobotPoints | None]:
-    first, last = _span(cameras)
-    near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
-    return [states[index] for index in near], (
-        None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
-    )
 
 
 def _pixel_scores(

@@ -31,10 +31,11 @@ from splatctrl_cli.recording.container.log_formats import (
 )
 from splatctrl_cli.recording.container.raw_log import RawLog
 from splatctrl_cli.recording.describe_file import describe_file
-from splatctrl_cli.recording.folder.image_folder import ImageFolderSource, open_image_folder
-from splatctrl_cli.recording.folder.layouts import (
+from splatctrl_cli.recording.folder.image_folder import (
+    ImageFolderSource,
     has_views,
     layout_of,
+    open_image_folder,
     open_layout,
     unknown_folder,
 )

@@ -11,7 +11,6 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     JointTopics,
     StoredFrame,
     is_png,
+    npy_bytes,
     write_rows,
     write_topics,
 )
@@ -317,7 +317,7 @@ def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
-    return ("npy", _npy(stored.depth)) if counts is None else ("png", encoded(counts))
+    return ("npy", npy_bytes(stored.depth)) if counts is None else ("png", encoded(counts))
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
@@ -335,12 +335,6 @@ def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
     if not is_written:
         raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
     return bytes(data)
-
-
-def _npy(depth: Float32) -> bytes:
-    stream = BytesIO()
-    np.save(stream, np.ascontiguousarray(depth, dtype="<f4"), allow_pickle=False)
-    return stream.getvalue()
 
 
 def _write_joints(path: Path, states: StateColumns) -> None:

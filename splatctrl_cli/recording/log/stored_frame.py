@@ -8,6 +8,7 @@ describes each K.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from io import BytesIO
 from math import prod
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -140,6 +141,13 @@ def write_rows(stream: IO[bytes], rows: Table) -> None:
     np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)})
     for block in blocks_of(rows):
         stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
+
+
+def npy_bytes(depth: Float32) -> bytes:
+    """The .npy of a depth image (H, W)."""
+    stream = BytesIO()
+    np.save(stream, np.ascontiguousarray(depth, dtype="<f4"), allow_pickle=False)
+    return stream.getvalue()
 
 
 def _blocks(path: Path) -> Iterator[Float64]:
