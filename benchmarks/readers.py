@@ -24,7 +24,7 @@ from splatctrl_cli.formats.image_file import image_head, read_pfm, write_pfm
 from splatctrl_cli.formats.splat.splats import FORMATS
 from splatctrl_cli.recording.capture.capture import CaptureSource
 from splatctrl_cli.recording.container.bag_logs import Bag1Log, Db3Log
-from splatctrl_cli.recording.container.foxglove import MessageTypes
+from splatctrl_cli.recording.container.foxglove import read_protobuf
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage
 from splatctrl_cli.recording.folder.folder_description import read_description
@@ -140,7 +140,7 @@ def _messages() -> list[Reader]:
 
     def protobuf(data: bytes) -> object:
         size = int.from_bytes(data[:2], "little")
-        return MessageTypes(data[2 : 2 + size]).read("foxglove.RawImage", data[2 + size :])
+        return read_protobuf(data[2 : 2 + size], "foxglove.RawImage", data[2 + size :])
 
     types = descriptor_set()
     raws = tuple(  # nv24 has to end where its pixels do

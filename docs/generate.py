@@ -29,8 +29,8 @@ from splatctrl_cli.jobs.compare.judged_runs import scales
 from splatctrl_cli.jobs.replay.criteria import Judged
 from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS, PROOF, Limit
 from splatctrl_cli.jobs.replay.verdict import CRITERIA
+from splatctrl_cli.recording.folder.image_folder import LAYOUTS
 from splatctrl_cli.recording.folder.layout import Layout
-from splatctrl_cli.recording.folder.layouts import LAYOUTS
 
 DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"

@@ -39,10 +39,10 @@ class Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class Widths:
-    """Limits of the residuals that count: reach [m], and cut [sigma] (None: the reach alone decides)."""
+    """Limits of the residuals that count: reach [m], and cut [sigma] (by default the reach alone decides)."""
 
     reach: float
-    cut: float | None = None
+    cut: float = np.inf
 
 
 @dataclass(kw_only=True)
@@ -120,9 +120,7 @@ class Adjustment:
             if not len(rows.residual):
                 continue
             deviation = np.abs(rows.residual) / rows.sigma
-            cut = widths.reach / rows.sigma
-            if widths.cut is not None:
-                cut = np.minimum(cut, widths.cut)
+            cut = np.minimum(widths.reach / rows.sigma, widths.cut)
             weight = np.where(deviation < cut, np.square(1 - np.square(deviation / cut)), 0.0)
             is_free = rows.columns >= 0
             columns, J = rows.columns[is_free], rows.jacobian[:, is_free] / rows.sigma[:, None]
@@ -141,8 +139,13 @@ class Adjustment:
             counts[rows.between] = counts.get(rows.between, 0) + int((weight > 0).sum())
             deviations.append(deviation)
         every = np.concatenate(deviations) if deviations else np.zeros(0)
-        spread = 1.4826 * float(np.median(every)) if len(every) else 0.0
-        return Normal(H=H, g=g, scores=np.array(scores).reshape(-1, P), counts=counts, spread=spread)
+        return Normal(
+            H=H,
+            g=g,
+            scores=np.array(scores).reshape(-1, P),
+            counts=counts,
+            spread=1.4826 * float(np.median(every)) if len(every) else 0.0,
+        )
 
     def cost(self, estimate: Estimate, reach: float) -> tuple[float, int]:
         """Misfit, and the number of points that can be compared.

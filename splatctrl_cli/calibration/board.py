@@ -231,8 +231,7 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
                 f" moment (expected {fixed.CALIBRATION_BOARD_FEWEST} times)",
                 remedy=SHOW,
             )
-        recorded = _recorded(rig, by_camera[best][0])
-        placed[best] = invert_transform(recorded) @ middle_pose(votes[best])
+        placed[best] = invert_transform(_recorded(rig, by_camera[best][0])) @ middle_pose(votes[best])
     return placed
 
 

@@ -121,7 +121,16 @@ def read_calibration(path: Path) -> Calibration:
         found = content.get("version")
         raise InputError(f"{path}: expected version {VERSION}, got {found}", remedy="use a newer splatctrl")
     try:
-        return _calibration(content)
+        clock = content.get("clock")
+        return Calibration(
+            recording=str(content["recording"]),
+            world_frame=str(content["world_frame"]),
+            digests={str(name): str(value) for name, value in content["digests"].items()},
+            cameras={str(name): _camera(entry) for name, entry in content["cameras"].items()},
+            held=tuple(map(str, content["held"])),
+            clock=None if clock is None else _finite([clock["offset"]], 1)[0],
+            sigma_clock=0.0 if clock is None else _finite([clock["sigma"]], 1)[0],
+        )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: damaged: {type(error).__name__}: {error}", remedy=AGAIN) from None
 
@@ -156,19 +165,6 @@ def describe_calibration(path: Path) -> Summary:
     }
     return Summary(
         path=str(path), kind="calibration", facts=facts, grids=(Grid(name="cameras", header=header, rows=rows),)
-    )
-
-
-def _calibration(content: Mapping[str, Any]) -> Calibration:
-    clock = content.get("clock")
-    return Calibration(
-        recording=str(content["recording"]),
-        world_frame=str(content["world_frame"]),
-        digests={str(name): str(value) for name, value in content["digests"].items()},
-        cameras={str(name): _camera(entry) for name, entry in content["cameras"].items()},
-        held=tuple(map(str, content["held"])),
-        clock=None if clock is None else _finite([clock["offset"]], 1)[0],
-        sigma_clock=0.0 if clock is None else _finite([clock["sigma"]], 1)[0],
     )
 
 

@@ -119,12 +119,7 @@ def middle_of(adjustment: Adjustment, camera: str) -> tuple[Float64, float]:
     return middle, max(float(np.median(np.linalg.norm(cloud - middle, axis=1))), 0.05)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Plane:
-    """The largest plane in view: unit normal (3,), world, and a name."""
-
-    normal: Float64
-    name: str
+Plane = tuple[str, Float64]  # name, and unit normal (3,), world
 
 
 def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
@@ -140,7 +135,7 @@ def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
         return None
     near = normals[normals @ few[best] > np.cos(np.radians(15))]
     normal = near.mean(axis=0) / np.linalg.norm(near.mean(axis=0))
-    return Plane(normal=normal, name="table" if abs(normal[2]) > 0.9 else "wall")
+    return "table" if abs(normal[2]) > 0.9 else "wall", normal
 
 
 def unobserved(certainty: Certainty, camera: str, T_world_camera: Float64, plane: Plane | None) -> tuple[str, ...]:
@@ -178,14 +173,14 @@ def _named_directions(plane: Plane | None) -> Sequence[tuple[str, tuple[Float64,
                 for name, axis in zip(AXES, np.eye(3), strict=True)
             ),
         ]
-    normal = plane.normal
+    name, normal = plane
     first = np.eye(3)[int(np.argmin(np.abs(normal)))]
     first = first - normal * (first @ normal)
     first /= np.linalg.norm(first)
     within = (first, np.cross(normal, first))
     return [
-        (f"translation along the {plane.name}'s normal", (zero, normal)),
-        *((f"translation in the {plane.name}'s plane", (zero, axis)) for axis in within),
-        (f"rotation about the {plane.name}'s normal", (normal, zero)),
-        *((f"rotation about axes in the {plane.name}'s plane", (axis, zero)) for axis in within),
+        (f"translation along the {name}'s normal", (zero, normal)),
+        *((f"translation in the {name}'s plane", (zero, axis)) for axis in within),
+        (f"rotation about the {name}'s normal", (normal, zero)),
+        *((f"rotation about axes in the {name}'s plane", (axis, zero)) for axis in within),
     ]

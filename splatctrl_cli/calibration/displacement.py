@@ -25,8 +25,6 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.records import Float64, RgbdFrame, spread
 
-MEASURED = ("distance_mm", "sigma_mm", "num_pixels")
-
 
 def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, Any]]:
     """Rows of `displacement_of` by camera, without those that show too little of the robot.
@@ -39,7 +37,10 @@ def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[s
     found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
     rows = {camera: row for camera, row in found.items() if row is not None}
     if any(is_displaced(row) and not is_corrected(row) for row in rows.values()):
-        return {camera: {name: row[name] for name in MEASURED} for camera, row in rows.items()}
+        return {
+            camera: {name: row[name] for name in ("distance_mm", "sigma_mm", "num_pixels")}
+            for camera, row in rows.items()
+        }
     return rows
 
 
@@ -130,12 +131,11 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, An
     moved = points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]
     by_pose = np.hstack([np.cross(np.eye(POSE // 2), points.mean(axis=0)).T, np.eye(POSE // 2)])  # of their middle
     variance = float(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T))
-    row = {
+    return {
         "distance_mm": round(1e3 * float(np.sqrt(np.square(moved).sum(axis=1).mean())), 2),
         "sigma_mm": round(1e3 * variance**0.5, 2),
         "num_pixels": len(points),
-    }
-    return row, T
+    }, T
 
 
 def _rows(arm: Arm, frame: RgbdFrame, T_recorded_camera: Float64) -> ArmRows | None:

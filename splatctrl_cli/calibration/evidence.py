@@ -85,8 +85,9 @@ class Unknowns:
             columns = self.columns(camera)[POSE:]
             scale, bias = np.where(columns < 0, 0.0, step[columns])
             depth[camera] = (estimate.depth_of(camera)[0] + scale, estimate.depth_of(camera)[1] + bias)
-        clock = estimate.clock + (float(step[-1]) if self.has_clock else 0.0)
-        return Estimate(corrections=corrections, depth=depth, clock=clock)
+        return Estimate(
+            corrections=corrections, depth=depth, clock=estimate.clock + (float(step[-1]) if self.has_clock else 0.0)
+        )
 
 
 def transform_of(twist: Float64) -> Float64:
@@ -296,12 +297,15 @@ class Evidence:
 
     def thinned(self) -> "Evidence":
         """Fewer pairs and robot frames, for a first look."""
-        frames = [
-            frame
-            for camera in self.cameras
-            for frame in spread([f for f in self.frames if f.camera == camera], fixed.CALIBRATION_FEW[0])
-        ]
-        return replace(self, frames=frames, pairs=spread(self.pairs, fixed.CALIBRATION_FEW[1]))
+        return replace(
+            self,
+            frames=[
+                frame
+                for camera in self.cameras
+                for frame in spread([f for f in self.frames if f.camera == camera], fixed.CALIBRATION_FEW[0])
+            ],
+            pairs=spread(self.pairs, fixed.CALIBRATION_FEW[1]),
+        )
 
 
 def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
@@ -323,8 +327,13 @@ def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
             views.append(DepthView.of(still, fixed.CALIBRATION_POINTS[0], step))
             continue
         for frame in its:
-            seen = np.where(_robot_near(frame, arm), np.float32(0.0), frame.depth)
-            views.append(DepthView.of(replace(frame, depth=seen), fixed.CALIBRATION_POINTS[1], _step(frame, 1)))
+            views.append(
+                DepthView.of(
+                    replace(frame, depth=np.where(_robot_near(frame, arm), np.float32(0.0), frame.depth)),
+                    fixed.CALIBRATION_POINTS[1],
+                    _step(frame, 1),
+                )
+            )
     return Evidence(
         views=views,
         pairs=_pairs(views, moving),

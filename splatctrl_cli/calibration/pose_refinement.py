@@ -108,11 +108,18 @@ class BentViews:
         """Offsets of disparity (C, rows, columns), in the views' scaled lengths."""
         return (self._free @ self._basis.T).reshape(self._num, *fixed.BEND_GRID)
 
-    def equations(self, size: int, num_pairs: int) -> "BendEquations":
-        """Zero equations of one round with `size` pose unknowns."""
+    def begin(self, size: int) -> None:
+        """Begin a round with `size` pose unknowns: its equations are zero."""
         num = self._num * len(self._basis)
-        cross, own, slope = np.zeros((size, num)), np.zeros((num, num)), np.zeros(num)
-        return BendEquations(views=self, num_pairs=num_pairs, cross=cross, own=own, slope=slope)
+        self._cross, self._own, self._slope = np.zeros((size, num)), np.zeros((num, num)), np.zeros(num)
+
+    def add(self, i: int, j: int, rows: Rows, columns: Index, J: Float64) -> None:
+        """Add view i on view j to the round's equations, with pose derivatives J (R, F) in `columns` (F,)."""
+        by_offsets = self.by_offsets(i, j, rows)
+        self._cross[columns] += (by_offsets.T @ J).T
+        square = (by_offsets.T @ by_offsets).tocoo()
+        self._own[square.row, square.col] += square.data
+        self._slope[:] += by_offsets.T @ rows.residuals
 
     def by_offsets(self, i: int, j: int, rows: Rows) -> csr_array:
         """(R, C G) derivatives of view i's residuals on view j by offsets."""
@@ -128,13 +135,14 @@ class BentViews:
             parts.append(csr_array((values, nodes, weights.indptr), shape=(len(pixels), self._num * size)))
         return parts[0] + parts[1]
 
-    def joined(self, H: Float64, g: Float64, bent: "BendEquations") -> tuple[Float64, Float64]:
+    def joined(self, H: Float64, g: Float64, num_pairs: int) -> tuple[Float64, Float64]:
         """Pose equations H (P, P), g (P,), extended by the bends' free coordinates."""
         Q = np.kron(np.eye(self._num), self._basis)
-        R = bent.num_pairs * np.kron(np.eye(self._num), self._prior)
-        cross = bent.cross @ Q
-        whole = np.block([[H, cross], [cross.T, Q.T @ bent.own @ Q + R]])
-        return whole, np.concatenate([g, Q.T @ bent.slope + R @ self._free.ravel()])
+        R = num_pairs * np.kron(np.eye(self._num), self._prior)
+        cross = self._cross @ Q
+        return np.block([[H, cross], [cross.T, Q.T @ self._own @ Q + R]]), np.concatenate(
+            [g, Q.T @ self._slope + R @ self._free.ravel()]
+        )
 
     def move(self, step: Float64) -> None:
         """Take a step in the free coordinates."""
@@ -158,32 +166,6 @@ class BentViews:
                 depth, surface=surface, normals=normals, points=surface.reshape(-1, 3)[pixels],
                 point_normals=normals.reshape(-1, 3)[pixels],
             ))  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class BendEquations:
-    """The bends' part of the normal equations.
-
-    cross (P, C G): with poses; own (C G, C G), slope (C G,): alone.
-    """
-
-    views: BentViews
-    num_pairs: int
-    cross: Float64
-    own: Float64
-    slope: Float64
-
-    def add(self, i: int, j: int, rows: Rows, columns: Index, J: Float64) -> None:
-        """Add view i on view j, with pose derivatives J (R, F) in `columns` (F,)."""
-        by_offsets = self.views.by_offsets(i, j, rows)
-        self.cross[columns] += (by_offsets.T @ J).T
-        square = (by_offsets.T @ by_offsets).tocoo()
-        self.own[square.row, square.col] += square.data
-        self.slope[:] += by_offsets.T @ rows.residuals
-
-    def joined(self, H: Float64, g: Float64) -> tuple[Float64, Float64]:
-        """Pose equations H (P, P), g (P,), extended by these."""
-        return self.views.joined(H, g, self)
 
 
 def _pixels(view: GrayView) -> Index:
@@ -294,8 +276,9 @@ def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) ->
     views = [gray_view(frame, scale) for frame in frames]
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     every = np.ones(len(views), np.bool_)
-    numbers = [cameras.index(frame.camera) if frame.camera in cameras else HELD for frame in frames]
-    bends = BentViews(recorded=views, cameras=numbers)
+    bends = BentViews(
+        recorded=views, cameras=[cameras.index(frame.camera) if frame.camera in cameras else HELD for frame in frames]
+    )
     _solved(views, poses, overlapping(views, poses, every, every), every, bends)
     return dict(zip(cameras, np.round(bends.grids / scale, 7), strict=True))
 
@@ -322,8 +305,10 @@ def _solved(
         for k, i in enumerate(free):
             g[POSE * k : POSE * (k + 1)] = twist_between(recorded[i], poses[i])
         g *= prior
-        bent = None if bends is None else bends.equations(size, len(pairs))
-        now = views if bends is None else bends.now
+        now = views
+        if bends is not None:
+            bends.begin(size)
+            now = bends.now
         for i, j in pairs:
             rows = rows_of(now[i], now[j], invert_transform(poses[j]) @ poses[i], width)
             own, other = (POSE * column[k] + np.arange(POSE) for k in (i, j))
@@ -331,10 +316,10 @@ def _solved(
             columns, J = np.concatenate([own, other])[keep], rows.by_twists[:, keep]
             H[np.ix_(columns, columns)] += J.T @ J
             g[columns] += J.T @ rows.residuals
-            if bent is not None:
-                bent.add(i, j, rows, columns, J)
-        if bent is not None:
-            H, g = bent.joined(H, g)
+            if bends is not None:
+                bends.add(i, j, rows, columns, J)
+        if bends is not None:
+            H, g = bends.joined(H, g, len(pairs))
         step = -np.asarray(np.linalg.solve(H, g), np.float64)
         for k, i in enumerate(free):
             poses[i] = poses[i] @ transform_of(step[POSE * k : POSE * (k + 1)])

@@ -38,8 +38,11 @@ class Solution:
         near = some.solved(replace(start, depth=self.estimate.depth, clock=self.estimate.clock), WIDE)
         solution = _solution(some, some.solved(near, [narrow(some, near)]))
         within = np.linalg.solve(reach, known @ known.T @ reach)
-        covariance = within @ solution.certainty.covariance @ within.T
-        return replace(solution, noticed=self.noticed, certainty=replace(solution.certainty, covariance=covariance))
+        return replace(
+            solution,
+            noticed=self.noticed,
+            certainty=replace(solution.certainty, covariance=within @ solution.certainty.covariance @ within.T),
+        )
 
     @property
     def held(self) -> tuple[str, ...]:
@@ -54,8 +57,14 @@ def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution
     Raises NotEvaluableError if cameras share no surface, or two solutions fit alike.
     """
     cameras = evidence.cameras
-    free = [camera for camera in cameras if camera not in held]
-    adjustment = Adjustment(evidence, Unknowns(cameras=cameras, poses=free, has_clock=evidence.arm is not None))
+    adjustment = Adjustment(
+        evidence,
+        Unknowns(
+            cameras=cameras,
+            poses=[camera for camera in cameras if camera not in held],
+            has_clock=evidence.arm is not None,
+        ),
+    )
     few = Adjustment(evidence.thinned(), adjustment.unknowns)
     rough = [few.solved(begin, WIDE, rounds=fixed.CALIBRATION_ROUGH) for begin in _starts(adjustment.unknowns, start)]
     costs = _costs(few, rough)
@@ -106,8 +115,9 @@ def _better(a: Solution, b: Solution) -> Solution:
 
 def _solution(adjustment: Adjustment, estimate: Estimate) -> Solution:
     widths = narrow(adjustment, estimate)
-    certainty = certainty_of(adjustment, estimate, widths)
-    return Solution(estimate=estimate, certainty=certainty, adjustment=adjustment, widths=widths)
+    return Solution(
+        estimate=estimate, certainty=certainty_of(adjustment, estimate, widths), adjustment=adjustment, widths=widths
+    )
 
 
 def narrow(adjustment: Adjustment, estimate: Estimate) -> Widths:
@@ -179,7 +189,9 @@ def _with_depths(solution: Solution) -> Solution:
         for number, some in enumerate((unknowns.poses, unknowns.cameras))
     )
     found = _freed(solution, replace(unknowns, scales=scales, biases=biases))
-    return solution if any(_is_absurd(*found.estimate.depth_of(one)) for one in unknowns.cameras) else found
+    most_scale, most_bias = fixed.CALIBRATION_DEPTH_MOST
+    depths = map(found.estimate.depth_of, unknowns.cameras)
+    return solution if any(abs(scale - 1) > most_scale or abs(bias) > most_bias for scale, bias in depths) else found
 
 
 def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
@@ -248,11 +260,6 @@ def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
     return bool(is_clear and abs(change) > fixed.CALIBRATION_DEPTH_LEAST)
 
 
-def _is_absurd(scale: float, bias: float) -> bool:
-    most = fixed.CALIBRATION_DEPTH_MOST
-    return abs(scale - 1) > most[0] or abs(bias) > most[1]
-
-
 def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
     """Solve again with scales and biases, from the best of several scales."""
     evidence = solution.adjustment.evidence
@@ -260,11 +267,11 @@ def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
     estimates = []
     for scale in fixed.CALIBRATION_SCALES if unknowns.scales else (1.0,):
         depth = {camera: (scale * solution.estimate.depth_of(camera)[0], 0.0) for camera in unknowns.scales}
-        begin = replace(solution.estimate, depth=depth)
-        estimates.append(few.solved(begin, FREED, rounds=fixed.CALIBRATION_ROUGH))
+        estimates.append(few.solved(replace(solution.estimate, depth=depth), FREED, rounds=fixed.CALIBRATION_ROUGH))
     near = estimates[int(np.argmin(_costs(few, estimates)))]
-    freed = _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
-    return replace(freed, noticed=solution.noticed)
+    return replace(
+        _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)])), noticed=solution.noticed
+    )
 
 
 def _far(solution: Solution, camera: str) -> float:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ class DepthView:
     """One depth image, in its camera's optical frame [m].
 
     surface, normals (h, w, 3): per pixel, normals towards the camera, 0 if unknown. points, point_normals (K, 3): a
-    subset with normals; tiles (K,): the part of the image of each. T_world_camera (4, 4): as recorded.
+    subset with normals. T_world_camera (4, 4): as recorded.
     """
 
     camera: str
@@ -30,7 +29,6 @@ class DepthView:
     normals: Float64
     points: Float64
     point_normals: Float64
-    tiles: Index
 
     @classmethod
     def of(cls, frame: RgbdFrame, num_points: int, step: int = 1) -> "DepthView":
@@ -50,7 +48,6 @@ class DepthView:
             normals=normals,
             points=surface.reshape(-1, 3)[chosen],
             point_normals=normals.reshape(-1, 3)[chosen],
-            tiles=tiles_of(chosen, frame.depth.shape),
         )
 
 
@@ -79,8 +76,9 @@ def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
     depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
     lens = strided_lens(frame.intrinsics, stride)
     human = None if frame.human is None else frame.human[::stride, ::stride]
-    color = np.zeros((*depth.shape, 3), np.uint8)
-    return replace(frame, depth=depth, color=color, intrinsics=lens, human=human, valid=None)
+    return replace(
+        frame, depth=depth, color=np.zeros((*depth.shape, 3), np.uint8), intrinsics=lens, human=human, valid=None
+    )
 
 
 def surface_normals(surface: Float64, step: int = 1) -> Float64:
@@ -113,18 +111,7 @@ def bend(depth: Float32, step: int = 1) -> Float64:
     return np.asarray(0.5 * bent)
 
 
-class Surface(Protocol):
-    """Surface and normals (h, w, 3), with their lens."""
-
-    @property
-    def lens(self) -> Intrinsics: ...
-    @property
-    def surface(self) -> Float64: ...
-    @property
-    def normals(self) -> Float64: ...
-
-
-def landed(points: Float64, view: Surface) -> tuple[Bool, Float64, Float64]:
+def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
     """Return which points (K, 3), camera frame, land on depth (K,), and the surface and normals (K, 3) there."""
     is_ahead = points[:, 2] > fixed.PLAUSIBLE_DEPTH[0]
     pixels = np.round(project(view.lens, np.where(is_ahead[:, None], points, 1.0)))
@@ -175,8 +162,9 @@ def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
     count = near.sum(axis=0)
     mean = np.where(near, inverse, 0.0).sum(axis=0) / np.maximum(count, 1)
     holds = is_seen & (2 * count >= len(frames)) & (mean > 0)
-    still = np.where(holds, 1 / np.where(holds, mean, 1.0), 0.0).astype(np.float32)
-    return replace(frames[len(frames) // 2], depth=still)
+    return replace(
+        frames[len(frames) // 2], depth=np.where(holds, 1 / np.where(holds, mean, 1.0), 0.0).astype(np.float32)
+    )
 
 
 def depth_sigma(depth: NDArray[np.floating]) -> Float64:

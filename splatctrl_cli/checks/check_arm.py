@@ -149,12 +149,21 @@ def arm_finding(where: str, agreement: ArmAgreement, units: Iterable[float | Non
     share = f"{100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
     seen = f"in {agreement.num_frames} depth images {share} show what is behind it"
     if agreement.is_good and agreement.scale is None:
-        text = f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); {seen}"
-        return note("arm", where, text, value=round(1e3 * agreement.median, 1), unit="mm")
+        return note(
+            "arm",
+            where,
+            f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); {seen}",
+            value=round(1e3 * agreement.median, 1),
+            unit="mm",
+        )
     assert agreement.scale is not None
-    text = f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say"
-    remedy = f"{rescaled(units, 1 / agreement.scale)}, or check --base and the camera's pose"
-    return warning("arm", where, text, remedy, value=round(agreement.scale, 3))
+    return warning(
+        "arm",
+        where,
+        f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say",
+        f"{rescaled(units, 1 / agreement.scale)}, or check --base and the camera's pose",
+        value=round(agreement.scale, 3),
+    )
 
 
 def misplaced_finding(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
@@ -162,11 +171,15 @@ def misplaced_finding(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
     where = f"camera{'s' if len(bad) > 1 else ''} {', '.join(bad)}"
     off = ", ".join(f"{1e3 * agreement.misfit:.0f}" for agreement in bad.values())
     through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
-    text = f"the arm is not where the joints say: {off} mm off in the mean (each pixel counted as"
-    text = f"{text} {1e3 * limits.ARM_NEAR:.0f} mm at most); {through} % of its pixels show what is behind it"
-    remedy = cause or "check the URDF, --base, the joints' zeros and the camera's pose; robot labels will be wrong"
-    worst = max(agreement.misfit for agreement in bad.values())
-    return warning("arm", where, text, remedy, value=round(1e3 * worst, 1), unit="mm")
+    return warning(
+        "arm",
+        where,
+        f"the arm is not where the joints say: {off} mm off in the mean (each pixel counted as"
+        f" {1e3 * limits.ARM_NEAR:.0f} mm at most); {through} % of its pixels show what is behind it",
+        cause or "check the URDF, --base, the joints' zeros and the camera's pose; robot labels will be wrong",
+        value=round(1e3 * max(agreement.misfit for agreement in bad.values()), 1),
+        unit="mm",
+    )
 
 
 def motion_findings(
@@ -192,8 +205,12 @@ def motion_findings(
     offset = estimate_clock_offset(list(asked), motion)
     if offset.offset_s is None or offset.uncertainty_s is None:
         return [note("robot-clock", "joint states", offset.sentence), *found]
-    least = limits.TIME_OFFSET + 2 * offset.uncertainty_s
-    return [_clock_finding("joint states", offset.sentence, offset.offset_s, least), *found]
+    return [
+        _clock_finding(
+            "joint states", offset.sentence, offset.offset_s, limits.TIME_OFFSET + 2 * offset.uncertainty_s
+        ),
+        *found,
+    ]
 
 
 def _arm_findings(
@@ -257,21 +274,32 @@ def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
     same = {c: offset for c, offset in offsets.items() if c not in others}
     if len(same) == 2 and np.ptp(list(same.values())) > apart:
         return [*found, *(_offset_finding(f"camera {c}", offset, "") for c, offset in same.items())]
-    mean = float(np.mean(list(same.values())))
-    return [*found, _offset_finding("joint states", mean, f" ({len(same)} cameras)")]
+    return [*found, _offset_finding("joint states", float(np.mean(list(same.values()))), f" ({len(same)} cameras)")]
 
 
 def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
     error = limits.TIME_ERROR
-    text = f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * error:.0f} ms, by where"
-    text = f"{text} depth shows the arm){rest}"
-    found = _clock_finding(where, text, offset_s, limits.TIME_OFFSET + error)
-    return replace(found, value=round(1e3 * offset_s, 1))
+    return replace(
+        _clock_finding(
+            where,
+            f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * error:.0f} ms, by where"
+            f" depth shows the arm){rest}",
+            offset_s,
+            limits.TIME_OFFSET + error,
+        ),
+        value=round(1e3 * offset_s, 1),
+    )
 
 
 def _clock_finding(where: str, text: str, offset_s: float, least_s: float) -> Finding:
     """A warning beyond `least_s` [s], else a note."""
     is_off = abs(offset_s) > least_s
     make = warning if is_off else note
-    remedy = LATE.format("late" if offset_s > 0 else "early") if is_off else ""
-    return make("robot-clock", where, text, remedy, value=1e3 * offset_s, unit="ms")
+    return make(
+        "robot-clock",
+        where,
+        text,
+        LATE.format("late" if offset_s > 0 else "early") if is_off else "",
+        value=1e3 * offset_s,
+        unit="ms",
+    )

@@ -1,7 +1,7 @@
 """Checks of cameras: colour-depth pairs, intrinsics, distortion and poses."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -24,9 +24,8 @@ _DONE: Mapping[ImageLens, str] = {
 NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
 
-def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Finding]:
+def lens_findings(where: str, lens: Intrinsics, source: str = "") -> Iterator[Finding]:
     """Findings on intrinsics by image size; source: their origin."""
-    found: list[Finding] = []
     says = f"{source}: " if source else ""
     remedy = "calibrate again, or give the CameraInfo of this very stream (a crop or another size has its own)"
     off = [(c + 0.5) / size - 0.5 for c, size in ((lens.cx, lens.width), (lens.cy, lens.height))]
@@ -40,81 +39,104 @@ def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Findin
             size = f"{factor * lens.width:.0f}x{factor * lens.height:.0f}"
             text, remedy = f"{text}, as if calibrated at about {size}", f"scale K by {1 / factor:.3g}, or {remedy}"
             make = error
-        found.append(make("principal-point", where, text, remedy, value=round(100 * worst, 1), unit="%"))
+        yield make("principal-point", where, text, remedy, value=round(100 * worst, 1), unit="%")
     ratio = lens.fx / lens.fy
     if abs(ratio - 1) > limits.LENS_RATIO:
         text = (
             f"{says}fx / fy = {ratio:.3f} ({lens.fx:.1f}, {lens.fy:.1f} px): pixels are square in every RGB-D camera"
         )
-        found.append(warning("focal-ratio", where, text, remedy, value=ratio))
+        yield warning("focal-ratio", where, text, remedy, value=ratio)
     angle = math.degrees(2 * math.atan(0.5 * lens.width / lens.fx))
     low, high = limits.LENS_FIELD_OF_VIEW
     if not low <= angle <= high:
         text = (
             f"{says}field of view {angle:.0f} deg (fx {lens.fx:.1f} of {lens.width} px): expected {low:g} to {high:g}"
         )
-        found.append(warning("field-of-view", where, text, remedy, value=angle, unit="deg"))
-    return found
+        yield warning("field-of-view", where, text, remedy, value=angle, unit="deg")
 
 
-def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed: dict[str, int]) -> list[Finding]:
+def calibration_findings(
+    found: Survey, cameras: Sequence[CameraTopics], changed: dict[str, int]
+) -> Iterator[Finding]:
     """Findings on CameraInfo; `changed`: stamps of first changes."""
-    findings: list[Finding] = []
     for entry in found.of_type(CAMERA_INFO):
         name, calibration = entry.topic.name, entry.calibration
         if calibration is None:
             make = note if cameras and all(camera.info for camera in cameras) else warning
-            findings.append(make("uncalibrated", name, "K is zero: the camera was never calibrated"))
+            yield make("uncalibrated", name, "K is zero: the camera was never calibrated")
             continue
         if name in changed:
-            text = "the CameraInfo changes within the log; the first is used for all frames"
-            findings.append(warning("camera-info-changes", name, text, stamp_ns=changed[name]))
+            yield warning(
+                "camera-info-changes",
+                name,
+                "the CameraInfo changes within the log; the first is used for all frames",
+                stamp_ns=changed[name],
+            )
     for topic, info in dict.fromkeys((c.color, c.info) for c in cameras if c.info) | dict.fromkeys(
         (c.depth, c.depth_info) for c in cameras if c.depth_info
     ):
         its = found.topics[info].calibration
-        findings += [] if its is None else _distortion(info, its, topic, image_lens(found, topic, its))
+        finding = None if its is None else _distortion(info, its, topic, image_lens(found, topic, its))
+        if finding is not None:
+            yield finding
     for camera in cameras:
-        findings += _sizes(found, camera)
-        findings += _rivals(found, camera)
-    return findings
+        yield from _sizes(found, camera)
+        yield from _rivals(found, camera)
 
 
-def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens) -> list[Finding]:
+def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens) -> Finding | None:
     """Say how `ingest` treats the distortion of a topic's images."""
     d, model = calibration.distortion, lens_model(calibration.distortion_model)
     if not is_distorted(model, d):
-        return []
+        return None
     if model not in DISTORTION_MODELS:
-        remedy = f"rectify the images first; known: {', '.join(DISTORTION_MODELS)}"
-        return [error("distortion", name, f"distortion model {model!r} is unknown", remedy)]
+        return error(
+            "distortion",
+            name,
+            f"distortion model {model!r} is unknown",
+            f"rectify the images first; known: {', '.join(DISTORTION_MODELS)}",
+        )
     if len(d) not in NUM_DISTORTION[model]:
         expected = " or ".join(map(str, NUM_DISTORTION[model]))
-        text = f"{model} with {len(d)} coefficients, expected {expected}"
         is_read = len(d) in NUM_COEFFICIENTS if model != "equidistant" else len(d) > 4 and not np.any(d[4:])
         make = warning if is_read else error
-        return [make("distortion", name, text, "calibrate again", value=len(d))]
+        return make(
+            "distortion",
+            name,
+            f"{model} with {len(d)} coefficients, expected {expected}",
+            "calibrate again",
+            value=len(d),
+        )
     done = f"{model} ({', '.join(f'{v:.4g}' for v in d[:5])}): ingest {_DONE[lens]} {topic}"
     if lens == "distorted" and topic.endswith("rect_raw"):
-        remedy = "give --intrinsics NAME=FX,FY,CX,CY if the images are rectified"
-        return [warning("distortion", name, f"{done}, whose name says rectified", remedy)]
+        return warning(
+            "distortion",
+            name,
+            f"{done}, whose name says rectified",
+            "give --intrinsics NAME=FX,FY,CX,CY if the images are rectified",
+        )
     if lens == "contradicted":
-        remedy = "give --intrinsics NAME=FX,FY,CX,CY if the images are rectified, with D1,D2,... behind it if not"
-        return [error("distortion", name, f"{done}, whose name says rectified", remedy)]
-    return [note("distortion", name, done)]
+        return error(
+            "distortion",
+            name,
+            f"{done}, whose name says rectified",
+            "give --intrinsics NAME=FX,FY,CX,CY if the images are rectified, with D1,D2,... behind it if not",
+        )
+    return note("distortion", name, done)
 
 
-def _sizes(found: Survey, camera: CameraTopics) -> list[Finding]:
-    findings = []
+def _sizes(found: Survey, camera: CameraTopics) -> Iterator[Finding]:
     for topic, info in ((camera.color, camera.info), (camera.depth, camera.depth_info or camera.info)):
         image = found.topics[topic].first_image
         calibration = found.topics[info].calibration if info else None
         if image is None or calibration is None or calibration.width == 0:
             continue
         if (image.width, image.height) != (calibration.width, calibration.height):
-            text = f"{topic} is {image.width}x{image.height}, its CameraInfo {calibration.width}x{calibration.height}"
-            findings.append(error("camera-info-size", info, text))
-    return findings
+            yield error(
+                "camera-info-size",
+                info,
+                f"{topic} is {image.width}x{image.height}, its CameraInfo {calibration.width}x{calibration.height}",
+            )
 
 
 def _rivals(found: Survey, camera: CameraTopics) -> list[Finding]:
@@ -142,20 +164,23 @@ def _is_rival(entry: TopicSurvey, camera: CameraTopics, chosen: Calibration) -> 
     return is_same_view and not np.allclose(other.K, chosen.K, rtol=1e-3)
 
 
-def tf_findings(found: Survey, cameras: Sequence[CameraTopics], options: SourceOptions) -> list[Finding]:
+def tf_findings(found: Survey, cameras: Sequence[CameraTopics], options: SourceOptions) -> Iterator[Finding]:
     """Findings on separate trees, and on frames with two parents."""
     roots = found.tf.roots
-    findings = [warning("tf-parents", "tf", text, "let one node publish each frame") for text in found.tf.notes]
+    yield from (warning("tf-parents", "tf", text, "let one node publish each frame") for text in found.tf.notes)
     if len(roots) > 1:
         frames = {camera.name: _frame(found, camera.color) for camera in cameras}
         trees = {found.tf.root_of(frame) for frame in frames.values() if frame in found.tf.frames}
         text = f"{len(roots)} separate trees, with roots {', '.join(roots[:6])}"
         if len(trees) > 1 and not options.camera_poses:
-            remedy = "record the transform that joins them (hand-eye calibration), or choose with --cameras"
-            findings.append(error("tf-roots", "tf", f"{text}; the cameras are in more than one", remedy))
+            yield error(
+                "tf-roots",
+                "tf",
+                f"{text}; the cameras are in more than one",
+                "record the transform that joins them (hand-eye calibration), or choose with --cameras",
+            )
         else:
-            findings.append(note("tf-roots", "tf", text, "give --world-frame if the wrong one is taken"))
-    return findings
+            yield note("tf-roots", "tf", text, "give --world-frame if the wrong one is taken")
 
 
 def _frame(found: Survey, topic: str) -> str:
@@ -163,14 +188,13 @@ def _frame(found: Survey, topic: str) -> str:
     return "" if image is None else image.frame_id
 
 
-def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 | None]) -> list[Finding]:
+def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 | None]) -> Iterator[Finding]:
     """Images without pose, and jumps; stamps in order."""
-    findings: list[Finding] = []
     lost = [stamp for stamp, T in zip(stamps_ns, poses, strict=True) if T is None]
     if lost:
         share = f"{len(lost)} of {len(poses)} images have no pose"
         severity = error if len(lost) == len(poses) else warning
-        findings.append(severity("pose-missing", where, share, value=len(lost), stamp_ns=lost[0]))
+        yield severity("pose-missing", where, share, value=len(lost), stamp_ns=lost[0])
     known = [(s, T[:3, 3]) for s, T in zip(stamps_ns, poses, strict=True) if T is not None]
     steps = [
         (float(np.linalg.norm(b - a)), first)
@@ -181,59 +205,84 @@ def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 
         longest, at = max(steps)
         median = float(np.median([step for step, _ in steps]))
         if longest > max(limits.POSES_JUMP, limits.POSES_JUMP_RATIO * median):
-            text = f"the camera jumps by {longest:.3g} m from one frame to the next (median {median:.2g} m)"
-            findings.append(error("pose-jump", where, text, value=longest, unit="m", stamp_ns=at))
-    return findings
+            yield error(
+                "pose-jump",
+                where,
+                f"the camera jumps by {longest:.3g} m from one frame to the next (median {median:.2g} m)",
+                value=longest,
+                unit="m",
+                stamp_ns=at,
+            )
 
 
 def camera_findings(
     found: Survey, topics: CameraTopics, camera: Camera | None, options: SourceOptions
-) -> list[Finding]:
+) -> Iterator[Finding]:
     """Pairs, lens and poses of one camera."""
-    findings = [*_pairing(found, topics, options), *_lens(found, topics, options)]
+    yield from _pairing(found, topics, options)
+    yield from _lens(found, topics, options)
     if camera is None or camera.fixed_pose is not None:
-        return findings
+        return
     stamps = sorted(found.topics[topics.color].stamps_ns)[: limits.POSES_LOOKED_UP]
     tolerance_ns = round(options.pose_tolerance_s * 1e9)
-    poses = [camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in stamps]
-    return [*findings, *pose_findings(f"camera {topics.name}", stamps, poses)]
+    yield from pose_findings(
+        f"camera {topics.name}", stamps, [camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in stamps]
+    )
 
 
-def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> list[Finding]:
+def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> Iterator[Finding]:
     where = f"camera {camera.name}"
     color, depth = (found.topics[t].stamps_ns[: limits.PAIRED_STAMPS] for t in (camera.color, camera.depth))
     pairs = paired(color, depth, round(options.pairing_tolerance_s * 1e9)).tolist()
     rarer, other = sorted((len(color), len(depth)))
     if not pairs or not rarer:
         gap = nearest_gap_ns(color, depth) * 1e-9
-        text = f"no colour image has a depth image of its time; the closest are {1e3 * gap:.4g} ms apart"
-        remedy = f"give --pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right"
-        return [error("pairing", where, text, remedy, value=1e3 * gap, unit="ms")]
-    findings = []
+        yield error(
+            "pairing",
+            where,
+            f"no colour image has a depth image of its time; the closest are {1e3 * gap:.4g} ms apart",
+            f"give --pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right",
+            value=1e3 * gap,
+            unit="ms",
+        )
+        return
     if len(pairs) < limits.PAIRED_SHARE * rarer:
-        text = f"{len(pairs)} of {rarer} images find a partner within {1e3 * options.pairing_tolerance_s:g} ms"
-        remedy = "let the driver synchronise colour and depth, or give --pairing-tolerance"
-        findings.append(warning("pairing", where, text, remedy, value=len(pairs) / rarer))
+        yield warning(
+            "pairing",
+            where,
+            f"{len(pairs)} of {rarer} images find a partner within {1e3 * options.pairing_tolerance_s:g} ms",
+            "let the driver synchronise colour and depth, or give --pairing-tolerance",
+            value=len(pairs) / rarer,
+        )
     is_all = max(len(color), len(depth)) < limits.PAIRED_STAMPS
     if other > limits.RATE_SLOWER * rarer and rarer >= limits.RATE_FEWEST and is_all:
         names = ("depth", "colour") if len(depth) < len(color) else ("colour", "depth")
-        text = f"{rarer} {names[0]} images to {other} of {names[1]}: {other - len(pairs)} {names[1]} images go unused"
-        findings.append(note("rates-differ", where, text, value=rarer / other))
+        yield note(
+            "rates-differ",
+            where,
+            f"{rarer} {names[0]} images to {other} of {names[1]}: {other - len(pairs)} {names[1]} images go unused",
+            value=rarer / other,
+        )
     offset = float(np.median([depth[j] - color[i] for i, j in pairs])) * 1e-9
     if abs(offset) > limits.PAIRED_LATE:
-        text = f"depth is stamped {1e3 * offset:+.1f} ms against its colour image (median)"
-        findings.append(note("pair-offset", where, text, value=1e3 * offset, unit="ms"))
-    return findings
+        yield note(
+            "pair-offset",
+            where,
+            f"depth is stamped {1e3 * offset:+.1f} ms against its colour image (median)",
+            value=1e3 * offset,
+            unit="ms",
+        )
 
 
-def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> list[Finding]:
+def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> Iterator[Finding]:
     """Findings on the lens in use, and on depth's own."""
     where, image = f"camera {topics.name}", found.topics[topics.color].first_image
     given = options.intrinsics.get(topics.name)
     if given is not None and image is not None:
         fx, fy, cx, cy = given[:4]
-        lens = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=image.width, height=image.height)
-        return lens_findings(where, lens, "--intrinsics")
+        return lens_findings(
+            where, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=image.width, height=image.height), "--intrinsics"
+        )
     names = dict.fromkeys(name for name in (topics.info, topics.depth_info) if name)
     known = [(name, its) for name in names if (its := found.topics[name].calibration) is not None and its.width]
-    return [finding for name, its in known for finding in lens_findings(where, intrinsics_of(its), name)]
+    return (finding for name, its in known for finding in lens_findings(where, intrinsics_of(its), name))

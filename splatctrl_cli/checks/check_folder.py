@@ -1,6 +1,6 @@
 """Checks of a capture or image folder in one pass, judged as logs are."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from splatctrl_cli.checks.finding import (
 from splatctrl_cli.config.fixed import SCALE_DEPTH
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
-from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.capture.capture import is_capture
 from splatctrl_cli.recording.folder.image_folder import ImageFolderSource
 from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
@@ -70,8 +70,7 @@ def judged(
     findings += wrong if only_errors else [*wrong, *exposure_findings(corrected)]
     states = None if only_errors else evidence.states
     if states is not None and not any(finding.code == "joints-degrees" for finding in findings):
-        units = evidence.depth_units.values()
-        findings += motion_findings(corrected, evidence.motion, states, model, units)
+        findings += motion_findings(corrected, evidence.motion, states, model, evidence.depth_units.values())
     findings += [note("quick", Path(report.path).name, evidence.cut)] if evidence.cut else []
     return replace(report, findings=findings, frames=scaled)
 
@@ -82,39 +81,43 @@ def usable_frames(frames: Sequence[RgbdFrame], findings: Sequence[Finding]) -> l
     return [frame for frame in frames if f"camera {frame.camera}" not in wrong]
 
 
-def exposure_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
+def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
     """Brightness ratios per camera: between images of a surface, and between rows of an image."""
     cameras = sorted({frame.camera for frame in frames})
     whole = [frame for frame in frames if frame.depth.shape == frame.color.shape[:2]]
     chosen = [f for c in cameras for f in spread([f for f in whole if f.camera == c], limits.EXPOSURE_FRAMES)]
     depth = RecordedDepth.of(chosen)
     if depth is None:
-        return []
+        return
     scale = depth.median / SCALE_DEPTH
     is_free = np.ones(len(chosen), np.bool_)
     gains = band_ratios(chosen, scale, is_free, 1).gains(is_free)
     rows = _rows(band_ratios(chosen, scale, is_free, limits.EXPOSURE_BANDS), gains)
-    findings = []
     for camera in cameras:
         is_own = [frame.camera == camera for frame in chosen]
         own = gains[is_own, 0]
         ratio = float((own.max(axis=0) / own.min(axis=0)).max()) - 1
         if ratio > limits.EXPOSURE_RATIO:
-            what = f"one image shows a surface up to {100 * ratio:.0f} % brighter or more coloured than another"
-            remedy = (
-                "fix exposure and white balance in its driver; 'reconstruct --refine-exposure' corrects a still scene"
+            yield note(
+                "exposure",
+                f"camera {camera}",
+                f"one image shows a surface up to {100 * ratio:.0f} % brighter or more coloured than another",
+                "fix exposure and white balance in its driver;"
+                " 'reconstruct --refine-exposure' corrects a still scene",
+                value=round(100 * ratio, 1),
+                unit="%",
             )
-            findings.append(note("exposure", f"camera {camera}", what, remedy, value=round(100 * ratio, 1), unit="%"))
         uneven = float(np.exp(np.ptp(rows[is_own] - np.median(rows[is_own], axis=0), axis=1).max())) - 1
         if uneven > limits.EXPOSURE_UNEVEN:
-            what = f"rows of one image differ in exposure by up to {100 * uneven:.0f} %, unlike those of its others"
-            remedy = (
+            yield note(
+                "exposure-rows",
+                f"camera {camera}",
+                f"rows of one image differ in exposure by up to {100 * uneven:.0f} %, unlike those of its others",
                 "set the driver's anti-flicker to the mains frequency, or expose for whole periods of the lamp;"
-                " 'reconstruct --refine-exposure' has one gain for a whole image and leaves this as it is"
+                " 'reconstruct --refine-exposure' has one gain for a whole image and leaves this as it is",
+                value=round(100 * uneven, 1),
+                unit="%",
             )
-            value = round(100 * uneven, 1)
-            findings.append(note("exposure-rows", f"camera {camera}", what, remedy, value=value, unit="%"))
-    return findings
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
@@ -166,35 +169,33 @@ class _CameraWatch:
             RgbdFrame(
                 stamp_ns=depth.stamp_ns,
                 camera=camera,
-                color=color.color if color.color is not None else np.zeros((*depth.depth.shape, 3), np.uint8),
-                depth=depth.depth,
+                color=color.pixels,
+                depth=depth.pixels,
                 intrinsics=strided_lens(self.lens, depth.stride),
                 T_world_camera=poses[depth.stamp_ns],
             )
             for depth, color in zip(self.images.kept, self.colors.kept, strict=True)
-            if depth.depth is not None
         ]
 
 
-class _SourceWatch:
-    def __init__(self, num_joints: int) -> None:
-        self.cameras: dict[str, _CameraWatch] = {}
-        self.states = StateCollector(num_joints)
-        self.motion = ImageMotion()
-        self.is_whole = True
-
-    def read(self, source: FrameSource, num_images: int | None) -> None:
-        """Take all, or at most `num_images` per camera."""
-        for item in source.stored():
-            if isinstance(item, JointState):
-                self.states.add(item)
-                continue
-            if item.camera not in self.cameras:
-                self.cameras[item.camera] = _CameraWatch(item.intrinsics, f"camera {item.camera}", item.depth_unit)
-            self.cameras[item.camera].add(item, self.motion)
-            if len(self.cameras[item.camera].stamps) == num_images:
-                self.is_whole = False
-                return
+def _read(
+    source: FrameSource,
+    cameras: dict[str, _CameraWatch],
+    states: StateCollector,
+    motion: ImageMotion,
+    num_images: int | None,
+) -> bool:
+    """Take all (True), or at most `num_images` per camera."""
+    for item in source.stored():
+        if isinstance(item, JointState):
+            states.add(item)
+            continue
+        if item.camera not in cameras:
+            cameras[item.camera] = _CameraWatch(item.intrinsics, f"camera {item.camera}", item.depth_unit)
+        cameras[item.camera].add(item, motion)
+        if len(cameras[item.camera].stamps) == num_images:
+            return False
+    return True
 
 
 def check_folder(
@@ -210,23 +211,33 @@ def check_folder(
     try:
         source = open_source(path, options)
     except InputError as wrong:
-        return _refused(path, kind if path.is_file() or is_capture(path) else "folder", wrong)
-    watch = _SourceWatch(len(source.joint_names))
+        return CheckReport(
+            path=str(path),
+            kind=kind if path.is_file() or is_capture(path) else "folder",
+            duration_s=0.0,
+            num_messages=0,
+            start_ns=None,
+            findings=[error("refused", path.name, wrong.message.removeprefix(f"{path}: "), wrong.remedy)],
+            needs=needs(num_cameras=0, num_frames=0, states_lack=""),
+        )
+    cameras: dict[str, _CameraWatch] = {}
+    states, motion, is_whole = StateCollector(len(source.joint_names)), ImageMotion(), True
     findings: list[Finding] = []
     try:
-        watch.read(source, num_images)
+        is_whole = _read(source, cameras, states, motion, num_images)
     except InputError as wrong:
         findings.append(error("refused", path.name, wrong.message, wrong.remedy))
     findings += _losses(source, path.name)
-    cameras = dict(sorted(watch.cameras.items()))
+    cameras = dict(sorted(cameras.items()))
     if not cameras and not any(finding.code == "refused" for finding in findings):
         findings.append(error("missing", path.name, "no frame could be read", "copy or record it again"))
     for camera in cameras.values():
         findings += _camera_findings(camera, has_clock=source.has_clock)
     findings += sample_findings([camera.images for camera in cameras.values()])
-    logged = watch.states.columns()
-    lack = "" if len(logged) else "no joint states; give them apart (splatctrl help replay, Logs)"
-    of_states = RobotStates(model=model, lack=lack)
+    logged = states.columns()
+    of_states = RobotStates(
+        model=model, lack="" if len(logged) else "no joint states; give them apart (splatctrl help replay, Logs)"
+    )
     if len(logged) and source.has_clock:
         of_states = robot_states(model, source.joint_names, logged)
         findings += of_states.findings
@@ -245,49 +256,41 @@ def check_folder(
             states_lack=of_states.lack,
         ),
     )
-    evidence = Evidence(
-        frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
-        depth_units={name: camera.images.scale for name, camera in cameras.items()},
-        motion=watch.motion,
-        states=of_states.states,
-        is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
-        cut="" if watch.is_whole else f"only the first {num_images} frames of a camera were read",
-    )
-    return judged(report, evidence, of_states.model, only_errors=only_errors)
-
-
-def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:
-    return CheckReport(
-        path=str(path),
-        kind=kind,
-        duration_s=0.0,
-        num_messages=0,
-        start_ns=None,
-        findings=[error("refused", path.name, wrong.message.removeprefix(f"{path}: "), wrong.remedy)],
-        needs=needs(num_cameras=0, num_frames=0, states_lack=""),
+    return judged(
+        report,
+        Evidence(
+            frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
+            depth_units={name: camera.images.scale for name, camera in cameras.items()},
+            motion=motion,
+            states=of_states.states,
+            is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
+            cut="" if is_whole else f"only the first {num_images} frames of a camera were read",
+        ),
+        of_states.model,
+        only_errors=only_errors,
     )
 
 
-def _losses(source: FrameSource, where: str) -> list[Finding]:
+def _losses(source: FrameSource, where: str) -> Iterator[Finding]:
     loss = source.loss
-    findings = damage_findings(where, loss.notes[:50])
-    if not loss.damaged:
-        findings = [note("loss", where, text) for text in loss.notes[:50]]
+    if loss.damaged:
+        yield from damage_findings(where, loss.notes[:50])
+    else:
+        yield from (note("loss", where, text) for text in loss.notes[:50])
     for name, words in _LOST.items():
         count = getattr(loss, name)
         if count:
             code = "pose-missing" if name == "without_pose" else "pairing"
-            findings.append(warning(code, where, f"{count} {words}", "they are left out", value=count))
+            yield warning(code, where, f"{count} {words}", "they are left out", value=count)
     if loss.invalid_depth:
         text = f"{loss.invalid_depth} depth pixels are NaN, infinite, negative or 65535: they count as none"
-        findings.append(note("depth-invalid", where, text, value=loss.invalid_depth))
-    return findings
+        yield note("depth-invalid", where, text, value=loss.invalid_depth)
 
 
-def _camera_findings(camera: _CameraWatch, *, has_clock: bool) -> list[Finding]:
+def _camera_findings(camera: _CameraWatch, *, has_clock: bool) -> Iterator[Finding]:
     where = camera.images.where
-    findings = [*lens_findings(where, camera.lens), *depth_findings(camera.images)]
+    yield from lens_findings(where, camera.lens)
+    yield from depth_findings(camera.images)
     if has_clock:
-        findings += time_findings(camera.times, "frames")
-        findings += pose_findings(where, camera.stamps, camera.poses)
-    return findings
+        yield from time_findings(camera.times, "frames")
+        yield from pose_findings(where, camera.stamps, camera.poses)

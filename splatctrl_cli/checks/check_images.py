@@ -1,11 +1,13 @@
 """Checks of images: encodings, sizes, depth, and registration of depth to colour by edges."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_times import Thinned
@@ -24,23 +26,14 @@ class Kept:
     stride: int
     width: int
     height: int
-    depth: Float32 | None = None
-    color: UInt8 | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Thumbnail:
-    """An image of `limits.THUMBNAIL_COLUMNS` columns: depth (h, w) [m] or colour (h, w, 3)."""
-
-    stamp_ns: int
-    depth: Float32 | None = None
-    color: UInt8 | None = None
+    pixels: NDArray[Any]
 
 
 class ImageWatch:
     """Statistics of a topic's or camera's images, in bounded memory.
 
-    The first `limits.DECODED_IMAGES` are decoded, then every second, fourth, ... (`is_wanted`).
+    The first `limits.DECODED_IMAGES` are decoded, then every second, fourth, ... (`is_wanted`). thumbnails: stamp
+    [ns] and image of `limits.THUMBNAIL_COLUMNS` columns, depth (h, w) [m] or colour (h, w, 3).
     """
 
     def __init__(self, where: str, scale: float | None = None) -> None:
@@ -55,7 +48,7 @@ class ImageWatch:
         self.medians: Thinned[float] = Thinned(1000)
         self.shares: Thinned[float] = Thinned(1000)
         self.kept: Thinned[Kept] = Thinned(limits.KEPT_IMAGES)
-        self.thumbnails: list[Thumbnail] = []
+        self.thumbnails: list[tuple[int, NDArray[Any]]] = []
         self._wanted: Thinned[None] = Thinned(limits.DECODED_IMAGES)
 
     def is_wanted(self) -> bool:
@@ -77,14 +70,12 @@ class ImageWatch:
         height, width = color.shape[:2]
         self.add_undecoded(encoding, width, height)
         self.num_decoded += 1
-        if len(self.thumbnails) < limits.THUMBNAILS:
-            small = cv2.resize(color, thumbnail_size(width, height), interpolation=cv2.INTER_AREA)
-            self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, color=np.asarray(small, dtype=np.uint8)))
+        self._add_thumbnail(stamp_ns, color, cv2.INTER_AREA)
         if self.kept.is_next():
             stride = stride_of(height)
             small = cv2.resize(color, (-(-width // stride), -(-height // stride)), interpolation=cv2.INTER_AREA)
             kept = np.asarray(small, dtype=np.uint8)
-            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, color=kept))
+            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, pixels=kept))
 
     def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
         """Take a depth image (H, W) [m], 0 = none."""
@@ -104,11 +95,13 @@ class ImageWatch:
         if self.medians.is_next():
             self.medians.add(float(np.median(valid)) if valid.size else 0.0)
         if self.kept.is_next():
-            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, depth=small.copy()))
+            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, pixels=small.copy()))
+        self._add_thumbnail(stamp_ns, depth, cv2.INTER_NEAREST)
+
+    def _add_thumbnail(self, stamp_ns: int, image: NDArray[Any], interpolation: int) -> None:
         if len(self.thumbnails) < limits.THUMBNAILS:
-            size = thumbnail_size(width, height)
-            thumbnail = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
-            self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, depth=thumbnail))
+            size = thumbnail_size(image.shape[1], image.shape[0])
+            self.thumbnails.append((stamp_ns, cv2.resize(image, size, interpolation=interpolation)))
 
     def rescale(self, scale: float) -> None:
         """Set the scale [m per count] of a log that names it."""
@@ -117,8 +110,8 @@ class ImageWatch:
         if factor != 1.0:
             self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
             self.medians.change(lambda median: float(median * factor))
-            self.kept.change(lambda kept: kept if kept.depth is None else replace(kept, depth=kept.depth * factor))
-            self.thumbnails = [t if t.depth is None else replace(t, depth=t.depth * factor) for t in self.thumbnails]
+            self.kept.change(lambda kept: replace(kept, pixels=_scaled(kept.pixels, factor)))
+            self.thumbnails = [(stamp_ns, _scaled(image, factor)) for stamp_ns, image in self.thumbnails]
 
     @property
     def is_float(self) -> bool:
@@ -135,6 +128,11 @@ class ImageWatch:
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
+
+
+def _scaled(image: NDArray[Any], factor: np.float32) -> NDArray[Any]:
+    """The image, times a factor if it is depth."""
+    return image * factor if image.ndim == 2 else image
 
 
 def _constant(depth: Float32) -> list[float]:
@@ -166,21 +164,24 @@ def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
     return Intrinsics(fx=lens.fx * across, fy=lens.fy * down, cx=cx, cy=cy, width=width, height=height)
 
 
-def image_findings(images: ImageWatch) -> list[Finding]:
+def image_findings(images: ImageWatch) -> Iterator[Finding]:
     """Findings on the images, except depth."""
-    where, found = images.where, []
+    where = images.where
     if images.num_bad:
-        text = f"{images.num_bad} of {images.count} images do not decode; the first: {images.first_bad}"
         severity = error if images.num_bad == images.count else warning
-        found.append(severity("undecodable", where, text, value=images.num_bad, stamp_ns=images.first_bad_ns))
+        yield severity(
+            "undecodable",
+            where,
+            f"{images.num_bad} of {images.count} images do not decode; the first: {images.first_bad}",
+            value=images.num_bad,
+            stamp_ns=images.first_bad_ns,
+        )
     if len(images.sizes) > 1:
         sizes = ", ".join(f"{w}x{h} ({n})" for (w, h), n in images.sizes.most_common(4))
-        found.append(warning("image-size", where, f"the size of the images changes: {sizes}"))
+        yield warning("image-size", where, f"the size of the images changes: {sizes}")
     if len(images.encodings) > 1:
         kinds = ", ".join(f"{name} ({n})" for name, n in images.encodings.most_common(4))
-        text = f"the encoding of the images changes: {kinds}"
-        found.append(warning("encoding", where, text, "record one encoding"))
-    return found
+        yield warning("encoding", where, f"the encoding of the images changes: {kinds}", "record one encoding")
 
 
 def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
@@ -189,42 +190,64 @@ def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
     if not few:
         return []
     decoded, count = sum(images.num_decoded for images in few), sum(images.count for images in few)
-    text = f"{decoded} of {count} images were decoded, the first {limits.DECODED_IMAGES} of a topic and"
-    text = f"{text} fewer and fewer later; of the others only head, closing mark and checksum were read"
-    return [note("sampled", "images", text, value=decoded / count)]
+    return [
+        note(
+            "sampled",
+            "images",
+            f"{decoded} of {count} images were decoded, the first {limits.DECODED_IMAGES} of a topic and"
+            " fewer and fewer later; of the others only head, closing mark and checksum were read",
+            value=decoded / count,
+        )
+    ]
 
 
-def depth_findings(images: ImageWatch) -> list[Finding]:
+def depth_findings(images: ImageWatch) -> Iterator[Finding]:
     """Findings on missing or implausible depth."""
-    where, found = images.where, []
+    where = images.where
     if images.num_without_depth:
         every = images.num_without_depth == images.num_decoded
         num = "all" if every else str(images.num_without_depth)
-        text = f"{num} of {images.num_decoded} depth images hold no depth at all"
         severity = error if every else warning
-        found.append(severity("depth-empty", where, text, value=images.num_without_depth))
+        yield severity(
+            "depth-empty",
+            where,
+            f"{num} of {images.num_decoded} depth images hold no depth at all",
+            value=images.num_without_depth,
+        )
         if every:
-            return found
+            return
     share = float(np.median(list(images.shares)))
     if share < limits.SOME_DEPTH:
         severity = warning if share < limits.LITTLE_DEPTH else note
-        text = f"{100 * share:.0f} % of the pixels have depth (median of the images)"
-        found.append(severity("depth-share", where, text, value=share))
-    if images.num_invalid:
-        text = (
-            f"{images.num_invalid} depth pixels of {images.num_decoded} images are NaN, infinite, negative or 65535"
-            " (or a like code): they count as none"
+        yield severity(
+            "depth-share", where, f"{100 * share:.0f} % of the pixels have depth (median of the images)", value=share
         )
-        found.append(note("depth-invalid", where, text, value=images.num_invalid))
+    if images.num_invalid:
+        yield note(
+            "depth-invalid",
+            where,
+            f"{images.num_invalid} depth pixels of {images.num_decoded} images are NaN, infinite, negative or 65535"
+            " (or a like code): they count as none",
+            value=images.num_invalid,
+        )
     for value, times in images.constants.most_common(1):
         if times >= limits.CONSTANT_IMAGES * images.num_decoded:
             of = f"the largest depth of {times} of {images.num_decoded} images"
-            text = f"many pixels are exactly {value:.6g} m, {of}: a code for no return?"
-            found.append(warning("depth-constant", where, text, value=value, unit="m"))
+            yield warning(
+                "depth-constant",
+                where,
+                f"many pixels are exactly {value:.6g} m, {of}: a code for no return?",
+                value=value,
+                unit="m",
+            )
     if images.num_repeats:
-        text = f"{images.num_repeats} of {images.num_decoded} depth images equal the one before to the bit"
-        found.append(warning("depth-repeats", where, text, value=images.num_repeats))
-    return [*found, *_scale(images)]
+        yield warning(
+            "depth-repeats",
+            where,
+            f"{images.num_repeats} of {images.num_decoded} depth images equal the one before to the bit",
+            value=images.num_repeats,
+        )
+    yield from _scale(images)
 
 
 def _scale(images: ImageWatch) -> list[Finding]:
@@ -246,8 +269,16 @@ def _scale(images: ImageWatch) -> list[Finding]:
     guess = "metres stored as integers" if not images.is_float and counts < 20 else guess
     text = f"median depth {median:.4g} m, read as {used:g} m per count: expected {low:g} to {high:g} m"
     text += f"; {guess}?" if guess else ""
-    remedy = f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]"
-    return [error("depth-scale", images.where, text, remedy, value=median, unit="m")]
+    return [
+        error(
+            "depth-scale",
+            images.where,
+            text,
+            f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]",
+            value=median,
+            unit="m",
+        )
+    ]
 
 
 def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
@@ -273,19 +304,28 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
 
 def _shifted(where: str, du: int, dv: int, width: int, peak: float) -> Finding:
     share = 100 * max(abs(du), abs(dv)) / width
-    text = f"depth edges lie {-du:+d} px across and {-dv:+d} px down from colour edges in images {width} px wide"
-    text = f"{text} ({share:.1f} % of the width, correlation {peak:.2f} there): depth is not registered to colour"
-    remedy = "record depth aligned to colour, or with its own frame and CameraInfo, that ingest may register it"
-    return error("alignment", where, text, remedy, value=max(abs(du), abs(dv)), unit="px")
+    return error(
+        "alignment",
+        where,
+        f"depth edges lie {-du:+d} px across and {-dv:+d} px down from colour edges in images {width} px wide"
+        f" ({share:.1f} % of the width, correlation {peak:.2f} there): depth is not registered to colour",
+        "record depth aligned to colour, or with its own frame and CameraInfo, that ingest may register it",
+        value=max(abs(du), abs(dv)),
+        unit="px",
+    )
 
 
 def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> Finding:
     """An error only if mutual: an exchange has two sides."""
     name, own, peak = other
-    text = f"its colour edges meet the depth edges of camera {name} (correlation {peak:.2f}), not its own ({own:.2f})"
     severity = error if is_mutual else warning
-    remedy = "exchange the depth topics, with --camera NAME=COLOR,DEPTH"
-    return severity("alignment", f"camera {camera}", text, remedy, value=own)
+    return severity(
+        "alignment",
+        f"camera {camera}",
+        f"its colour edges meet the depth edges of camera {name} (correlation {peak:.2f}), not its own ({own:.2f})",
+        "exchange the depth topics, with --camera NAME=COLOR,DEPTH",
+        value=own,
+    )
 
 
 def _other(

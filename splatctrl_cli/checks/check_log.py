@@ -1,14 +1,27 @@
-"""Checks of a log in one pass."""
+"""Checks of a log in one pass: observed messages, and a few frames per camera."""
 
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.checks.check_cameras import calibration_findings, camera_findings, tf_findings
 from splatctrl_cli.checks.check_folder import Evidence, judged
-from splatctrl_cli.checks.check_images import depth_findings, image_findings, sample_findings
+from splatctrl_cli.checks.check_images import (
+    ImageWatch,
+    Kept,
+    depth_findings,
+    image_findings,
+    sample_findings,
+    thumbnail_lens,
+)
 from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_times import (
+    TimesWatch,
     clock_findings,
     ending_findings,
     file_findings,
@@ -17,18 +30,245 @@ from splatctrl_cli.checks.check_times import (
     peer_findings,
     time_findings,
 )
+from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, needs, note, warning
-from splatctrl_cli.checks.log_pass import LogWatch, image_motion, ready, reduced_frames
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.recording.calibrated import correction_of
-from splatctrl_cli.recording.container.raw_log import RawLog
+from splatctrl_cli.recording.container.raw_log import Damage, JoinedLog, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.cameras import image_topics
-from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
-from splatctrl_cli.recording.log.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
-from splatctrl_cli.recording.log.rig import camera_topics, check_mask_topics, missing
+from splatctrl_cli.recording.log.decoder import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    TRANSFORMS,
+    MessageDecoder,
+    UndecodableMessageError,
+    header_stamp_ns,
+    is_ros,
+    stamp_ns,
+)
+from splatctrl_cli.recording.log.messages import (
+    COLOR_CONVERSIONS,
+    DEPTH_ENCODINGS,
+    color_of,
+    depth_of,
+    num_invalid,
+    read_image,
+)
+from splatctrl_cli.recording.log.registration import DepthToColor, TfTree
+from splatctrl_cli.recording.log.rig import Camera, build_cameras, camera_topics, check_mask_topics, missing
 from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.survey import Survey, survey
 from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions, refuse_unknown_cameras
+from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
+
+_HEADED = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu")
+_FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
+
+
+class LogWatch(JoinedLog):
+    """A log that observes messages read by another, decoding images as needed.
+
+    num_images: reading ends at this many of a topic. spans: first and last log time [ns] by file.
+    """
+
+    def __init__(self, log: RawLog, options: SourceOptions, num_images: int | None = None) -> None:
+        super().__init__(log.path, (log,), log.container)
+        self._scale, self._num_images = options.depth_scale, num_images
+        self._by_log_time = options.stamps == "log"
+        self.times: dict[str, TimesWatch] = {}
+        self.transforms: dict[str, TimesWatch] = {}
+        self.images: dict[str, ImageWatch] = {}
+        self.changed_infos: dict[str, int] = {}
+        self.spans: dict[str, tuple[int, int]] = {}
+        self.is_whole = True
+        self._infos: dict[str, tuple[object, ...]] = {}
+        self._decoder = MessageDecoder()
+        self._headed: dict[Topic, bool] = {}
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """The log's messages, each observed."""
+        for message in super().messages(damage, names):
+            self._take(message)
+            yield message
+            images = self.images.get(message.topic.name)
+            if images is not None and images.count == self._num_images:
+                self.is_whole = False
+                return
+
+    def _take(self, message: RawMessage) -> None:
+        topic, name, stamp = message.topic, message.topic.name, message.log_time_ns
+        first, last = self.spans.get(message.file, (stamp, stamp))
+        self.spans[message.file] = min(first, stamp), max(last, stamp)
+        has_stamps = not self._by_log_time and self._is_headed(topic)
+        if has_stamps:
+            try:
+                stamp = header_stamp_ns(message)
+            except UndecodableMessageError:
+                has_stamps = False
+        times = self.times.get(name)
+        if times is None:
+            times = self.times[name] = TimesWatch(name, has_stamps=has_stamps)
+        times.add(stamp, message.log_time_ns)
+        if not is_ros(topic):
+            return
+        try:
+            if topic.type_name in (IMAGE, COMPRESSED_IMAGE):
+                self._image(message, stamp)
+            elif topic.type_name == CAMERA_INFO and name not in self.changed_infos:
+                self._info(message, stamp)
+            elif topic.type_name in TRANSFORMS and not name.endswith("tf_static"):
+                self._transforms(message)
+        except UndecodableMessageError:
+            return  # the survey counts it
+
+    def _is_headed(self, topic: Topic) -> bool:
+        """True if messages begin with a std_msgs/Header."""
+        if topic not in self._headed:
+            fields = [line.split("#")[0].strip() for line in topic.definition.splitlines()]
+            first = next((line for line in fields if line), "")
+            is_headed = bool(_FIRST_FIELD.match(first)) if topic.definition else topic.type_name in _HEADED
+            self._headed[topic] = is_ros(topic) and (is_headed or topic.type_name in _HEADED)
+        return self._headed[topic]
+
+    def _image(self, message: RawMessage, stamp: int) -> None:
+        name = message.topic.name
+        images = self.images.setdefault(name, ImageWatch(name, self._scale))
+        is_wanted = images.is_wanted()
+        try:
+            image = read_image(self._decoder.decode(message), message.topic.type_name, lazily=True)
+            if is_wanted and image.kind == "depth":
+                images.add_depth(stamp, depth_of(image, self._scale), image.encoding, num_invalid(image.pixels))
+            elif is_wanted and image.kind == "color":
+                images.add_color(stamp, color_of(image), image.encoding)
+            else:
+                images.add_undecoded(image.encoding, image.width, image.height)
+        except (UndecodableMessageError, ValueError) as reason:
+            images.add_bad(stamp, str(reason))
+
+    def _info(self, message: RawMessage, stamp: int) -> None:
+        info = self._decoder.decode(message)
+        fields = {name.lower(): getattr(info, name) for name in ("K", "k", "D", "d") if hasattr(info, name)}
+        said = (info.width, info.height, tuple(fields["k"]), tuple(fields["d"]))
+        if self._infos.setdefault(message.topic.name, said) != said:
+            self.changed_infos[message.topic.name] = stamp
+
+    def _transforms(self, message: RawMessage) -> None:
+        for item in self._decoder.decode(message).transforms:
+            child = item.child_frame_id.strip("/")
+            edge = f"tf {item.header.frame_id.strip('/')} -> {child}"
+            if child not in self.transforms:
+                self.transforms[child] = TimesWatch(edge, has_stamps=True)
+            self.transforms[child].add(
+                message.log_time_ns if self._by_log_time else stamp_ns(item.header), message.log_time_ns
+            )
+
+
+def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
+    """The camera as `ingest` builds it, or None (rig.missing says why)."""
+    try:
+        return build_cameras(log, found, replace(options, cameras=(topics.name,)))[0]
+    except InputError:
+        return None
+
+
+def reduced_frames(
+    topics: CameraTopics,
+    camera: Camera,
+    images: Mapping[str, ImageWatch],
+    tf: TfTree,
+    options: SourceOptions,
+    late_ns: Mapping[str, int],
+) -> list[RgbdFrame]:
+    """Reduced frames of a camera, with kept depth and known pose.
+
+    color is black without one at depth's time. late_ns: delay of frames' stamps against transforms, by camera.
+    """
+    depths, colors = images.get(topics.depth), images.get(topics.color)
+    kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
+    frames = []
+    for kept in depths.kept if depths is not None else ():
+        near = min(sorted(kept_colors), key=lambda stamp: abs(stamp - kept.stamp_ns), default=None)
+        is_near = near is not None and abs(near - kept.stamp_ns) <= options.pairing_tolerance_s * 1e9
+        color = kept_colors[near] if near is not None and is_near else None
+        stamp_ns = kept.stamp_ns if color is None else color.stamp_ns
+        T = camera.pose_at(tf, stamp_ns - late_ns.get(camera.name, 0), round(options.pose_tolerance_s * 1e9))
+        if T is not None:
+            frames.append(_frame(camera, kept, color, stamp_ns, T))
+    return frames
+
+
+def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
+    """Depth in the undistorted colour view, reduced."""
+    depth, stride = kept.pixels, kept.stride
+    if camera.depth_to_color is not None:
+        stride = max(1, round(camera.intrinsics.height / kept.pixels.shape[0]))
+        warp = camera.depth_to_color
+        depth = DepthToColor(
+            depth_intrinsics=strided_lens(warp.depth_intrinsics, kept.stride),
+            color_intrinsics=strided_lens(camera.intrinsics, stride),
+            T_color_depth=warp.T_color_depth,
+        ).warp(depth)
+    elif camera.undistortion is not None:
+        depth = camera.undistortion.nearest(_enlarged(depth, kept))[::stride, ::stride]
+    pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
+    if color is not None and color.pixels.ndim == 3:
+        pixels = color.pixels
+        if camera.undistortion is not None:
+            pixels = camera.undistortion.color(_enlarged(pixels, color))[:: color.stride, :: color.stride]
+    if pixels.shape[:2] != depth.shape:
+        pixels = np.zeros((*depth.shape, 3), np.uint8)
+    return RgbdFrame(
+        stamp_ns=stamp_ns,
+        camera=camera.name,
+        color=pixels,
+        depth=np.asarray(depth, np.float32),
+        intrinsics=strided_lens(camera.intrinsics, stride),
+        T_world_camera=T,
+    )
+
+
+def _enlarged(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
+    rows = np.repeat(image, kept.stride, axis=0)[: kept.height]
+    return np.repeat(rows, kept.stride, axis=1)[:, : kept.width]
+
+
+def image_motion(
+    watch: LogWatch, cameras: Sequence[tuple[CameraTopics, Camera]], frames: Mapping[str, Sequence[RgbdFrame]]
+) -> ImageMotion:
+    """Motion in each camera's first images. frames: of `reduced_frames`."""
+    motion = ImageMotion()
+    for topics, camera in cameras:
+        if frames[camera.name] and topics.color in watch.images:
+            for frame in _thumbnails(watch, topics, camera, frames[camera.name]):
+                motion.add(frame)
+    return motion
+
+
+def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Sequence[RgbdFrame]) -> list[RgbdFrame]:
+    """Depth with colour, where both share a view."""
+    gray = dict(watch.images[topics.color].thumbnails if camera.depth_to_color is None else ())
+    at, frames = sorted(gray), []
+    poses = {frame.stamp_ns: frame.T_world_camera for frame in sorted(posed, key=lambda frame: frame.stamp_ns)}
+    for stamp, depth in watch.images[topics.depth].thumbnails:
+        near = min(at, key=lambda other: abs(other - stamp), default=None)
+        color = gray.get(near) if near is not None else None
+        if color is None or color.shape != (*depth.shape, 3):
+            color = np.zeros((*depth.shape, 3), np.uint8)
+        frames.append(
+            RgbdFrame(
+                stamp_ns=stamp,
+                camera=camera.name,
+                color=color,
+                depth=depth,
+                intrinsics=thumbnail_lens(camera.intrinsics),
+                T_world_camera=poses[min(poses, key=lambda other: abs(other - stamp))],
+            )
+        )
+    return frames
+
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
 SAID = (" are never closer than ", " images as ", "distortion model ", " says rectified")  # other findings name them
@@ -81,7 +321,7 @@ def check_log(
         kind=log.container,
         duration_s=(last - first) * 1e-9,
         num_messages=found.num_messages,
-        start_ns=watch.first_ns,
+        start_ns=min((t.first_ns for t in watch.times.values() if t.first_ns), default=None),
         findings=[*findings, *of_states.findings],
         rates=[
             t.rate(is_read=found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS))
@@ -93,14 +333,18 @@ def check_log(
             states_lack=of_states.lack,
         ),
     )
-    evidence = Evidence(
-        frames=list(chain.from_iterable(frames.values())),
-        depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
-        motion=image_motion(watch, whole, frames),
-        states=of_states.states,
-        cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
+    return judged(
+        report,
+        Evidence(
+            frames=list(chain.from_iterable(frames.values())),
+            depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
+            motion=image_motion(watch, whole, frames),
+            states=of_states.states,
+            cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
+        ),
+        of_states.model,
+        only_errors=only_errors,
     )
-    return judged(report, evidence, of_states.model, only_errors=only_errors)
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
@@ -134,8 +378,7 @@ def _span(found: Survey) -> tuple[int, int]:
 
 def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopics]) -> list[Finding]:
     names = [n for n, e in sorted(found.topics.items()) if e.topic.type_name in (*IMAGES, *STATE_TYPES)]
-    judged = [name for name in names if name in watch.times and not _is_beside(watch, name, cameras)]
-    times = [watch.times[name] for name in judged]
+    times = [watch.times[n] for n in names if n in watch.times and not _is_beside(watch, n, cameras)]
     each = [f for t in times for f in time_findings(t, "images" if t.topic in watch.images else "states")]
     each += [
         replace(f, code="tf-gap") if f.code == "gap" else f
@@ -164,13 +407,19 @@ def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Co
     """Findings on image topics; notes if no camera uses them. unlike: topics with only depth's encoding."""
     findings = []
     for name, images in sorted(watch.images.items()):
-        its = image_findings(images)
+        its = list(image_findings(images))
         kinds = set(images.encodings)
         unread = sorted(kinds - set(DEPTH_ENCODINGS) - set(COLOR_CONVERSIONS))
         if unread:
             known = ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
-            remedy = f"record another topic of this camera, or convert it; read: {known}"
-            its.append(warning("encoding", name, f"encoding {unread[0]!r} is not read", remedy))
+            its.append(
+                warning(
+                    "encoding",
+                    name,
+                    f"encoding {unread[0]!r} is not read",
+                    f"record another topic of this camera, or convert it; read: {known}",
+                )
+            )
         if _is_beside(watch, name, cameras):
             its = [replace(f, severity=Severity.NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
         elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded and name not in unlike:

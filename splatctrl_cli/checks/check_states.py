@@ -20,8 +20,7 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Index, JointState, LossReport, spread
 from splatctrl_cli.robot.model import RobotModel
 
-TURN = 2 * np.pi
-DEGREES = 3.0 * TURN  # that no joint of an arm turns to, in radians
+DEGREES = 6 * np.pi  # [rad] that no joint of an arm turns to: three turns
 
 
 PoseVerdict = Literal["agree", "tool", "base", "disagree", "still"]  # of logged end-effector poses on a robot model
@@ -122,7 +121,8 @@ def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> 
     lower, upper, slack = model.lower[limited], model.upper[limited], limits.DEGREES_SLACK
     num_far = num_fit = 0
     worst, at_worst = np.full(len(lower), -np.inf), np.zeros(len(lower))  # of each joint
-    for q in _positions(states):
+    rows = states.position if isinstance(states, StateColumns) else np.array([state.position for state in states])
+    for q in blocks_of(rows):
         beyond = np.abs(q[:, limited]) - np.maximum(np.maximum(np.abs(lower), np.abs(upper)), 2 * np.pi)
         as_degrees = np.radians(q[:, limited])
         num_far += int((beyond.max(axis=1) > limits.ANGLES_FAR).sum())
@@ -179,17 +179,8 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
         return _agreement("tool", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
     if bases[base][1].is_small:
         offset, rest = bases[base]
-        moved = invert_transform(offset)
-        return _agreement("base", base, len(chosen), _spread(links[base], logged), moved, rest)
+        return _agreement("base", base, len(chosen), _spread(links[base], logged), invert_transform(offset), rest)
     return _agreement("disagree", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
-
-
-def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
-    return (
-        blocks_of(states.position)
-        if isinstance(states, StateColumns)
-        else iter([np.array([state.position for state in states])])
-    )
 
 
 def _posed(states: Sequence[JointState]) -> Index:
@@ -277,8 +268,11 @@ def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) 
         return RobotStates(model=model, lack=str(wrong), findings=findings)
     findings += [note("joints", "joint states", text) for text in loss.notes]
     if not len(states):
-        lack = "no joint states; record /joint_states, or give the states apart (splatctrl help replay, Logs)"
-        return RobotStates(model=model, lack=lack, findings=findings)
+        return RobotStates(
+            model=model,
+            lack="no joint states; record /joint_states, or give the states apart (splatctrl help replay, Logs)",
+            findings=findings,
+        )
     of_robot = robot_states(model, names, states)
     is_said = any(f.code == "joints-degrees" for f in findings)
     more = [f for f in of_robot.findings if not (is_said and f.code == "joints-degrees")]
@@ -293,20 +287,20 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
     try:
         states = states.of_log(*model.joint_columns(names))
     except InputError as wrong:
-        found = [error("joints", "joint states", wrong.message, wrong.remedy)]
-        return RobotStates(model=model, lack=str(wrong), findings=found)
+        return RobotStates(
+            model=model, lack=str(wrong), findings=[error("joints", "joint states", wrong.message, wrong.remedy)]
+        )
     of_fingers = [note("joints", "joint states", model.held_words)] if model.held else []
     return RobotStates(
         model=model, states=states, findings=[*of_fingers, *robot_findings(model, states, "joint states")]
     )
 
 
-def stream_findings(where: str, stream: JointStream) -> list[Finding]:
+def stream_findings(where: str, stream: JointStream) -> Iterator[Finding]:
     """Findings on a topic's states of the same joints, as recorded."""
-    found: list[Finding] = []
     position = stream.columns().get("position")
     if position is None:
-        return []
+        return
     num_bad, first_bad, joint = 0, 0, 0
     lowest, highest = np.full(len(stream.names), np.inf), np.full(len(stream.names), -np.inf)
     at = 0
@@ -320,16 +314,24 @@ def stream_findings(where: str, stream: JointStream) -> list[Finding]:
         highest = np.fmax(highest, np.where(is_bad, -np.inf, block).max(axis=0, initial=-np.inf))
         at += len(block)
     if num_bad:
-        text = f"{num_bad} of {at} states hold a position that is NaN or infinite; the first: {stream.names[joint]}"
-        found.append(warning("joints-nan", where, text, value=num_bad, stamp_ns=int(stream.stamp_ns[first_bad])))
+        yield warning(
+            "joints-nan",
+            where,
+            f"{num_bad} of {at} states hold a position that is NaN or infinite; the first: {stream.names[joint]}",
+            value=num_bad,
+            stamp_ns=int(stream.stamp_ns[first_bad]),
+        )
     widest = np.maximum(np.abs(lowest), np.abs(highest))
     if np.isfinite(widest).any() and float(widest[np.isfinite(widest)].max()) > DEGREES:
         worst = int(np.argmax(np.where(np.isfinite(widest), widest, 0)))
-        text = f"{stream.names[worst]} reaches {widest[worst]:.4g}: degrees, not radians?"
-        remedy = _unit_remedy(stream.names)
-        found.append(error("joints-degrees", where, text, remedy, value=widest[worst]))
-    found += _velocities(where, stream, bool((highest - lowest > STATES_STILL).any()))
-    return found
+        yield error(
+            "joints-degrees",
+            where,
+            f"{stream.names[worst]} reaches {widest[worst]:.4g}: degrees, not radians?",
+            _unit_remedy(stream.names),
+            value=widest[worst],
+        )
+    yield from _velocities(where, stream, bool((highest - lowest > STATES_STILL).any()))
 
 
 def _velocities(where: str, stream: JointStream, is_moving: bool) -> list[Finding]:
@@ -339,8 +341,14 @@ def _velocities(where: str, stream: JointStream, is_moving: bool) -> list[Findin
     if velocity is None:
         return [note("joints-velocity", where, "no velocities were recorded: the change of the positions is taken")]
     if all(not np.any(np.nan_to_num(block)) for block in blocks_of(velocity)):
-        text = "all velocities are zero while joints move: the change of the positions is taken"
-        return [warning("joints-velocity", where, text, "let the driver fill them in")]
+        return [
+            warning(
+                "joints-velocity",
+                where,
+                "all velocities are zero while joints move: the change of the positions is taken",
+                "let the driver fill them in",
+            )
+        ]
     return []
 
 
@@ -356,8 +364,16 @@ def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) 
         is_good = agreement.verdict in {"agree", "tool"}
         value = 1e3 * agreement.difference.median_position
         make = note if is_good else error
-        remedy = "" if is_good else "give the URDF of this very robot, and its --base"
-        found.append(make("end-effector", where, agreement.sentence, remedy, value=value, unit="mm"))
+        found.append(
+            make(
+                "end-effector",
+                where,
+                agreement.sentence,
+                "" if is_good else "give the URDF of this very robot, and its --base",
+                value=value,
+                unit="mm",
+            )
+        )
     return found
 
 

@@ -67,18 +67,10 @@ class TimesWatch:
         """Take the next message."""
         self.count += 1
         self.num_zero += self.has_stamps and stamp_ns == 0
-        if self.count == 1:
-            self.first_ns = self.last_ns = self._latest_ns = stamp_ns
-        else:
-            self._step(stamp_ns)
-        if self.has_stamps and self._delays.is_next():
-            self._delays.add((log_ns * _NS, (log_ns - stamp_ns) * _NS))
-        self.first_ns, self.last_ns = min(self.first_ns, stamp_ns), max(self.last_ns, stamp_ns)
-        self._latest_ns = stamp_ns
-
-    def _step(self, stamp_ns: int) -> None:
         interval = stamp_ns - self._latest_ns
-        if interval == 0:
+        if self.count == 1:
+            self.first_ns = self.last_ns = stamp_ns
+        elif interval == 0:
             self.num_duplicates += 1
             self.first_duplicate_ns = self.first_duplicate_ns or stamp_ns
         elif interval < 0:
@@ -88,22 +80,18 @@ class TimesWatch:
         else:
             if self._intervals.is_next():
                 self._intervals.add(interval * _NS)
-            entry = (interval, self._latest_ns)
-            if len(self._longest) < limits.KEPT_GAPS:
-                heapq.heappush(self._longest, entry)
-            else:
-                heapq.heappushpop(self._longest, entry)
+            heapq.heappush(self._longest, (interval, self._latest_ns))
+            if len(self._longest) > limits.KEPT_GAPS:
+                heapq.heappop(self._longest)
+        if self.has_stamps and self._delays.is_next():
+            self._delays.add((log_ns * _NS, (log_ns - stamp_ns) * _NS))
+        self.first_ns, self.last_ns = min(self.first_ns, stamp_ns), max(self.last_ns, stamp_ns)
+        self._latest_ns = stamp_ns
 
     @property
     def median_interval(self) -> float | None:
         """Median interval [s]; None for fewer than two different times."""
         return float(np.median(list(self._intervals))) if len(self._intervals) else None
-
-    @property
-    def is_regular(self) -> bool:
-        """True if messages have a steady rate."""
-        median = self.median_interval
-        return median is not None and float(np.quantile(list(self._intervals), 0.9)) <= limits.REGULAR * median
 
     @property
     def delays(self) -> Float64:
@@ -118,8 +106,8 @@ class TimesWatch:
     def gaps(self) -> list[tuple[float, int]]:
         """Intervals [s] far above the median, with the stamp before each; none without a rate."""
         median = self.median_interval
-        if median is None or not self.is_regular:
-            return []
+        if median is None or float(np.quantile(list(self._intervals), 0.9)) > limits.REGULAR * median:
+            return []  # no steady rate
         limit = max(limits.GAP_SECONDS, limits.GAP_RATIO * median)
         return sorted(((i * _NS, at) for i, at in self._longest if i * _NS > limit), key=lambda gap: gap[1])
 
@@ -136,32 +124,31 @@ class TimesWatch:
         )
 
 
-def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
+def time_findings(times: TimesWatch, what: str = "messages") -> Iterator[Finding]:
     """Findings on one topic's times."""
-    found: list[Finding] = []
     where = times.topic
     if times.num_zero:
         text = f"{times.num_zero} of {times.count} header stamps are 0"
         make = error if times.num_zero == times.count and what != "states" else warning
         if what == "states":
             text = f"{text}; the times of logging are taken where all are"
-        return [make("stamp-zero", where, text, value=times.num_zero)]
+        yield make("stamp-zero", where, text, value=times.num_zero)
+        return
     gaps = times.gaps()
     if gaps and times.median_interval is not None:
         longest, at = max(gaps)
         lost = sum(round(interval / times.median_interval) - 1 for interval, _ in gaps)
         gaps_of = f"a gap of {longest:.3g} s" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest {longest:.3g} s"
         text = f"{gaps_of}; about {lost} {what} are missing"
-        found.append(warning("gap", where, text, value=longest, unit="s", stamp_ns=at))
+        yield warning("gap", where, text, value=longest, unit="s", stamp_ns=at)
     if times.num_duplicates:
         text = f"{times.num_duplicates} of {times.count} stamps repeat the one before"
         first = times.first_duplicate_ns
-        found.append(warning("stamp-repeats", where, text, value=times.num_duplicates, stamp_ns=first))
+        yield warning("stamp-repeats", where, text, value=times.num_duplicates, stamp_ns=first)
     if times.num_back:
         text = f"stamps go back {times.num_back} times, by up to {times.furthest_back:.3g} s"
         first = times.first_back_ns
-        found.append(warning("stamp-back", where, text, value=times.furthest_back, unit="s", stamp_ns=first))
-    return found
+        yield warning("stamp-back", where, text, value=times.furthest_back, unit="s", stamp_ns=first)
 
 
 def joined_gaps(findings: list[Finding]) -> list[Finding]:
@@ -192,13 +179,21 @@ def _joined(group: list[Finding]) -> Finding:
 
 def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
     """Files logged far apart; spans: first and last log time [ns]."""
-    ordered = sorted((span, name) for name, span in spans.items() if name)
     found = []
+    ordered = sorted((span, name) for name, span in spans.items() if name)
     for (before, name), (after, other) in pairwise(ordered):
         pause = (after[0] - before[1]) * _NS
         if pause > limits.FILES_APART:
-            text = f"between {name} and {other} nothing was logged for {pause:.4g} s"
-            found.append(warning("files-apart", "files", text, value=pause, unit="s", stamp_ns=before[1]))
+            found.append(
+                warning(
+                    "files-apart",
+                    "files",
+                    f"between {name} and {other} nothing was logged for {pause:.4g} s",
+                    value=pause,
+                    unit="s",
+                    stamp_ns=before[1],
+                )
+            )
     return found
 
 
@@ -213,14 +208,21 @@ def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
     first = min(ended, key=lambda edge: edge.last_ns)
     early = (last_ns - first.last_ns) * _NS
     more = f" and {len(ended) - 1} more" if len(ended) > 1 else ""
-    text = f"ends {early:.3g} s before the last image: frames below it have no pose from then on"
-    return [warning("tf-ends", f"{first.topic}{more}", text, value=early, unit="s", stamp_ns=first.last_ns)]
+    return [
+        warning(
+            "tf-ends",
+            f"{first.topic}{more}",
+            f"ends {early:.3g} s before the last image: frames below it have no pose from then on",
+            value=early,
+            unit="s",
+            stamp_ns=first.last_ns,
+        )
+    ]
 
 
-def part_findings(topics: list[TimesWatch]) -> list[Finding]:
+def part_findings(topics: list[TimesWatch]) -> Iterator[Finding]:
     """Topics that start long after others, or end long before."""
     several = [t for t in topics if t.count > 2 and t.median_interval is not None]
-    found = []
     first, last = (min((t.first_ns for t in several), default=0), max((t.last_ns for t in several), default=0))
     for times in several:
         least = max(limits.ENDS_EARLY, 3 * (times.median_interval or 0.0))
@@ -228,30 +230,39 @@ def part_findings(topics: list[TimesWatch]) -> list[Finding]:
         for seconds, words, at in ((begins, "begins", times.first_ns), (ends, "ends", times.last_ns)):
             if seconds > least:
                 side = "after the first" if words == "begins" else "before the last"
-                text = f"{words} {seconds:.3g} s {side} of the other topics"
                 make = warning if seconds > limits.ENDS_MUCH * (last - first) * _NS else note
-                found.append(make("part", times.topic, text, value=seconds, unit="s", stamp_ns=at))
-    return found
+                yield make(
+                    "part",
+                    times.topic,
+                    f"{words} {seconds:.3g} s {side} of the other topics",
+                    value=seconds,
+                    unit="s",
+                    stamp_ns=at,
+                )
 
 
-def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
+def peer_findings(topics: list[TimesWatch]) -> Iterator[Finding]:
     """Topics whose log delay differs from the other cameras'."""
     stamped = [t for t in topics if t.delay is not None and t.count > 1]
     if len(stamped) < 3:
-        return []
-    found = []
+        return
     for times in stamped:
         own = times.delays[:, 1]
         others = np.array([t.delay for t in stamped if t is not times], dtype=np.float64)
         apart = float(np.median(own) - np.median(others))
         spread = float(np.median(np.abs(own - np.median(own))))
         if max(limits.PEERS_APART, 5 * spread, 3 * float(np.ptp(others))) < abs(apart) <= limits.DELAYS_APART:
-            text = f"stamps are {1e3 * abs(apart):.0f} ms {'before' if apart > 0 else 'after'} those of the other"
-            text = f"{text} cameras' images, as logged"
-            remedy = "is its clock synchronised (PTP, chrony), or is its stream only slower? compare what moves"
             value, at = round(1e3 * apart, 1), times.first_ns
-            found.append(warning("clock-offset", times.topic, text, remedy, value=value, unit="ms", stamp_ns=at))
-    return found
+            yield warning(
+                "clock-offset",
+                times.topic,
+                f"stamps are {1e3 * abs(apart):.0f} ms {'before' if apart > 0 else 'after'} those of the other"
+                " cameras' images, as logged",
+                "is its clock synchronised (PTP, chrony), or is its stream only slower? compare what moves",
+                value=value,
+                unit="ms",
+                stamp_ns=at,
+            )
 
 
 def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
@@ -262,8 +273,16 @@ def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
     delays = [t.delay for t in stamped if t.delay is not None]
     common = float(np.median(delays))
     if abs(common) > limits.STAMP_DELAYED and max(abs(delay - common) for delay in delays) <= limits.DELAYS_APART:
-        text = f"header stamps are of another clock than the log's, {common:+.4g} s apart, the same for all topics"
-        found = [note("clock", "all topics", f"{text} (a played log, or simulated time)", value=common, unit="s")]
+        found = [
+            note(
+                "clock",
+                "all topics",
+                f"header stamps are of another clock than the log's, {common:+.4g} s apart, the same for all topics"
+                " (a played log, or simulated time)",
+                value=common,
+                unit="s",
+            )
+        ]
     else:
         found = [*filter(None, (_offset(t, common) for t in stamped))]
     return [*found, *filter(None, (_drift(t) for t in stamped))]
@@ -280,8 +299,15 @@ def _offset(times: TimesWatch, common: float) -> Finding | None:
         text = f"header stamps are {delay:.3g} s before the log's times, those of most topics {common:.3g} s"
     else:
         return None
-    remedy = "synchronise the clocks (chrony, PTP) and record again; images and poses do not belong together"
-    return warning("clock-offset", times.topic, text, remedy, value=delay, unit="s", stamp_ns=times.first_ns)
+    return warning(
+        "clock-offset",
+        times.topic,
+        text,
+        "synchronise the clocks (chrony, PTP) and record again; images and poses do not belong together",
+        value=delay,
+        unit="s",
+        stamp_ns=times.first_ns,
+    )
 
 
 def _drift(times: TimesWatch) -> Finding | None:
@@ -296,8 +322,14 @@ def _drift(times: TimesWatch) -> Finding | None:
     change = slope * float(at[-1])
     if abs(change) < max(limits.DELAYS_DRIFT, 6.0 * spread):
         return None
-    text = f"header stamps drift against the log's times by {1e3 * change:+.0f} ms ({1e6 * slope:+.0f} ppm)"
-    return warning("clock-drift", times.topic, text, value=change, unit="s", stamp_ns=times.first_ns)
+    return warning(
+        "clock-drift",
+        times.topic,
+        f"header stamps drift against the log's times by {1e3 * change:+.0f} ms ({1e6 * slope:+.0f} ppm)",
+        value=change,
+        unit="s",
+        stamp_ns=times.first_ns,
+    )
 
 
 def _slope(at: Float64, delay: Float64) -> float:

@@ -7,31 +7,16 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.calibration.evidence import transform_of
-from splatctrl_cli.calibration.views import landed, overlap_rows, surface_normals
+from splatctrl_cli.calibration.views import DepthView, landed, overlap_rows, surface_normals
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, warning
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
 from splatctrl_cli.geometry import back_project, invert_transform, strided_lens, transform_points
-from splatctrl_cli.records import Bool, Float64, Intrinsics, RgbdFrame, spread
+from splatctrl_cli.records import Bool, Float64, RgbdFrame, spread
 
 SCALES = (0.001, 0.01, 0.1, 0.2, 0.25, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0)
 SCALES = (*SCALES, *(1 / s for s in reversed(SCALES[:-1])))
 FINE = np.linspace(0.92, 1.08, 17)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _View:
-    """A reduced view: normals (h, w, 3), 0 if unknown; points (K, 3), camera frame."""
-
-    frame: RgbdFrame
-    surface: Float64
-    normals: Float64
-    points: Float64
-
-    @property
-    def lens(self) -> Intrinsics:
-        """The reduced camera."""
-        return self.frame.intrinsics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +50,7 @@ def check_views(
         return [], list(frames), list(frames)
     scales = wrong_scales(views, pairs)
     moves = wrong_poses(views, pairs) if scales or not only_errors else []
-    scaled = _scaled(frames, scales)
+    scaled = [replace(f, depth=f.depth * np.float32(scales.get(f.camera, 1.0))) for f in frames]
     if scales:
         fitted = [_view(frame) for frame in _chosen(scaled)]
         if _cost(fitted, pairs)[1] > _cost(_all_moved(views, moves), pairs)[1]:
@@ -88,12 +73,12 @@ def are_far(frames: Sequence[RgbdFrame]) -> bool:
     )
 
 
-def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
+def wrong_scales(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
     """Depth factor by camera that makes views fit, if any.
 
     A common factor is tried first, then one per camera.
     """
-    cameras = sorted({view.frame.camera for view in views})
+    cameras = sorted({view.camera for view in views})
     together = _best_scale(views, pairs, cameras)
     if together is not None:
         return dict.fromkeys(cameras, together)
@@ -108,9 +93,9 @@ def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> di
     return found if 2 * len(found) <= len(cameras) else {}  # else the factors only chase each other
 
 
-def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> list[Move]:
+def wrong_poses(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> list[Move]:
     """Cameras that fit the others much better after a small move, largest gain first."""
-    cameras = sorted({view.frame.camera for view in views})
+    cameras = sorted({view.camera for view in views})
     moves: list[Move] = []
     for _ in range(max(1, len(cameras) // 2)):
         left = [camera for camera in cameras if camera not in {move.camera for move in moves}]
@@ -143,7 +128,7 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
 
 
 def _overlap_findings(
-    views: Sequence[_View], pairs: Sequence[tuple[int, int]], used: Mapping[str, float | None], *, is_sure: bool
+    views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], used: Mapping[str, float | None], *, is_sure: bool
 ) -> list[Finding]:
     """Findings of unusual depths at which views would meet at a tenth or ten times.
 
@@ -153,19 +138,23 @@ def _overlap_findings(
     depths = np.concatenate([view.points[:, 2] for view in views])
     if not len(depths) or (is_sure and low <= float(np.median(depths)) <= high):
         return []
-    median, cameras = float(np.median(depths)), [view.frame.camera for view in views]
+    median, cameras = float(np.median(depths)), [view.camera for view in views]
     tried = (0.1 if median > high else 10.0,) if is_sure else SCALES
     plain = _fitting(views, pairs, cameras, 1.0)[1]
     (fits, most), scale = max((_fitting(views, pairs, cameras, s), s) for s in tried)
     if most < limits.VIEWS_LANDED or plain > limits.VIEWS_TRUSTED * most or fits < limits.VIEWS_LEAST_FIT * most:
         return []
-    text = f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times it"
     said = warning if is_sure else error
-    return [said("views-scale", "cameras", text, f"if so, {rescaled(used.values(), scale)}", value=scale)]
-
-
-def _scaled(frames: Sequence[RgbdFrame], scales: Mapping[str, float]) -> list[RgbdFrame]:
-    return [replace(f, depth=f.depth * np.float32(scales.get(f.camera, 1.0))) for f in frames]
+    return [
+        said(
+            "views-scale",
+            "cameras",
+            f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times"
+            " it",
+            f"if so, {rescaled(used.values(), scale)}",
+            value=scale,
+        )
+    ]
 
 
 def rescaled(units: Iterable[float | None], factor: float) -> str:
@@ -185,14 +174,26 @@ def _scale_findings(scales: Mapping[str, float], used: Mapping[str, float | None
     units = {used[camera] or 1.0 for camera in scales}
     if is_all and len(units) == 1:
         factor = shared.pop()
-        text = f"views of one scene fit together only where all depths are multiplied by {factor:.3g}"
-        remedy = f"{rescaled(units, factor)}, or correct the poses' unit"
-        return [error("views-scale", "cameras", text, remedy, value=factor)]
+        return [
+            error(
+                "views-scale",
+                "cameras",
+                f"views of one scene fit together only where all depths are multiplied by {factor:.3g}",
+                f"{rescaled(units, factor)}, or correct the poses' unit",
+                value=factor,
+            )
+        ]
     found = []
     for camera, factor in sorted(scales.items()):
-        text = f"its views fit those of the other cameras only where its depths are multiplied by {factor:.3g}"
-        remedy = "set the depth unit of its driver as that of the others, or leave it out with --cameras"
-        found.append(error("views-scale", f"camera {camera}", text, remedy, value=factor))
+        found.append(
+            error(
+                "views-scale",
+                f"camera {camera}",
+                f"its views fit those of the other cameras only where its depths are multiplied by {factor:.3g}",
+                "set the depth unit of its driver as that of the others, or leave it out with --cameras",
+                value=factor,
+            )
+        )
     return found
 
 
@@ -207,8 +208,14 @@ def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
         where, what = f"cameras {' and '.join(cameras)}", f"their views fit where {move.camera} is moved by {by}"
         remedy = "calibrate both cameras' poses again (splatctrl calibrate): two do not tell which of them is wrong"
     falls = f"points then lie {1e3 * move.after:.1f} mm off surfaces instead of {1e3 * move.before:.1f}"
-    text = f"{what}: {falls} (mean, each counted as {1e3 * limits.MOVE_CUT:.0f} mm at most)"
-    return warning("views-pose", where, text, remedy, value=round(1e3 * move.distance, 1), unit="mm")
+    return warning(
+        "views-pose",
+        where,
+        f"{what}: {falls} (mean, each counted as {1e3 * limits.MOVE_CUT:.0f} mm at most)",
+        remedy,
+        value=round(1e3 * move.distance, 1),
+        unit="mm",
+    )
 
 
 def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
@@ -218,8 +225,8 @@ def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     return [frame for of_camera in of_cameras for frame in spread(of_camera, each)]
 
 
-def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    places = [view.frame.T_world_camera[:3, 3] for view in views]
+def _pairs(views: Sequence[DepthView]) -> list[tuple[int, int]]:
+    places = [view.T_world_camera[:3, 3] for view in views]
     pairs = [
         (i, j)
         for i in range(len(views))
@@ -229,44 +236,54 @@ def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
     return spread(pairs, limits.VIEWS_PAIRS)
 
 
-def _with(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> list[tuple[int, int]]:
-    return [(i, j) for i, j in pairs if camera in (views[i].frame.camera, views[j].frame.camera)]
+def _with(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera: str) -> list[tuple[int, int]]:
+    return [(i, j) for i, j in pairs if camera in (views[i].camera, views[j].camera)]
 
 
-def _view(frame: RgbdFrame) -> _View:
+def _view(frame: RgbdFrame) -> DepthView:
     stride = max(1, frame.depth.shape[0] // limits.VIEWS_ROWS)
     depth = cv2.medianBlur(np.ascontiguousarray(frame.depth), 3)[::stride, ::stride]
     lens = strided_lens(frame.intrinsics, stride)
     surface = back_project(lens, depth)
     normals = surface_normals(surface)
-    points = surface[np.any(normals != 0, axis=-1)]
-    if len(points) > limits.VIEWS_POINTS:
-        points = points[np.linspace(0, len(points) - 1, limits.VIEWS_POINTS).astype(int)]
-    reduced = replace(frame, depth=np.asarray(depth, np.float32), color=np.zeros((*depth.shape, 3), np.uint8))
-    return _View(frame=replace(reduced, intrinsics=lens), surface=surface, normals=normals, points=points)
+    known = np.flatnonzero(np.any(normals != 0, axis=-1))
+    if len(known) > limits.VIEWS_POINTS:
+        known = known[np.linspace(0, len(known) - 1, limits.VIEWS_POINTS).astype(int)]
+    return DepthView(
+        camera=frame.camera,
+        stamp_ns=frame.stamp_ns,
+        lens=lens,
+        T_world_camera=frame.T_world_camera,
+        surface=surface,
+        normals=normals,
+        points=surface.reshape(-1, 3)[known],
+        point_normals=normals.reshape(-1, 3)[known],
+    )
 
 
-def _landed(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Bool, Float64, Float64]:
+def _landed(
+    a: DepthView, b: DepthView, scale_a: float = 1.0, scale_b: float = 1.0
+) -> tuple[Float64, Bool, Float64, Float64]:
     """View a's points (K, 3) in b's frame, hits (K,), b's surface and normals."""
     points = transform_points(_transform(a, b), a.points * scale_a)
     lands, surface, normals = landed(points, b)
     return points, lands, surface * scale_b, normals
 
 
-def _transform(a: _View, b: _View) -> Float64:
-    return invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera
+def _transform(a: DepthView, b: DepthView) -> Float64:
+    return invert_transform(b.T_world_camera) @ a.T_world_camera
 
 
-def _distances(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
+def _distances(a: DepthView, b: DepthView, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
     """Distances [m] of view a's points from view b's planes, and depth."""
     points, lands, surface, normals = _landed(a, b, scale_a, scale_b)
     lands &= np.any(normals != 0, axis=1)
     return np.abs(np.einsum("ki,ki->k", points - surface, normals))[lands], points[lands, 2]
 
 
-def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str]) -> float | None:
+def _best_scale(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], cameras: Sequence[str]) -> float | None:
     """Factor on these cameras' depths that fits far more points, or None."""
-    medians = [float(np.median(v.points[:, 2])) for v in views if v.frame.camera in cameras and len(v.points)]
+    medians = [float(np.median(v.points[:, 2])) for v in views if v.camera in cameras and len(v.points)]
     if not medians:
         return None
     low, high = PLAUSIBLE_DEPTH
@@ -294,20 +311,24 @@ def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera
 
 
 def _fitting(
-    views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str], scale: float, share: float = 1.0
+    views: Sequence[DepthView],
+    pairs: Sequence[tuple[int, int]],
+    cameras: Sequence[str],
+    scale: float,
+    share: float = 1.0,
 ) -> tuple[int, int]:
     """Points within `share` of `VIEWS_FIT` at a scale, and all that land."""
     num_fit = num = 0
     for i, j in pairs:
         a, b = views[i], views[j]
-        scales = [scale if view.frame.camera in cameras else 1.0 for view in (a, b)]
+        scales = [scale if view.camera in cameras else 1.0 for view in (a, b)]
         off, depth = _distances(a, b, *scales)
         num_fit += int((off < limits.VIEWS_FIT * share * depth).sum())
         num += len(off)
     return num_fit, num
 
 
-def _fitted(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
+def _fitted(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
     is_far = _cost(views, _with(views, pairs, camera))[1] < limits.MOVE_GOOD_SHARE
     starts = [limits.MOVE_WIDTHS, (*limits.MOVE_WIDE, *limits.MOVE_WIDTHS)] if is_far else [limits.MOVE_WIDTHS]
     found = [T for widths in starts if (T := _descended(views, pairs, camera, widths)) is not None]
@@ -315,7 +336,7 @@ def _fitted(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: st
 
 
 def _descended(
-    views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str, widths: Sequence[float]
+    views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera: str, widths: Sequence[float]
 ) -> Float64 | None:
     """T_camera_corrected by Gauss-Newton on point-to-plane residuals, with Tukey's biweight."""
     its = _with(views, pairs, camera)
@@ -337,16 +358,16 @@ def _descended(
     return T
 
 
-def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
+def _rows(a: DepthView, b: DepthView, camera: str) -> tuple[Float64, Float64]:
     """Derivatives (K, 6) by the camera's motion in its frame, and residuals (K,) [m]."""
     points, lands, surface, normals = _landed(a, b)
     lands &= np.any(normals != 0, axis=1) & (np.abs(points[:, 2] - surface[:, 2]) < 3 * limits.MOVE_WIDE[0])
     residual, derivatives = overlap_rows(a.points, _transform(a, b), lands, surface, normals)
     of_a, of_b = np.hsplit(derivatives, 2)
-    return (a.frame.camera == camera) * of_a + (b.frame.camera == camera) * of_b, residual
+    return (a.camera == camera) * of_a + (b.camera == camera) * of_b, residual
 
 
-def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
+def _cost(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
     """Mean distance [m], cut at `limits.MOVE_CUT`, and share of fitting points."""
     total = num = num_good = 0.0
     for i, j in pairs:
@@ -357,16 +378,13 @@ def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[flo
     return (total / num, num_good / num) if num >= limits.VIEWS_LANDED else (limits.MOVE_CUT, 0.0)
 
 
-def _moved(views: Sequence[_View], camera: str, T: Float64) -> list[_View]:
+def _moved(views: Sequence[DepthView], camera: str, T: Float64) -> list[DepthView]:
     return [
-        replace(view, frame=replace(view.frame, T_world_camera=view.frame.T_world_camera @ T))
-        if view.frame.camera == camera
-        else view
-        for view in views
+        replace(view, T_world_camera=view.T_world_camera @ T) if view.camera == camera else view for view in views
     ]
 
 
-def _all_moved(views: Sequence[_View], moves: Sequence[Move]) -> list[_View]:
+def _all_moved(views: Sequence[DepthView], moves: Sequence[Move]) -> list[DepthView]:
     moved = list(views)
     for move in moves:
         moved = _moved(moved, move.camera, move.T_camera_corrected)

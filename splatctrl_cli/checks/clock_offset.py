@@ -40,8 +40,7 @@ class ImageMotion:
         """Take the next frame."""
         camera = self.cameras.get(frame.camera)
         if camera is None:
-            small = thumbnail_lens(frame.intrinsics)
-            camera = CameraMotion(intrinsics=small, T_world_camera=frame.T_world_camera)
+            camera = CameraMotion(intrinsics=thumbnail_lens(frame.intrinsics), T_world_camera=frame.T_world_camera)
             self.cameras[frame.camera] = camera
         if len(camera.stamps_ns) == limits.MOTION_FRAMES:
             return
@@ -115,14 +114,12 @@ class ClockOffset:
     """The offset of two clocks, and its certainty.
 
     offset_s: a frame's stamp minus the joint state's at that instant [s], None if unknown, for `reason`.
-    uncertainty_s: the larger of camera disagreement and the method's error. correlation, runner_up: at the best and
-    next peak.
+    uncertainty_s: the larger of camera disagreement and the method's error. correlation: at the best peak.
     """
 
     offset_s: float | None
     uncertainty_s: float | None
     correlation: float
-    runner_up: float
     num_intervals: int
     reason: str = ""
 
@@ -150,7 +147,10 @@ def estimate_clock_offset(
     num = sum(len(camera.changes) for camera in cameras)
     if len(states) < 3 or num < limits.MOTION_INTERVALS:
         return _unknown(num, f"expected at least {limits.MOTION_INTERVALS} times between frames and 3 states")
-    states, robot = _near(states, robot, cameras)
+    first, last = _span(cameras)
+    near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
+    states = [states[index] for index in near]
+    robot = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
     if len(states) < 3:
         return _unknown(num, f"no joint states within {limits.OFFSET_REACH:g} s of the frames")
     position = np.array([state.position for state in states])
@@ -164,8 +164,9 @@ def estimate_clock_offset(
     interval = step * limits.OFFSET_STEPS
     fixed = sorted((c for c in cameras if c.is_fixed), key=lambda c: -float(np.sum(c.changes)))
     if robot is not None and fixed:
-        most = fixed[: limits.MOTION_CAMERAS]
-        scores = [_pixel_scores(seconds, robot, step, camera, start, offsets) for camera in most]
+        scores = [
+            _pixel_scores(seconds, robot, step, camera, start, offsets) for camera in fixed[: limits.MOTION_CAMERAS]
+        ]
         return _peak(offsets, np.array(scores), num, limits.PIXEL_CORRELATION, limits.PIXEL_ERROR * interval)
     scores = [_sum_scores(seconds, position, camera, start, offsets) for camera in cameras]
     return _peak(offsets, np.array(scores), num, limits.OFFSET_CORRELATION, limits.OFFSET_SUM_ERROR * interval)
@@ -214,15 +215,6 @@ def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, f
 
 def _since(camera: CameraMotion, start: int) -> Float64:
     return np.array([stamp - start for stamp in camera.stamps_ns]) * 1e-9
-
-
-def _near(
-    states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
-) -> tuple[list[JointState], RobotPoints | None]:
-    first, last = _span(cameras)
-    near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
-    points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
-    return [states[index] for index in near], points
 
 
 def _pixel_scores(
@@ -292,13 +284,12 @@ def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: floa
     elif top - runner_up < limits.OFFSET_LEAD:
         reason = f"the motion repeats: offsets of {offsets[best]:+.2f} s and another fit alike"
     if reason:
-        return _unknown(num, reason, top, runner_up)
+        return _unknown(num, reason, top)
     single = np.array([_vertex(offsets, row, int(np.argmax(row))) for row in scores])
     return ClockOffset(
         offset_s=_vertex(offsets, score, best),
         uncertainty_s=max(float(single.std() / np.sqrt(len(single))), error),
         correlation=top,
-        runner_up=runner_up,
         num_intervals=num,
     )
 
@@ -315,7 +306,5 @@ def _vertex(offsets: Float64, score: Float64, best: int) -> float:
     return float(offsets[best]) + shift * width
 
 
-def _unknown(num: int, reason: str, top: float = 0.0, runner_up: float = 0.0) -> ClockOffset:
-    return ClockOffset(
-        offset_s=None, uncertainty_s=None, correlation=top, runner_up=runner_up, num_intervals=num, reason=reason
-    )
+def _unknown(num: int, reason: str, top: float = 0.0) -> ClockOffset:
+    return ClockOffset(offset_s=None, uncertainty_s=None, correlation=top, num_intervals=num, reason=reason)

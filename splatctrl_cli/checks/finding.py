@@ -144,8 +144,13 @@ def _checks() -> Iterator[Check]:
     """The entries of `_TABLE`, whose rows continue in indented lines."""
     for row in re.findall(r"^[a-z].*(?:\n +.*)*", _TABLE, flags=re.MULTILINE):
         code, severities, blocked, meaning, *remedy = (cell.strip() for cell in " ".join(row.split()).split("|"))
-        words = tuple(Severity(word) for word in severities.split(", "))
-        yield Check(code=code, severities=words, meaning=meaning, blocked=_BLOCKED[blocked], remedy="".join(remedy))
+        yield Check(
+            code=code,
+            severities=tuple(Severity(word) for word in severities.split(", ")),
+            meaning=meaning,
+            blocked=_BLOCKED[blocked],
+            remedy="".join(remedy),
+        )
 
 
 CHECKS: Mapping[str, Check] = {check.code: check for check in _checks()}
@@ -293,8 +298,12 @@ class CheckReport:
 
 def needs(*, num_cameras: int, num_frames: int, states_lack: str) -> list[Need]:
     """One per later command, without errors among findings. states_lack: why states are missing."""
-    too_few = "one camera and less than three frames: nothing can be held out; record more views"
-    lacks = {"score": too_few if num_cameras == 1 and 0 < num_frames < 3 else "", "replay": states_lack}
+    lacks = {
+        "score": "one camera and less than three frames: nothing can be held out; record more views"
+        if num_cameras == 1 and 0 < num_frames < 3
+        else "",
+        "replay": states_lack,
+    }
     return [Need(command=name, lacks=tuple(filter(None, [lacks.get(name)]))) for name in ALL]
 
 

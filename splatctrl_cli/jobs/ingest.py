@@ -14,7 +14,7 @@ from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import check_same_run, told_how_to_go_on
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.capture.capture_writer import JOURNAL, CaptureSummary, read_identity, write_capture
-from splatctrl_cli.recording.folder.image_folder import HOLDOUT
+from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.recording.source import logged_descriptions, open_session
 from splatctrl_cli.recording.source_options import SourceOptions
 

@@ -18,7 +18,7 @@ from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.recording.log.messages import metres
 from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_columns import StateColumns
-from splatctrl_cli.recording.log.stored_frame import FrameSource, JointTopics, Recording, StoredFrame
+from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions
 from splatctrl_cli.records import SECOND_NS, Float32, Float64, LossReport, RgbdFrame
 
@@ -115,7 +115,7 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
     return source if perturbation is None else PerturbedSource(source, perturbation)
 
 
-class CalibratedSource(Recording):
+class CalibratedSource(FrameSource):
     """Another source's records, corrected by a calibration.
 
     Joint states move to the frames' clock. A moving camera takes its pose at the frame's time on the robot's clock:
@@ -136,6 +136,7 @@ class CalibratedSource(Recording):
         self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
         self.has_clock, self.world_frame = source.has_clock, source.world_frame
         self.states = correction.states(source.states)
+        self.joint_topics = None if correction.clock_ns else source.joint_topics
         unseen = set(self.cameras)
         for _, camera, T in source.poses():
             if camera in unseen:
@@ -143,13 +144,6 @@ class CalibratedSource(Recording):
                 unseen.remove(camera)
             if not unseen:
                 break
-
-    @property
-    def joint_topics(self) -> JointTopics | None:
-        """Joint state topics, None if the clock is corrected."""
-        if self._correction.clock_ns or not isinstance(self.inner, RosLogSource | CaptureSource):
-            return None
-        return self.inner.joint_topics
 
     @property
     def loss(self) -> LossReport:
@@ -283,19 +277,14 @@ class Perturbation:
         return np.random.default_rng([self.seed, zlib.crc32(camera.encode()), stamp_ns % 2**63])
 
 
-class PerturbedSource(Recording):
+class PerturbedSource(FrameSource):
     """Another source's records, perturbed in memory."""
 
     def __init__(self, source: FrameSource, perturbation: Perturbation) -> None:
         self.inner, self._perturbation = source, perturbation
         self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
-        self.has_clock, self.world_frame, self.states = source.has_clock, source.world_frame, source.states
-
-    @property
-    def joint_topics(self) -> JointTopics | None:
-        """Joint state topics, None if unknown."""
-        found = getattr(self.inner, "joint_topics", None)
-        return found if isinstance(found, JointTopics) else None
+        self.has_clock, self.world_frame = source.has_clock, source.world_frame
+        self.states, self.joint_topics = source.states, source.joint_topics
 
     @property
     def loss(self) -> LossReport:

@@ -82,10 +82,12 @@ def _npz(path: Path, _head: bytes) -> Summary:
     ]
     names = {str(row[0]) for row in rows}
     kind = "occupancy grid" if "log_odds" in names else "distance grid" if {"sdf"} & names else "arrays"
-    return Summary(path=str(path), kind=kind, facts=facts, grids=(Grid(name="arrays", header=_ARRAY, rows=rows),))
-
-
-_ARRAY = ("array", "shape", "dtype")
+    return Summary(
+        path=str(path),
+        kind=kind,
+        facts=facts,
+        grids=(Grid(name="arrays", header=("array", "shape", "dtype"), rows=rows),),
+    )
 
 
 def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -163,8 +165,7 @@ def _yaml(path: Path, _head: bytes) -> Summary:
         total = sum(int(row[1]) for row in rows)
         grid = Grid(name="links", header=("link", "spheres"), rows=rows)
         return Summary(path=str(path), kind="robot spheres", facts={"spheres": total}, grids=(grid,))
-    keys = list(content) if isinstance(content, dict) else []
-    return Summary(path=str(path), kind="YAML", facts={"keys": keys})
+    return Summary(path=str(path), kind="YAML", facts={"keys": list(content) if isinstance(content, dict) else []})
 
 
 def _image(path: Path, _head: bytes) -> Summary:
@@ -172,8 +173,11 @@ def _image(path: Path, _head: bytes) -> Summary:
     if pixels is None:
         raise InputError(f"{path}: not an image that can be read", remedy="the file is damaged")
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    facts = {"size": f"{pixels.shape[1]}x{pixels.shape[0]}", "channels": channels, "dtype": str(pixels.dtype)}
-    return Summary(path=str(path), kind="image", facts=facts)
+    return Summary(
+        path=str(path),
+        kind="image",
+        facts={"size": f"{pixels.shape[1]}x{pixels.shape[0]}", "channels": channels, "dtype": str(pixels.dtype)},
+    )
 
 
 def _find(content: Any, key: str) -> Any:

@@ -14,27 +14,30 @@ from splatctrl_cli.formats.grid.grid_format import FORMAT, covers, header_facts
 from splatctrl_cli.formats.scene.scene_folder import run_value
 from splatctrl_cli.formats.scene.voxel_file import known_space, read_occupancy
 from splatctrl_cli.recording.calibrated import calibrated
-from splatctrl_cli.recording.capture.capture import CaptureSource, robot_description_of
-from splatctrl_cli.recording.capture.capture_header import is_capture, read_capture_header
+from splatctrl_cli.recording.capture.capture import (
+    CaptureSource,
+    is_capture,
+    read_capture_header,
+    robot_description_of,
+)
 from splatctrl_cli.recording.capture.capture_writer import check_not_partial
-from splatctrl_cli.recording.container.foreign import refuse_foreign
 from splatctrl_cli.recording.container.log_formats import (
     CONTAINERS,
     SUFFIXES,
     SessionLog,
     is_bag_folder,
     open_raw_log,
+    refuse_foreign,
 )
 from splatctrl_cli.recording.container.raw_log import RawLog
 from splatctrl_cli.recording.describe_file import describe_file
-from splatctrl_cli.recording.folder.image_folder import ImageFolderSource, open_image_folder
-from splatctrl_cli.recording.folder.layouts import (
-    BARE_REMEDY,
-    bare_images,
+from splatctrl_cli.recording.folder.image_folder import (
+    ImageFolderSource,
     has_views,
     layout_of,
+    open_image_folder,
     open_layout,
-    readable_in,
+    unknown_folder,
 )
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
 from splatctrl_cli.recording.log.rig import camera_topics, missing
@@ -162,8 +165,14 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     if robots:
         facts[ROBOT] = robots
     rows = [_topic_row(found.topics[name]) for name in sorted(found.topics)]
-    unused = [name for name, topic in found.topics.items() if _first(topic) == "-" and not _is_read(topic)]
-    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=rows, unused=unused)]
+    grids = [
+        Grid(
+            name="topics",
+            header=("topic", "type", "encoding", "count", "hz", "first message"),
+            rows=rows,
+            unused=[name for name, topic in found.topics.items() if _first(topic) == "-" and not _is_read(topic)],
+        )
+    ]
     cameras = camera_topics(log, found, options)
     if cameras:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
@@ -179,9 +188,6 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
         notes=tuple(notes),
         damaged=found.damage.count,
     )
-
-
-_TOPIC_COLUMNS = ("topic", "type", "encoding", "count", "hz", "first message")
 
 
 def _topic_row(entry: TopicSurvey) -> list[object]:
@@ -215,9 +221,6 @@ def _first(entry: TopicSurvey) -> str:
     return "-"
 
 
-_KNOWN_FILES = ("run.json", "splats.ply", "occupancy.npz", "field.json")
-
-
 def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     if is_capture(path):
         return _describe_capture(path)
@@ -226,18 +229,15 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
         return describe_log(open_log(path), options)
     if (layout := layout_of(path)) is not None:
         return _describe_images(path, open_layout(path, options), layout.name)
-    names = {name for name in _KNOWN_FILES if (path / name).is_file()}
+    known = ("run.json", "splats.ply", "occupancy.npz", "field.json")
+    names = {name for name in known if (path / name).is_file()}
     is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
     if not ("run.json" in names or "splats.ply" in names or is_dtu):
         refuse_foreign(path)
-        inside = readable_in(path)
-        if not inside and (found := bare_images(path)):
-            raise InputError(f"{path}: {found}", remedy=BARE_REMEDY)
-        raise InputError(
-            f"{path}: a folder of no known kind",
-            remedy=f"give one that is in it: {inside}"
-            if inside
-            else "expected a capture, ROS 2 bag, dataset folder (splatctrl help formats), MVSNet scan or output;"
+        raise unknown_folder(
+            path,
+            "a folder of no known kind",
+            "expected a capture, ROS 2 bag, dataset folder (splatctrl help formats), MVSNet scan or output;"
             " for other images give their .toml",
         )
     field = _field_facts(path / "field.json") if "field.json" in names else {}
@@ -325,5 +325,11 @@ def _describe_images(path: Path, source: ImageFolderSource, kind: str) -> Summar
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
     refusal = lacks_depth(source)
-    lacks = () if refusal is None else (str(refusal)[str(refusal).index("depth is missing") :],)
-    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,), missing=lacks, notes=tuple(loss.notes))
+    return Summary(
+        path=str(path),
+        kind=kind,
+        facts=facts,
+        grids=(grid,),
+        missing=() if refusal is None else (str(refusal)[str(refusal).index("depth is missing") :],),
+        notes=tuple(loss.notes),
+    )

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from splatctrl_cli.recording.capture.capture_header import read_capture_header
+from splatctrl_cli.recording.capture.capture import read_capture_header
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.log.decoder import COMPRESSED_IMAGE

@@ -9,7 +9,7 @@ from splatctrl_cli.files.summary import files_below, names_in
 from splatctrl_cli.formats.grid.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.libraries import entries_of
-from splatctrl_cli.recording.folder.layouts import LAYOUTS
+from splatctrl_cli.recording.folder.image_folder import LAYOUTS
 from splatctrl_cli.recording.source import describe
 
 

@@ -38,7 +38,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
-from splatctrl_cli.recording.container.foxglove_writer import FoxgloveLog, foxglove_log
+from splatctrl_cli.recording.container.mcap_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render

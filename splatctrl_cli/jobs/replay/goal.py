@@ -24,7 +24,7 @@ from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.running.progress import Progress
-from splatctrl_cli.recording.state.twists import read_twists
+from splatctrl_cli.recording.state.state_source import read_twists
 from splatctrl_cli.records import Float64, FloatRows, Stamps
 from splatctrl_cli.robot.model import RobotModel
 

@@ -44,7 +44,7 @@ from splatctrl_cli.jobs.replay.request import MODES, Replay, ReplayInputs, Repla
 from splatctrl_cli.jobs.replay.verdict import ASKED, replay_verdict
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.recording.capture.capture_header import ROBOT
+from splatctrl_cli.recording.capture.capture import ROBOT
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 

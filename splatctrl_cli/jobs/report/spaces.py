@@ -18,7 +18,7 @@ from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open
 from splatctrl_cli.formats.splat.splats import nearest_splats, read_splats
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
-from splatctrl_cli.recording.capture.capture_header import ROBOT
+from splatctrl_cli.recording.capture.capture import ROBOT
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
 from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_of, coarsened
 from splatctrl_cli.robot.model import RobotModel

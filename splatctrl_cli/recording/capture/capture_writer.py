@@ -9,8 +9,8 @@ import json
 import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.recording.capture.capture_header import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
+from splatctrl_cli.recording.capture.capture import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
 from splatctrl_cli.recording.log.messages import metres
 from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
 from splatctrl_cli.recording.log.stored_frame import (
@@ -31,6 +31,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     JointTopics,
     StoredFrame,
     is_png,
+    npy_bytes,
     write_rows,
     write_topics,
 )
@@ -63,10 +64,7 @@ class Journal:
         next(self._kept, None)
         self._stream = self._path.open("a", encoding="utf-8")
 
-    def __enter__(self) -> "Journal":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._stream.close()
 
     def kept(self) -> Entry | None:
@@ -168,7 +166,7 @@ def write_capture(
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}
     num_states = num_resumed = 0
-    with Journal(folder, identity or {}) as journal:
+    with closing(Journal(folder, identity or {})) as journal:
         for item in source.stored():
             if isinstance(item, JointState):
                 states.add(item)
@@ -319,7 +317,7 @@ def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
-    return ("npy", _npy(stored.depth)) if counts is None else ("png", encoded(counts))
+    return ("npy", npy_bytes(stored.depth)) if counts is None else ("png", encoded(counts))
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
@@ -337,12 +335,6 @@ def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
     if not is_written:
         raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
     return bytes(data)
-
-
-def _npy(depth: Float32) -> bytes:
-    stream = BytesIO()
-    np.save(stream, np.ascontiguousarray(depth, dtype="<f4"), allow_pickle=False)
-    return stream.getvalue()
 
 
 def _write_joints(path: Path, states: StateColumns) -> None:

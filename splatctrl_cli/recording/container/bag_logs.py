@@ -24,7 +24,7 @@ from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import standing_in
 from splatctrl_cli.recording.container.mcap_log import ros_type_name
-from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.records import SECOND_NS
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
@@ -46,12 +46,86 @@ class BagRecord(NamedTuple):
     is_cut: bool = False
 
 
-class BagFile:
-    """A reader of one file's records."""
+class Bag1Log(RawLog):
+    """One ROS 1 bag; its index is not needed. Raises InputError without any record.
+
+    rosbags (rosbags/rosbag1/reader.py) refuses a bag without index, and ends at the first damaged chunk.
+    """
+
+    container = "ROS 1 bag"
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.size = path.stat().st_size
+        self.files = (path,)
+        self._size = path.stat().st_size
+        self._topics: dict[int, Topic] = {}
+        if next(self.records(Damage()), None) is None:
+            raise InputError(f"{path}: not a readable ROS 1 bag: no whole record", remedy="record or copy it again")
+        for record in self._connections():
+            self._connect(record.fields, record.body, Damage())
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield in file order; skips bad chunks, reads a cut one to its cut."""
+        budget, num_indexed, num_chunks = Budget(self._size), 0, None
+        for record in self.records(damage):
+            if record.kind == BAG_HEADER:
+                num_chunks = number(record.fields, "chunk_count")
+                if number(record.fields, "index_pos") <= 0:
+                    damage.add(f"{self.path.name}: has no index: cut, or still being written")
+                    num_chunks = 0
+            elif record.kind == CHUNK_INFO:
+                num_indexed += 1
+            elif record.kind == CHUNK:
+                yield from self._chunk(record, budget, damage, names)
+            elif not record.is_cut:
+                yield from self._read(record.kind, record.fields, record.body, record.offset, damage, names)
+        if num_chunks is None or num_indexed < num_chunks:
+            damage.add(f"{self.path.name}: its index is not whole")
+
+    def _chunk(
+        self, record: BagRecord, budget: Budget, damage: Damage, names: Collection[str] | None
+    ) -> Iterator[RawMessage]:
+        compression = record.fields.get("compression", b"").decode("latin-1")
+        size = number(record.fields, "size")
+        try:
+            unpack = unpacked_start if record.is_cut else budget.unpacked
+            for kind, fields, body in records_in(unpack(record.body, compression, size)):
+                yield from self._read(kind, fields, body, record.offset, damage, names)
+        except (BadBlockError, ValueError) as error:
+            if not record.is_cut:  # the cut has been counted
+                damage.add(f"{self.path.name}: the chunk at byte {record.offset} was left out: {error}")
+
+    def _read(
+        self, kind: int, fields: Fields, body: bytes, offset: int, damage: Damage, names: Collection[str] | None
+    ) -> Iterator[RawMessage]:
+        if kind == CONNECTION:
+            self._connect(fields, body, damage)
+        elif kind == MESSAGE:
+            topic, time = self._topics.get(number(fields, "conn")), fields.get("time", b"")
+            if topic is None or len(time) != 8:
+                damage.add(f"{self.path.name}: a message without a connection or time")
+            elif names is None or topic.name in names:
+                seconds, nanoseconds = int.from_bytes(time[:4], "little"), int.from_bytes(time[4:], "little")
+                yield RawMessage(
+                    topic=topic,
+                    log_time_ns=seconds * SECOND_NS + nanoseconds,
+                    data=body,
+                    file=self.path.name,
+                    offset=offset,
+                )
+
+    def _connect(self, fields: Fields, body: bytes, damage: Damage) -> None:
+        told = fields_of(body)
+        if told is None or "topic" not in fields or "type" not in told:
+            damage.add(f"{self.path.name}: a connection without topic or type")
+            return
+        topic = Topic(
+            name=fields["topic"].decode("utf-8", "replace"),
+            type_name=ros_type_name(told["type"].decode("utf-8", "replace")),
+            encoding="ros1",
+            definition=told.get("message_definition", b"").decode("utf-8", "replace"),
+        )
+        self._topics[number(fields, "conn")] = standing_in(topic)
 
     def records(self, damage: Damage) -> Iterator[BagRecord]:
         """Yield all records in order; only chunks, connections and messages have bodies. Losses go to `damage`."""
@@ -59,7 +133,7 @@ class BagFile:
             if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
                 damage.add(f"{self.path.name}: is not a bag of format 2.0")
                 return
-            while stream.tell() < self.size:
+            while stream.tell() < self._size:
                 offset = stream.tell()
                 record = self._record(stream, offset)
                 if record is not None and not record.is_cut:
@@ -74,13 +148,13 @@ class BagFile:
                 damage.add(f"{self.path.name}: bytes {offset} to {place} are damaged and were left out")
                 stream.seek(place)
 
-    def connections(self) -> list[BagRecord]:
+    def _connections(self) -> list[BagRecord]:
         """The index's connections, if any."""
         with self.path.open("rb") as stream:
             stream.readline(64)
             first = self._record(stream, stream.tell())
             place = number(first.fields, "index_pos") if first is not None and first.kind == BAG_HEADER else 0
-            if not 0 < place < self.size:
+            if not 0 < place < self._size:
                 return []
             stream.seek(place)
             found = []
@@ -95,16 +169,16 @@ class BagFile:
             return None
         kind, fields, length = head
         end = stream.tell() + length
-        is_cut = end > self.size
+        is_cut = end > self._size
         is_read = kind in {MESSAGE, CHUNK, CONNECTION} or is_cut
         body = stream.read(min(length, MAX_BLOCK)) if is_read else b""
-        stream.seek(min(end, self.size))
+        stream.seek(min(end, self._size))
         return BagRecord(offset, kind, fields, body, is_cut)
 
     def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
         """Kind, fields and body length; the stream is left at the body."""
         length = self._length(stream)
-        if length is None or length > min(1 << 20, self.size - stream.tell()):  # those of connections hold a name
+        if length is None or length > min(1 << 20, self._size - stream.tell()):  # those of connections hold a name
             return None
         fields = fields_of(stream.read(length))
         kind = fields["op"][0] if fields is not None and len(fields.get("op", b"")) == 1 else 0
@@ -132,7 +206,7 @@ class BagFile:
     def _is_chunk(self, stream: BinaryIO, place: int) -> bool:
         stream.seek(place)
         head = self._head(stream)
-        return head is not None and head[0] == CHUNK and stream.tell() + head[2] <= self.size
+        return head is not None and head[0] == CHUNK and stream.tell() + head[2] <= self._size
 
     @staticmethod
     def _length(stream: BinaryIO) -> int | None:
@@ -145,9 +219,7 @@ def fields_of(header: bytes) -> Fields | None:
     found: Fields = {}
     at = 0
     while at < len(header):
-        if at + 4 > len(header):
-            return None
-        length = _U32.unpack_from(header, at)[0]
+        length = int.from_bytes(header[at : at + 4], "little")
         at += 4 + length
         name, equals, value = header[at - length : at].partition(b"=")
         if at > len(header) or not equals:
@@ -169,10 +241,8 @@ def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
     """
     at = 0
     while at < len(content):
-        if at + 4 > len(content):
-            raise ValueError(f"{len(content) - at} bytes are not a record")
         start = at + 4
-        end = start + _U32.unpack_from(content, at)[0]
+        end = start + int.from_bytes(content[at:start], "little")
         fields = fields_of(content[start:end]) if end + 4 <= len(content) else None
         if fields is None:
             raise ValueError(f"{len(content) - at} bytes are not a record")
@@ -184,93 +254,12 @@ def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
         yield kind[0], fields, content[body:at]
 
 
-class Bag1Log:
-    """One ROS 1 bag; its index is not needed. Raises InputError without any record.
-
-    rosbags (rosbags/rosbag1/reader.py) refuses a bag without index, and ends at the first damaged chunk.
-    """
-
-    container = "ROS 1 bag"
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.files = (path,)
-        self._file = BagFile(path)
-        self._topics: dict[int, Topic] = {}
-        if next(self._file.records(Damage()), None) is None:
-            raise InputError(f"{path}: not a readable ROS 1 bag: no whole record", remedy="record or copy it again")
-        for record in self._file.connections():
-            self._connect(record.fields, record.body, Damage())
-
-    def topics(self) -> tuple[Topic, ...]:
-        return tuple(self._topics.values())
-
-    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield in file order; skips bad chunks, reads a cut one to its cut."""
-        budget, num_indexed, num_chunks = Budget(self._file.size), 0, None
-        for record in self._file.records(damage):
-            if record.kind == BAG_HEADER:
-                num_chunks = number(record.fields, "chunk_count")
-                if number(record.fields, "index_pos") <= 0:
-                    damage.add(f"{self.path.name}: has no index: cut, or still being written")
-                    num_chunks = 0
-            elif record.kind == CHUNK_INFO:
-                num_indexed += 1
-            elif record.kind == CHUNK:
-                yield from self._chunk(record, budget, damage, names)
-            elif not record.is_cut:
-                yield from self._read(record.kind, record.fields, record.body, record.offset, damage, names)
-        if num_chunks is None or num_indexed < num_chunks:
-            damage.add(f"{self.path.name}: its index is not whole")
-
-    def _chunk(
-        self, record: BagRecord, budget: Budget, damage: Damage, names: Collection[str] | None
-    ) -> Iterator[RawMessage]:
-        compression = record.fields.get("compression", b"").decode("latin-1")
-        size = number(record.fields, "size")
-        try:
-            unpack = unpacked_start if record.is_cut else budget.unpacked
-            content = unpack(record.body, compression, size)
-            for kind, fields, body in records_in(content):
-                yield from self._read(kind, fields, body, record.offset, damage, names)
-        except (BadBlockError, ValueError) as error:
-            if not record.is_cut:  # the cut has been counted
-                damage.add(f"{self.path.name}: the chunk at byte {record.offset} was left out: {error}")
-
-    def _read(
-        self, kind: int, fields: Fields, body: bytes, offset: int, damage: Damage, names: Collection[str] | None
-    ) -> Iterator[RawMessage]:
-        if kind == CONNECTION:
-            self._connect(fields, body, damage)
-        elif kind == MESSAGE:
-            topic, time = self._topics.get(number(fields, "conn")), fields.get("time", b"")
-            if topic is None or len(time) != 8:
-                damage.add(f"{self.path.name}: a message without a connection or time")
-            elif names is None or topic.name in names:
-                seconds, nanoseconds = int.from_bytes(time[:4], "little"), int.from_bytes(time[4:], "little")
-                at = seconds * SECOND_NS + nanoseconds
-                yield RawMessage(topic=topic, log_time_ns=at, data=body, file=self.path.name, offset=offset)
-
-    def _connect(self, fields: Fields, body: bytes, damage: Damage) -> None:
-        told = fields_of(body)
-        if told is None or "topic" not in fields or "type" not in told:
-            damage.add(f"{self.path.name}: a connection without topic or type")
-            return
-        topic = Topic(
-            name=fields["topic"].decode("utf-8", "replace"),
-            type_name=ros_type_name(told["type"].decode("utf-8", "replace")),
-            encoding="ros1",
-            definition=told.get("message_definition", b"").decode("utf-8", "replace"),
-        )
-        self._topics[number(fields, "conn")] = standing_in(topic)
-
-
 _WIDEST_HOLE = 1 << 40
 _WAL = b"\2\2"  # format versions of a database that keeps what is new in a journal, "-wal"
 _PAGE_SIZE, _FILE_FORMAT = slice(16, 18), slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
 
 
-class Db3Log:
+class Db3Log(RawLog):
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
     SQLite writes while it reads a journal, so both are copied. It reads missing bytes of the last page as zeros,
@@ -325,9 +314,6 @@ class Db3Log:
                 self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]
         except sqlite3.Error:
             self._copy(size)
-
-    def topics(self) -> tuple[Topic, ...]:
-        return tuple(self._topics.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield in written order; rows on damaged pages are skipped and counted."""

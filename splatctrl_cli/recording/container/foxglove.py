@@ -26,26 +26,28 @@ from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.container.raw_log import Topic
 
 
-class MessageTypes:
-    """A FileDescriptorSet's types. Raises ValueError for other bytes."""
+@lru_cache(maxsize=16)
+def _pool(descriptor_set: bytes) -> Any:
+    files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
+    try:
+        for file in FileDescriptorSet.FromString(descriptor_set).file:
+            files.Add(file)
+    except (DecodeError, DescriptorDatabaseConflictingDefinitionError) as error:
+        raise ValueError(f"protobuf: the schema is not usable: {error}") from None
+    return DescriptorPool(files)
 
-    def __init__(self, descriptor_set: bytes) -> None:
-        files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
-        try:
-            for file in FileDescriptorSet.FromString(descriptor_set).file:
-                files.Add(file)
-        except (DecodeError, DescriptorDatabaseConflictingDefinitionError) as error:
-            raise ValueError(f"protobuf: the schema is not usable: {error}") from None
-        self._pool = DescriptorPool(files)
 
-    def read(self, type_name: str, data: bytes) -> Any:
-        """Decode a message; unwritten fields have defaults. Raises ValueError if it does not decode."""
-        try:
-            return GetMessageClass(self._pool.FindMessageTypeByName(type_name)).FromString(data)
-        except KeyError:
-            raise ValueError(f"the schema does not define {type_name}") from None
-        except (DecodeError, TypeError) as error:
-            raise ValueError(f"protobuf: {error}") from None
+def read_protobuf(descriptor_set: bytes, type_name: str, data: bytes) -> Any:
+    """Decode a message by a FileDescriptorSet; unwritten fields have defaults.
+
+    Raises ValueError for another set, and if the message does not decode.
+    """
+    try:
+        return GetMessageClass(_pool(descriptor_set).FindMessageTypeByName(type_name)).FromString(data)
+    except KeyError:
+        raise ValueError(f"the schema does not define {type_name}") from None
+    except (DecodeError, TypeError) as error:
+        raise ValueError(f"protobuf: {error}") from None
 
 
 _STANDS_FOR = {
@@ -57,8 +59,6 @@ _STANDS_FOR = {
     "FrameTransforms": "tf2_msgs/msg/TFMessage",
     "JointStates": "sensor_msgs/msg/JointState",
 }
-_VECTORS = "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
-_TRANSFORM = f"builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n{_VECTORS}"
 _STAMPED = "builtin_interfaces/Time timestamp\nstring frame_id\n"
 _SIZED = f"{_STAMPED}uint32 width\nuint32 height\n"
 DEFINITIONS = {  # for bags without any; foxglove/schemas, ros_foxglove_msgs/ros2
@@ -68,7 +68,10 @@ DEFINITIONS = {  # for bags without any; foxglove/schemas, ros_foxglove_msgs/ros
     "foxglove_msgs/msg/CameraCalibration": (
         f"{_SIZED}string distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n"
     ),
-    "foxglove_msgs/msg/FrameTransform": _TRANSFORM,
+    "foxglove_msgs/msg/FrameTransform": (
+        "builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n"
+        "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
+    ),
     "foxglove_msgs/msg/FrameTransforms": "foxglove_msgs/FrameTransform[] transforms\n",
 }
 TEXT = "std_msgs/msg/String"
@@ -78,13 +81,14 @@ _TEXTS = {  # by the topic, what a text of the SDK stands for; metadata say the 
     rf"{_SENSOR}/\w+_\d+/tf/ref_\d+": "geometry_msgs/msg/Transform",
     rf"{_SENSOR}/(option/Depth_Units/value|\w+_\d+/image/metadata)": "std_msgs/msg/Float32",
 }
-_PREFIXES = ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/")
 
 
 def stands_for(schema: str) -> str:
     """The ROS type of a Foxglove schema, "" for others."""
-    prefix = next((prefix for prefix in _PREFIXES if schema.startswith(prefix)), None)
-    return "" if prefix is None else _STANDS_FOR.get(schema.removeprefix(prefix), "")
+    for prefix in ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/"):
+        if schema.startswith(prefix):
+            return _STANDS_FOR.get(schema.removeprefix(prefix), "")
+    return ""
 
 
 def standing_in(topic: Topic) -> Topic:
@@ -102,17 +106,12 @@ def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> A
     """
     if encoding == "json":
         return as_ros(schema, _object(json.loads(data)))
-    return as_ros(schema, _types(definition).read(schema, data))
+    return as_ros(schema, read_protobuf(definition.encode("latin-1"), schema, data))
 
 
 def as_ros(schema: str, message: Any) -> Any:
     """Convert a Foxglove message to its ROS message."""
     return _READERS[schema.replace("/", ".").rpartition(".")[2]](message)
-
-
-@lru_cache(maxsize=16)
-def _types(definition: str) -> MessageTypes:
-    return MessageTypes(definition.encode("latin-1"))
 
 
 def _object(value: Any) -> Any:
@@ -199,7 +198,8 @@ def _joint_states(message: Any) -> Any:
 def _sdk_text(message: Any) -> Any:
     """Parse an SDK text. Raises KeyError or ValueError for a missing field."""
     said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
-    values = {key: np.array(text.split(","), np.float64) for key, text in said.items() if key in _TEXT_FIELDS}
+    fields = ("fx", "fy", "ppx", "ppy", "coeffs", "rotation", "translation")
+    values = {key: np.array(said[key].split(","), np.float64) for key in fields if key in said}
     if "fx" in said:
         fx, fy, cx, cy = (float(values[key][0]) for key in ("fx", "fy", "ppx", "ppy"))
         size = SimpleNamespace(width=float(said["width"]), height=float(said["height"]))
@@ -212,7 +212,6 @@ def _sdk_text(message: Any) -> Any:
     return SimpleNamespace(data=float(said.get("Depth Units", 0) if said else message.data))
 
 
-_TEXT_FIELDS = ("fx", "fy", "ppx", "ppy", "coeffs", "rotation", "translation")
 _READERS: dict[str, Callable[[Any], Any]] = {
     "CompressedImage": _compressed_image,
     "CompressedVideo": _compressed_image,

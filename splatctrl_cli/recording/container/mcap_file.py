@@ -1,32 +1,92 @@
 """The records of an MCAP file from front to back, despite damage, in bounded memory.
 
-An impossible record is skipped, to the summary's next place or the next compressed chunk with consistent lengths.
+An impossible record is skipped, to the summary's next place or the next compressed chunk with consistent lengths. The
+`mcap` package reads the fields of a record (mcap.dev/spec), each within its own bytes; bytes after the last field are
+allowed, as specified.
 """
 
 import bisect
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics
 
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE
-from splatctrl_cli.recording.container.mcap_records import (
-    ATTACHMENT,
-    CHUNK,
-    CHUNK_INDEX,
-    DATA_END,
-    FIRST_OPCODE,
-    FOOTER,
-    HEAD,
-    MAGIC,
-    BadRecordError,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    parse_record,
-)
 from splatctrl_cli.recording.container.raw_log import Damage
+
+__all__ = ["Channel", "Chunk", "ChunkIndex", "DataEnd", "Footer", "Schema", "Statistics", "parse_record"]
+MAGIC = b"\x89MCAP0\r\n"
+MESSAGE, CHUNK, ATTACHMENT, SCHEMA, CHANNEL = 0x05, 0x06, 0x09, 0x03, 0x04
+DATA_END, FOOTER, CHUNK_INDEX, STATISTICS, MESSAGE_INDEX = 0x0F, 0x02, 0x08, 0x0B, 0x07
+FIRST_OPCODE = 0x01
+HEAD = struct.Struct("<BQ")  # opcode and length of what follows
+
+
+class BadRecordError(ValueError):
+    """A record too short for its fields."""
+
+
+class _Fields(ReadDataStream):  # type: ignore[misc]
+    def read(self, length: int) -> bytes:
+        """Read exactly `length` bytes. Raises EndOfFile, where the package returns fewer."""
+        found: bytes = super().read(length)
+        if len(found) < length:
+            raise EndOfFile
+        return found
+
+    def read_prefixed_string(self) -> str:
+        return self.read(self.read4()).decode("utf-8", "replace")
+
+    def rest(self) -> bytes:
+        """The remaining bytes."""
+        return bytes(self._stream.read())
+
+
+class Chunk(NamedTuple):
+    """Stored records; shorter than `compressed_size` if cut."""
+
+    message_start_time: int
+    message_end_time: int
+    uncompressed_size: int
+    uncompressed_crc: int
+    compression: str
+    compressed_size: int
+    records: bytes
+
+    @classmethod
+    def read(cls, fields: _Fields) -> "Chunk":
+        numbers = (fields.read8(), fields.read8(), fields.read8(), fields.read4())
+        compression, size = fields.read_prefixed_string(), fields.read8()
+        return cls(*numbers, compression, size, fields.rest()[:size])
+
+
+_KINDS: dict[int, Any] = {  # by opcode
+    FOOTER: Footer,
+    SCHEMA: Schema,
+    CHANNEL: Channel,
+    CHUNK: Chunk,
+    CHUNK_INDEX: ChunkIndex,
+    STATISTICS: Statistics,
+    DATA_END: DataEnd,
+}
+
+
+def parse_record(opcode: int, content: bytes) -> Any:
+    """A record, None if not in `_KINDS`. Raises BadRecordError."""
+    if opcode not in _KINDS:
+        return None
+    try:
+        return _KINDS[opcode].read(_Fields(BytesIO(content)))
+    except EndOfFile:
+        raise BadRecordError(f"a record of {len(content)} bytes ends within a field") from None
+
 
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, start, end, unpacked size, crc; then the compression's name
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
@@ -57,8 +117,7 @@ class McapFile:
         places = [index.chunk_start_offset for index in self.chunk_indexes()]  # where records are known to begin
         places += [part.offset for part in self.summary()[:1]]
         with self.path.open("rb") as stream:
-            walk = _Walk(stream, self.path.name, self.size, damage, places, has_crc=not is_known)
-            yield from walk.parts()
+            yield from _Walk(stream, self.path.name, self.size, damage, places, has_crc=not is_known).parts()
 
     def summary(self) -> list[Part]:
         """The summary section's records, if readable."""
@@ -79,14 +138,10 @@ class McapFile:
 
     def chunk_indexes(self) -> list[ChunkIndex]:
         """The summary's chunks in file order."""
-        found = []
+        found: list[ChunkIndex] = []
         for part in self.summary():
-            try:
-                record = parse_record(part.opcode, part.content) if part.opcode == CHUNK_INDEX else None
-            except BadRecordError:
-                continue
-            if isinstance(record, ChunkIndex):
-                found.append(record)
+            with suppress(BadRecordError):
+                found += [parse_record(CHUNK_INDEX, part.content)] if part.opcode == CHUNK_INDEX else []
         return sorted(found, key=lambda index: index.chunk_start_offset)
 
     def chunk_at(self, index: ChunkIndex) -> bytes:
@@ -199,13 +254,10 @@ class _Walk:
     def _check_data(self, opcode: int, length: int) -> None:
         if opcode != DATA_END or length > PIECE:
             return
-        here = self._stream.tell()
-        try:
-            record = parse_record(opcode, self._stream.read(length))
-        except BadRecordError:
-            record = None
+        here, expected = self._stream.tell(), 0
+        with suppress(BadRecordError):
+            expected = parse_record(DATA_END, self._stream.read(length)).data_section_crc
         self._stream.seek(here)
-        expected = record.data_section_crc if isinstance(record, DataEnd) else 0
         if expected and self._crc is not None and self._crc != expected:
             self._add("checksum of the data section differs")
         self._crc = None
@@ -231,8 +283,6 @@ class _Walk:
         try:
             footer = parse_record(FOOTER, part.content)
         except BadRecordError:
-            footer = None
-        if not isinstance(footer, Footer):
             self._add("its footer is damaged")
             return
         after = self._stream.tell()
@@ -277,9 +327,7 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
     opcode, length = HEAD.unpack_from(content)
     if opcode != FOOTER or length != 20 or not content.endswith(MAGIC):
         return None
-    footer = parse_record(FOOTER, content[HEAD.size : _FOOTER_SIZE])
-    assert isinstance(footer, Footer)
-    return footer
+    return parse_record(FOOTER, content[HEAD.size : _FOOTER_SIZE])
 
 
 def _attachment_length(head: bytes) -> int | None:

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from splatctrl_cli.formats.unpacking import BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import standing_in, stands_for
-from splatctrl_cli.recording.container.mcap_file import McapFile
-from splatctrl_cli.recording.container.mcap_records import (
+from splatctrl_cli.recording.container.mcap_file import (
     CHANNEL,
     CHUNK,
     FIRST_OPCODE,
@@ -29,11 +28,12 @@ from splatctrl_cli.recording.container.mcap_records import (
     Channel,
     Chunk,
     ChunkIndex,
+    McapFile,
     Schema,
     Statistics,
     parse_record,
 )
-from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 
 MOST_HEADS = 100_000  # records that are visited: a second or so
 
@@ -69,8 +69,9 @@ def index_by_heads(file: McapFile) -> LogIndex:
             elif opcode == MESSAGE_INDEX and chunks:
                 channel, size = struct.unpack_from("<HI", content)
                 counts[channel] = counts.get(channel, 0) + size // 16
-                offsets = {**chunks[-1].message_index_offsets, channel: offset}
-                chunks[-1] = replace(chunks[-1], message_index_offsets=offsets)
+                chunks[-1] = replace(
+                    chunks[-1], message_index_offsets={**chunks[-1].message_index_offsets, channel: offset}
+                )
             elif opcode == MESSAGE:
                 channel, _, stamp, _ = struct.unpack_from("<HIQQ", content)
                 counts[channel] = counts.get(channel, 0) + 1
@@ -89,8 +90,7 @@ def index_by_heads(file: McapFile) -> LogIndex:
 
 
 def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex:
-    chunk = parse_record(CHUNK, content)
-    assert isinstance(chunk, Chunk)
+    chunk: Chunk = parse_record(CHUNK, content)
     return ChunkIndex(
         message_start_time=chunk.message_start_time,
         message_end_time=chunk.message_end_time,
@@ -107,7 +107,7 @@ def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex:
 _MESSAGE = struct.Struct("<HIQQ")
 
 
-class McapLog:
+class McapLog(RawLog):
     """One MCAP file."""
 
     container = "MCAP"
@@ -117,16 +117,13 @@ class McapLog:
         self.files = (path,)
         self._file = McapFile(path)
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Topic] = {}
+        self._topics: dict[int, Topic] = {}
         self._statistics: Statistics | None = None
         self._budget = Budget(self._file.size)
         self._whole: tuple[int, int] | None = None  # the file's state when a pass found all its checksums right
         for part in self._file.summary():  # so that a damaged chunk hides no channel of others
             if part.opcode in {SCHEMA, CHANNEL, STATISTICS}:
                 self._declare(part.opcode, part.content, Damage())
-
-    def topics(self) -> tuple[Topic, ...]:
-        return tuple(self._channels.values())
 
     def index(self) -> LogIndex:
         """The index by summary, else by the heads of records."""
@@ -145,7 +142,7 @@ class McapLog:
 
     def topic_of(self, channel: int) -> Topic | None:
         """A declared channel's topic, or None."""
-        return self._channels.get(channel)
+        return self._topics.get(channel)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.
@@ -171,8 +168,9 @@ class McapLog:
         """Yield these chunks' messages, anywhere in the file."""
         self._forget_changed()
         for index in chunks:
-            content = self._file.chunk_at(index)
-            yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
+            yield from self._chunk_messages(
+                self._file.chunk_at(index), index.chunk_start_offset, damage, names, is_cut=False
+            )
 
     def _forget_changed(self) -> tuple[int, int]:
         stat = self.path.stat()
@@ -202,13 +200,11 @@ class McapLog:
     def _records_in(self, content: bytes, offset: int, damage: Damage, *, is_cut: bool) -> bytes:
         """A chunk's records, its start if cut, empty if damaged."""
         try:
-            chunk = parse_record(CHUNK, content)
-            assert isinstance(chunk, Chunk)
+            chunk: Chunk = parse_record(CHUNK, content)
             if is_cut or len(chunk.records) < chunk.compressed_size:
                 return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
             records = self._budget.unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
-            is_known = self._whole is not None
-            if chunk.uncompressed_crc and not is_known and zlib.crc32(records) != chunk.uncompressed_crc:
+            if chunk.uncompressed_crc and self._whole is None and zlib.crc32(records) != chunk.uncompressed_crc:
                 raise BadBlockError("checksum differs")
         except (BadRecordError, BadBlockError) as error:
             if not is_cut:  # the cut has been counted
@@ -223,7 +219,7 @@ class McapLog:
             damage.add(f"{self.path.name}: a message record of {end - start} bytes")
             return None
         channel, _, log_time_ns, _ = _MESSAGE.unpack_from(records, start)
-        topic = self._channels.get(channel)
+        topic = self._topics.get(channel)
         if topic is None:
             damage.add(f"{self.path.name}: a message of undeclared channel {channel}")
             return None
@@ -246,7 +242,7 @@ class McapLog:
         if isinstance(record, Schema):
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
-            self._channels[record.id] = _topic(record, self._schemas.get(record.schema_id))
+            self._topics[record.id] = _topic(record, self._schemas.get(record.schema_id))
         elif isinstance(record, Statistics):
             self._statistics = record
 

@@ -1,10 +1,10 @@
 """Recorded messages as bytes, in file order; damage is counted, not raised."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 MAX_NOTES = 100  # a long log can be damaged in a million places
 
@@ -44,10 +44,11 @@ class RawMessage:
 class Damage:
     """A record of what a pass over a log could not read.
 
-    remarks: counts of what is no damage, such as unsupported forms.
+    remarks: counts of what is no damage, such as unsupported forms. num_invalid: depth pixels that measure nothing.
     """
 
     count: int = 0
+    num_invalid: int = 0
     notes: list[str] = field(default_factory=list)
     remarks: Counter[str] = field(default_factory=Counter)
     _num_unsaid: int = 0
@@ -72,32 +73,27 @@ class Damage:
         return [*self.notes, *(text if num == 1 else f"{text} ({num} times)" for text, num in self.remarks.items())]
 
 
-class RawLog(Protocol):
-    """A log that can be read repeatedly."""
+class RawLog:
+    """A log that can be read repeatedly.
 
-    @property
-    def path(self) -> Path: ...
+    container: the kind of file in words, such as ``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``.
+    """
 
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """The log's files."""
-        ...
-
-    @property
-    def container(self) -> str:
-        """The kind of file in words, such as ``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``."""
-        ...
+    path: Path
+    files: tuple[Path, ...]
+    container: str
+    _topics: Mapping[Any, Topic]
 
     def topics(self) -> tuple[Topic, ...]:
         """Topics in the index, even without messages; none without an index."""
-        ...
+        return tuple(self._topics.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages of `names` (None: all) in file order; losses go to `damage`."""
-        ...
+        raise NotImplementedError
 
 
-class JoinedLog:
+class JoinedLog(RawLog):
     """Logs read in turn; `note` is a fault of the whole, counted as damage."""
 
     def __init__(

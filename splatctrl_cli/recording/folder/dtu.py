@@ -132,15 +132,18 @@ def read_views(
             depth = read_depth(depth_path, visual, size)
             files += [depth_path, *([visual] if visual.is_file() else [])]
         mask_path = mask_of(number)
-        view = DtuView(
-            name=path.stem,
-            color=color,
-            depth=depth,
-            intrinsics=intrinsics,
-            T_world_camera=T_world_camera,
-            mask=None if mask_path is None else read_mask(mask_path, size),
+        views.append(
+            shrink(
+                DtuView(
+                    name=path.stem,
+                    color=color,
+                    depth=depth,
+                    intrinsics=intrinsics,
+                    T_world_camera=T_world_camera,
+                    mask=None if mask_path is None else read_mask(mask_path, size),
+                )
+            )
         )
-        views.append(shrink(view))
         numbers.append(number)
         files += [path] if mask_path is None else [path, mask_path]
     return DtuScan(

@@ -281,11 +281,18 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         stamps=_optional(StampsTable, content, "stamps", path) or StampsTable(),
         split=_optional(SplitTable, content, "split", path) or SplitTable(),
     )
-    if description.poses is not None:
-        _check_choice(path, "poses.format", description.poses.format, FORMATS)
-        _check_choice(path, "poses.convention", description.poses.convention, CONVENTIONS)
-        _check_choice(path, "poses.axes", description.poses.axes, AXES)
-    _check_choice(path, "depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
+    choices: list[tuple[str, str, tuple[str, ...]]] = [
+        ("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
+    ]
+    if (poses := description.poses) is not None:
+        choices[:0] = [
+            ("poses.format", poses.format, FORMATS),
+            ("poses.convention", poses.convention, CONVENTIONS),
+            ("poses.axes", poses.axes, AXES),
+        ]
+    for key, value, allowed in choices:
+        if value not in allowed:
+            raise _refused(f"{path}: {key}: expected one of {', '.join(allowed)}, got {value!r}")
     for name, camera in (("camera", description.camera), ("depth_camera", description.depth_camera)):
         if camera is not None:
             check_camera(camera, f"{path}: {name}")
@@ -325,8 +332,7 @@ def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> 
     for key, f in declared.items():
         if key not in table and f.default is MISSING and f.default_factory is MISSING:
             raise _refused(f"{path}: {name}.{key} is missing")
-    values = {key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()}
-    return kind(**values)
+    return kind(**{key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()})
 
 
 def _typed(value: Any, hint: Any, where: str) -> Any:
@@ -347,10 +353,7 @@ def _typed(value: Any, hint: Any, where: str) -> Any:
 def _check_keys(table: dict[str, Any], known: set[str], where: str, prefix: str) -> None:
     for key in table:
         if key not in known:
-            remedy = did_you_mean(key, known, f"known here: {', '.join(sorted(known))}", prefix=prefix, cutoff=0.4)
-            raise InputError(f"{where}: unknown key {prefix}{key}", remedy=remedy)
-
-
-def _check_choice(path: Path, key: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise _refused(f"{path}: {key}: expected one of {', '.join(choices)}, got {value!r}")
+            raise InputError(
+                f"{where}: unknown key {prefix}{key}",
+                remedy=did_you_mean(key, known, f"known here: {', '.join(sorted(known))}", prefix=prefix, cutoff=0.4),
+            )

@@ -1,4 +1,7 @@
-"""Image folders with a TOML description, of one or several cameras, as records."""
+"""Image folders with a TOML description, of one or several cameras, as records.
+
+Dataset layouts are known by their own files, without a description.
+"""
 
 import heapq
 from collections.abc import Iterator
@@ -14,8 +17,12 @@ from numpy.typing import NDArray
 from splatctrl_cli.config.fixed import UNIT_BASELINE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.summary import names_in
 from splatctrl_cli.formats.arrays import DAMAGE, npy_of
 from splatctrl_cli.formats.image_file import decode_file, read_pfm
+from splatctrl_cli.libraries import entries_of
+from splatctrl_cli.recording.capture.capture_writer import check_not_partial
+from splatctrl_cli.recording.container.log_formats import SUFFIXES, is_bag_folder
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     Description,
@@ -23,28 +30,35 @@ from splatctrl_cli.recording.folder.folder_description import (
     read_description,
     read_rig,
 )
-from splatctrl_cli.recording.folder.folder_views import HOLDOUT, UNITS, View, find_files, length_unit, views_of
+from splatctrl_cli.recording.folder.folder_views import UNITS, View, find_files, length_unit, views_of
+from splatctrl_cli.recording.folder.idr import idr_scans
+from splatctrl_cli.recording.folder.layout import Layout, images_of
 from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
 from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
 from splatctrl_cli.recording.log.registration import DepthToColor, Lens, Undistortion, undistortion_of
-from splatctrl_cli.recording.log.stored_frame import Recording, StoredFrame, check_depth, human_mask, is_kept, is_png
+from splatctrl_cli.recording.log.stored_frame import (
+    FrameSource,
+    StoredFrame,
+    check_depth,
+    human_mask,
+    is_kept,
+    is_png,
+)
 from splatctrl_cli.recording.source_options import SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.records import Bool, Float32, Float64, LossReport, UInt8
 
-__all__ = ["HOLDOUT", "ImageFolderSource"]
 _NOT_FOR_FOLDERS = (
     *("world_frame", "camera_topics", "camera_pose_topics", "human_topics"),
     *("joint_topic", "stamps"),
 )
 
 
-class ImageFolderSource(Recording):
+class ImageFolderSource(FrameSource):
     """Frames of an image folder, without joint states.
 
     The descriptions, one per camera, differ only in files, lens and poses.
     """
 
-    joint_names: tuple[str, ...] = ()
     world_frame = "world"
 
     def __init__(self, path: Path, options: SourceOptions, *descriptions: Description) -> None:
@@ -52,6 +66,8 @@ class ImageFolderSource(Recording):
         self.name = path.name
         self._descriptions = tuple(map(with_transforms, descriptions))
         self._description = self._descriptions[0]
+        stamps = self._description.stamps
+        self.has_clock = stamps.rate is not None or stamps.names
         self._loss = LossReport()
         self._damaged: list[str] = []
         self._num_invalid = 0
@@ -60,8 +76,9 @@ class ImageFolderSource(Recording):
         self._lenses: dict[str, Lens] = {}
         self.guess = "" if self.has_clock else self._in_metres()
         """In which unit lengths look to be, in words; empty where they may be metres."""
-        lenses = sorted({view.lens.name for view in self._views})
-        refuse_unknown_cameras(path, (*options.camera_poses, *options.intrinsics), lenses)
+        refuse_unknown_cameras(
+            path, (*options.camera_poses, *options.intrinsics), sorted({view.lens.name for view in self._views})
+        )
         names = sorted({view.camera for view in self._views})
         self.cameras = tuple(names) if options.cameras is None else options.cameras
         refuse_unknown_cameras(path, self.cameras, names)
@@ -78,12 +95,6 @@ class ImageFolderSource(Recording):
             f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
             remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
         )
-
-    @property
-    def has_clock(self) -> bool:
-        """True if [stamps] has a rate or names."""
-        stamps = self._description.stamps
-        return stamps.rate is not None or stamps.names
 
     @property
     def loss(self) -> LossReport:
@@ -214,13 +225,15 @@ class ImageFolderSource(Recording):
             )
             if depth_camera is not None:
                 bent = _undistortion(depth_camera)
-                warp = DepthToColor(
-                    depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
-                    color_intrinsics=lens.intrinsics,
-                    T_color_depth=self._description.T_color_depth,
-                    undistortion=bent,
+                lens = replace(
+                    lens,
+                    depth_to_color=DepthToColor(
+                        depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
+                        color_intrinsics=lens.intrinsics,
+                        T_color_depth=self._description.T_color_depth,
+                        undistortion=bent,
+                    ),
                 )
-                lens = replace(lens, depth_to_color=warp)
             self._lenses[table.name] = lens
         return self._lenses[table.name]
 
@@ -317,7 +330,87 @@ def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
     options.refuse(("holdout", "intrinsics", "camera_pose_topics"), "a description with several cameras", path)
     refuse_unknown_cameras(path, (*(options.cameras or ()), *options.camera_poses), rig)
     names = options.cameras or tuple(rig)
-    poses = {name: pose for name, pose in options.camera_poses.items() if name in names}
     return ImageFolderSource(
-        path, replace(options, cameras=names, camera_poses=poses), *(rig[name] for name in names)
+        path,
+        replace(
+            options,
+            cameras=names,
+            camera_poses={name: pose for name, pose in options.camera_poses.items() if name in names},
+        ),
+        *(rig[name] for name in names),
+    )
+
+
+_COLORS = ("images", "image", "rgb", "color")  # where folders of colour alone keep it
+_MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is not itself one
+
+LAYOUTS = entries_of(__package__, Layout)
+
+
+def layout_of(path: Path) -> Layout | None:
+    if path.is_file():
+        return next((layout for layout in LAYOUTS if layout.suffix == path.suffix.lower() != ""), None)
+    return next((layout for layout in LAYOUTS if layout.matches(path)), None)
+
+
+def has_views(path: Path) -> bool:
+    """True for a folder that is no ROS 2 bag, or a file with a layout."""
+    return layout_of(path) is not None if path.is_file() else path.is_dir() and not is_bag_folder(path)
+
+
+def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
+    """Open a dataset's folder. Raises InputError for an unknown layout."""
+    check_not_partial(folder)
+    layout = layout_of(folder)
+    if layout is None and ((folder / "Rectified").is_dir() or idr_scans(folder)):
+        raise InputError(
+            f"{folder}: a DTU data set, which only reconstruct and score read",
+            remedy='give it as --dtu (in a suite dtu = "{recording}")',
+        )
+    if layout is None:
+        names = ", ".join(known.name for known in LAYOUTS)
+        raise unknown_folder(
+            folder,
+            f"a folder that is neither a capture nor a ROS 2 bag, nor laid out as {names}",
+            "give the capture, the bag, one scene of the dataset, or a .toml for images (splatctrl help input)",
+        )
+    options.refuse(("root",), f"a folder laid out as {layout.name}", folder)
+    return ImageFolderSource(folder, options, layout.read(folder, options))
+
+
+def unknown_folder(folder: Path, what: str, remedy: str) -> InputError:
+    """The error for a folder that is not read: it names readable parts, else missing depth."""
+    inside = _readable_in(folder)
+    if not inside and (found := _bare_images(folder)):
+        return InputError(
+            f"{folder}: {found}",
+            remedy="describe colour, depth, lens and poses in a .toml (splatctrl help input); info, score and"
+            " reconstruct --points CLOUD.ply work without depth, but not without poses: a transforms.json"
+            " (ns-process-data writes it)",
+        )
+    return InputError(f"{folder}: {what}", remedy=f"give one that is in it: {inside}" if inside else remedy)
+
+
+def _bare_images(folder: Path) -> str:
+    """Words for missing depth in a folder of colour; "" without images."""
+    num = max(len(images_of(place)) for place in (folder, *(folder / name for name in _COLORS)) if place.is_dir())
+    is_colmap = any((folder / place).exists() for place in ("sparse", "images.bin", "images.txt"))
+    return f"depth is missing: images{' of a COLMAP model' if is_colmap else ''} alone ({num})" if num else ""
+
+
+def _readable_in(folder: Path) -> str:
+    """Names of readable parts, or ""."""
+    found = []
+    for name in names_in(folder)[:_MOST_LOOKED_AT]:
+        path = folder / name
+        if path.is_file() and (path.suffix in SUFFIXES or layout_of(path) is not None):
+            found.append(path.name)
+        elif path.is_dir() and (layout := layout_of(path)) is not None:
+            found.append(f"{path.name} ({layout.name})")
+        elif path.is_dir() and (path / "metadata.yaml").is_file():
+            found.append(f"{path.name} (ROS 2 bag)")
+        elif path.is_dir() and (path / "capture.json").is_file():
+            found.append(f"{path.name} (capture)")
+    return ", ".join(found[:_MOST_NAMED]) + (
+        f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
     )

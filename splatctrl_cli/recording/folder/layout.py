@@ -71,24 +71,17 @@ def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions],
     return refuse
 
 
-class Lenses:
-    """A layout's different lenses, as cameras ``camera``, ``camera-1``, ``camera-2``, ..."""
+def named_lens(lenses: list[CameraTable], table: CameraTable, where: str) -> CameraTable:
+    """A lens's camera, of those known or added to them as ``camera``, ``camera-1``, ``camera-2``, ...
 
-    def __init__(self) -> None:
-        self._tables: list[CameraTable] = []
-
-    def __len__(self) -> int:
-        return len(self._tables)
-
-    def named(self, table: CameraTable, where: str) -> CameraTable:
-        """A lens's camera, new or known. Raises as `check_camera`."""
-        for known in self._tables:
-            if asdict(replace(known, name=table.name)) == asdict(table):
-                return known
-        check_camera(table, where)
-        number = len(self._tables)
-        self._tables.append(replace(table, name=table.name if number == 0 else f"{table.name}-{number}"))
-        return self._tables[-1]
+    Raises as `check_camera`.
+    """
+    for known in lenses:
+        if asdict(replace(known, name=table.name)) == asdict(table):
+            return known
+    check_camera(table, where)
+    lenses.append(replace(table, name=f"{table.name}-{len(lenses)}" if lenses else table.name))
+    return lenses[-1]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +101,9 @@ class Pairs:
 
     def moved(self, change: Callable[[Float64], Float64]) -> "Pairs":
         """Apply `change` to each known pose."""
-        views = [v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in self.views]
-        return replace(self, views=views)
+        return replace(
+            self, views=[v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in self.views]
+        )
 
 
 def paired_by_name(

@@ -39,12 +39,12 @@ from splatctrl_cli.recording.folder.folder_description import (
 from splatctrl_cli.recording.folder.layout import (
     CAMERA,
     Layout,
-    Lenses,
     Pairs,
     described,
     image_size,
     images_of,
     marked,
+    named_lens,
     paired_by_stamp,
     read_json,
 )
@@ -63,13 +63,13 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
     trajectory = Trajectory(_poses(root / TRAJECTORY))
     pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, trajectory.at, options)
-    lenses = Lenses()
+    lenses: list[CameraTable] = []
     pincams = {
         stamp: path
         for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))
         if (stamp := _stamp_ns(path))
     }
-    views = [replace(view, camera=lenses.named(_arkit_lens(pincams, view), str(root))) for view in pairs.views]
+    views = [replace(view, camera=named_lens(lenses, _arkit_lens(pincams, view), str(root))) for view in pairs.views]
     return described(
         replace(pairs, views=views),
         root,
@@ -127,12 +127,6 @@ def _arkit_lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
     return CameraTable(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy)
 
 
-_ARKIT_DOCS = """
-ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world to camera, interpolated | 1 mm, of
-    another size: nearest pixels | a `.pincam` per image
-"""
-
-
 FILE = "scene_camera.json"
 _REMEDY = "see BOP's format of datasets"
 COLOR_FOLDERS = ("rgb", "gray")
@@ -176,7 +170,8 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected an object by image number, got {type(content).__name__}", remedy=_REMEDY)
     entries = {int(key): entry for key, entry in content.items() if key.isdigit()}
-    lenses, views, prefix = Lenses(), [], sensor.removeprefix("_")
+    lenses: list[CameraTable] = []
+    views, prefix = [], sensor.removeprefix("_")
     size = image_size(next(iter(colors.values()))) if colors else (0, 0)  # that of all images of a scene
     for name, color in colors.items():
         entry = entries.get(int(name)) if name.isdigit() else None
@@ -191,7 +186,7 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
                 color=color,
                 depth=depths[name],
                 matrix=_pose(entry),
-                camera=lenses.named(lens, where),
+                camera=named_lens(lenses, lens, where),
                 depth_scale=float(entry["depth_scale"]) * MILLIMETRE,
             )
         except (KeyError, TypeError, ValueError) as error:
@@ -207,12 +202,6 @@ def _pose(entry: dict[str, Any]) -> Float64 | None:
         np.array(entry["cam_t_w2c"], dtype=np.float64) * MILLIMETRE,
         np.array(entry["cam_R_w2c"], dtype=np.float64).reshape(3, 3),
     )
-
-
-_BOP_DOCS = """
-BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1.json`, `depth_cam1/` |
-    `cam_R_w2c`, `cam_t_w2c`; else `--camera-pose` | `depth_scale` of each image | `cam_K` of each image
-"""
 
 
 _CAMERAS = "cams/*_cam.txt"
@@ -237,7 +226,8 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
     colors = _images(folder, set(files))
     depths, without = _depths(folder)
     notes += without
-    lenses, views = Lenses(), []
+    lenses: list[CameraTable] = []
+    views = []
     for stem, color in colors.items():
         (K, T_camera_world, _), depth = cameras[stem], depths.get(int(stem) if stem.isdigit() else -1)
         if depth is None and depths:
@@ -245,7 +235,7 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
         k = fitted_intrinsics(K, image_size(color), files[stem])
         T_camera_world[:3, 3] *= unit
         lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
-        lens = lenses.named(lens, str(files[stem]))
+        lens = named_lens(lenses, lens, str(files[stem]))
         views.append(ListedView(name=stem, color=color, depth=depth, matrix=T_camera_world, camera=lens))
     return described(
         Pairs(path=folder, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views))),
@@ -288,21 +278,37 @@ def _maps(folder: Path) -> Iterator[tuple[int, Path]]:
             yield int(number[0]), path
 
 
-_MVSNET_DOCS = """
-MVSNet scene: DTU's test set, BlendedMVS, Tanks and Temples, colmap2mvsnet | `cams/*_cam.txt`, with `images/`,
-    `blended_images/` or images beside it | world to camera, of the camera file | `.pfm` in a folder with `depth` in
-    its name; metres, or millimetres where the files' least depth is over 20, or `--depth-scale` for poses and depth |
-    of the camera file, for the image or a quarter of it
-"""
-
 ENTRIES = (
     Layout(
         name="ARKitScenes",
         order=7,
         matches=lambda folder: _frames(folder) is not None,
         read=read_arkit,
-        docs=_ARKIT_DOCS,
+        docs="""
+ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world to camera, interpolated | 1 mm, of
+    another size: nearest pixels | a `.pincam` per image
+""",
     ),
-    Layout(name="BOP scene", order=1, matches=lambda folder: bool(_sensors(folder)), read=read_bop, docs=_BOP_DOCS),
-    Layout(name="MVSNet scene", order=10, matches=marked(_CAMERAS), read=read_mvsnet, docs=_MVSNET_DOCS),
+    Layout(
+        name="BOP scene",
+        order=1,
+        matches=lambda folder: bool(_sensors(folder)),
+        read=read_bop,
+        docs="""
+BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1.json`, `depth_cam1/` |
+    `cam_R_w2c`, `cam_t_w2c`; else `--camera-pose` | `depth_scale` of each image | `cam_K` of each image
+""",
+    ),
+    Layout(
+        name="MVSNet scene",
+        order=10,
+        matches=marked(_CAMERAS),
+        read=read_mvsnet,
+        docs="""
+MVSNet scene: DTU's test set, BlendedMVS, Tanks and Temples, colmap2mvsnet | `cams/*_cam.txt`, with `images/`,
+    `blended_images/` or images beside it | world to camera, of the camera file | `.pfm` in a folder with `depth` in
+    its name; metres, or millimetres where the files' least depth is over 20, or `--depth-scale` for poses and depth |
+    of the camera file, for the image or a quarter of it
+""",
+    ),
 )

@@ -14,7 +14,7 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.folder.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.recording.folder.layout import Layout, Lenses, image_size, marked
+from splatctrl_cli.recording.folder.layout import Layout, image_size, marked, named_lens
 from splatctrl_cli.recording.folder.poses import read_nerfstudio
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -29,16 +29,15 @@ _COEFFICIENTS = {
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 SUPPLY = "add depth_file_path to each frame (16-bit PNG in mm, or .npy in m), or describe the files in a .toml"
-_DEPTHS = ("depth_file_path", "depth_path")
-_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 
 
 def read(folder: Path, options: SourceOptions) -> Description:
     """Describe the folder; depth defaults to millimetres."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
-    poses = PosesTable(format="nerfstudio", file=file, axes="opengl")
-    return with_transforms(Description(path=folder / file, root=folder, poses=poses))
+    return with_transforms(
+        Description(path=folder / file, root=folder, poses=PosesTable(format="nerfstudio", file=file, axes="opengl"))
+    )
 
 
 def with_transforms(description: Description) -> Description:
@@ -49,7 +48,7 @@ def with_transforms(description: Description) -> Description:
         return description
     path = description.root / table.file
     content, matrices = read_nerfstudio(path)
-    lenses = Lenses()
+    lenses: list[CameraTable] = []
     views = [_view(content, entry, path, lenses, description, matrices) for entry in content["frames"]]
     if not views:
         raise InputError(f"{path}: no frames", remedy="give a transforms.json with frames")
@@ -70,21 +69,27 @@ def with_transforms(description: Description) -> Description:
     is_short = len(set(stems)) == len(stems)  # else the path without suffix
     names = stems if is_short else [str(Path(view.name).with_suffix("")) for view in views]
     named = (replace(view, name=name) for view, name in zip(views, names, strict=True))
-    listed = tuple(sorted(named, key=lambda v: v.name))
-    return replace(description, camera=views[0].camera, listed=listed, is_depth_resized=True, supply=SUPPLY)
+    return replace(
+        description,
+        camera=views[0].camera,
+        listed=tuple(sorted(named, key=lambda v: v.name)),
+        is_depth_resized=True,
+        supply=SUPPLY,
+    )
 
 
 def _view(
     content: dict[str, Any],
     entry: dict[str, Any],
     path: Path,
-    lenses: Lenses,
+    lenses: list[CameraTable],
     description: Description,
     matrices: dict[str, Float64],
 ) -> ListedView:
     name, said = str(entry["file_path"]), {**content, **entry}
-    color = _image(path.parent / _with_slashes(name))
-    depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
+    color = _image(path.parent / name.replace("\\", "/"))
+    depth = _only(entry, ("depth_file_path", "depth_path"), path)
+    scale = _only(said, ("depth_unit_scale_factor", "integer_depth_scale"), path)
     mask = entry.get("mask_path")
     try:
         applied = float(content.get("applied_scale", 1.0))
@@ -96,11 +101,11 @@ def _view(
     return ListedView(
         name=name,
         color=color,
-        depth=None if depth is None else path.parent / _with_slashes(str(depth)),
+        depth=None if depth is None else path.parent / str(depth).replace("\\", "/"),
         matrix=matrix,
-        camera=description.camera or lenses.named(_camera(said, color, path), str(path)),
+        camera=description.camera or named_lens(lenses, _camera(said, color, path), str(path)),
         depth_scale=unit,
-        valid=None if not mask else path.parent / _with_slashes(str(mask)),
+        valid=None if not mask else path.parent / str(mask).replace("\\", "/"),
     )
 
 
@@ -111,10 +116,6 @@ def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
         both = " and ".join(f"{key} = {value}" for key, value in found.items())
         raise InputError(f"{path}: {both} differ", remedy="leave one of them out")
     return next(iter(found.values()), None)
-
-
-def _with_slashes(name: str) -> str:
-    return name.replace("\\", "/")
 
 
 def _image(path: Path) -> Path:
@@ -157,13 +158,21 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
             distortion_model=_MODELS[model],
         )
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        remedy = "give [camera] and [frames] in a description"
-        raise InputError(f"{path}: no usable {error} in the intrinsics", remedy=remedy) from None
+        raise InputError(
+            f"{path}: no usable {error} in the intrinsics", remedy="give [camera] and [frames] in a description"
+        ) from None
 
 
-_DOCS = """
+ENTRIES = (
+    Layout(
+        name="nerfstudio",
+        order=4,
+        matches=marked(*FILES),
+        read=read,
+        docs="""
 nerfstudio, instant-ngp, Blender | `transforms.json` or `transforms_train.json`, `depth_file_path` or `depth_path` |
     `transform_matrix`, without `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` too; of another size: nearest
     pixels | of the file or each frame; `mask_path` leaves pixels out
-"""
-ENTRIES = (Layout(name="nerfstudio", order=4, matches=marked(*FILES), read=read, docs=_DOCS),)
+""",
+    ),
+)

@@ -8,7 +8,6 @@ the camera (z forward) or world, whichever fits.
 import struct
 from dataclasses import dataclass
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from splatctrl_cli.recording.folder.folder_description import (
 )
 from splatctrl_cli.recording.folder.layout import CAMERA, Layout, Pairs, by_numbers, described, marked
 from splatctrl_cli.recording.folder.poses import stamp_of_text
+from splatctrl_cli.recording.log.stored_frame import npy_bytes
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, Intrinsics, UInt8
 
@@ -242,14 +242,20 @@ def _depth_file(path: Path, camera: Intrinsics, first: Path, *, is_world: bool) 
     far = residual(points, camera)
     if seen.any() and far > CLOUD_RESIDUAL:
         raise _unfit(path, far, f"that of {first.name}")
-    stream = BytesIO()
-    np.save(stream, np.where(seen, points[..., 2], 0.0).astype(np.float32), allow_pickle=False)
-    return stream.getvalue()
+    return npy_bytes(np.where(seen, points[..., 2], 0.0).astype(np.float32))
 
 
-_DOCS = """
+ENTRIES = (
+    Layout(
+        name="PCD clouds",
+        order=12,
+        matches=marked(f"*{SUFFIX}"),
+        read=read,
+        suffix=SUFFIX,
+        docs="""
 organised point clouds (extra `pcd`) | `X.pcd` of HEIGHT over 1, or a folder of them; ascii, binary, compressed |
     `VIEWPOINT` | z of the points in the camera; metres, or `--depth-scale` | fitted to the grid, to 0.5 px; so are
     `--intrinsics` checked
-"""
-ENTRIES = (Layout(name="PCD clouds", order=12, matches=marked(f"*{SUFFIX}"), read=read, suffix=SUFFIX, docs=_DOCS),)
+""",
+    ),
+)

@@ -206,11 +206,6 @@ def _png(read: Callable[[], bytes], sens: _Sens) -> bytes:
     return cv2.imencode(".png", np.frombuffer(data, "<u2").reshape(height, width), _FAST)[1].tobytes()
 
 
-_SENS_DOCS = """
-ScanNet sensor file | `X.sens` of version 4, or a folder that holds one | camera to world of each frame, -inf = none |
-    `depthShift` counts per metre (zlib or plain words), registered to colour | of the file, extrinsics
-"""
-
 ENTRIES = (
     Layout(
         name="ScanNet sensor file",
@@ -218,6 +213,9 @@ ENTRIES = (
         matches=marked(f"*{SUFFIX}"),
         read=read_sens,
         suffix=SUFFIX,
-        docs=_SENS_DOCS,
+        docs="""
+ScanNet sensor file | `X.sens` of version 4, or a folder that holds one | camera to world of each frame, -inf = none |
+    `depthShift` counts per metre (zlib or plain words), registered to colour | of the file, extrinsics
+""",
     ),
 )

@@ -106,19 +106,6 @@ def _files(folder: Path, pattern: str, kind: str) -> dict[str, Path]:
     return {path.relative_to(folder).as_posix().partition(kind)[0]: path for path in paths}
 
 
-_FRAMES_DOCS = """
-7-Scenes | `frame-*.pose.txt`, also in `seq-*/` | a file a frame, of the depth camera; moved to colour | 1 mm,
-    65535 = none, registered to colour | depth 585, 585, 320, 240; colour 525, 525, 320, 240 with another Kinect's
-    extrinsics; `--intrinsics` takes both as one
-
-3DMatch | the same, `camera-intrinsics.txt` | a file a frame | as above, not registered | that file; 585, 585,
-    320, 240 in it counts as 7-Scenes
-
-12-Scenes, BundleFusion, 3RScan | the same, also in `data/`, `sequence/`, and `info.txt` or `_info.txt` | by a
-    [description](#12-scenes) | of the description | of the description
-"""
-
-
 COLOR_FOLDERS = ("color", "colors", "image", "rgb")
 TRAJECTORIES = (
     "trajectory.log",
@@ -194,62 +181,63 @@ def _redwood_lens(folder: Path) -> CameraTable:
     )
 
 
-_REDWOOD_DOCS = """
-Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.log` (`*_trajectory.log`,
-    `*-traj.txt`, ...) | by order; by number where there are more poses than images | 1 mm |
-    `camera_intrinsic.json` in the folder or above it, else `--intrinsics`
-"""
-
-
-_REPLICA_DOCS = """
-Replica of NICE-SLAM or Semantic-NeRF | `traj.txt`, `results/frame*`; `traj_w_c.txt`, `rgb/rgb_*` | by a
-    [description](#replica) | of the description | of the description
-"""
-
-_SCANNET_DOCS = """
-ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | by a
-    [description](#scannet-export) | of the description | of the description
-"""
-
-_ICL_DOCS = """
-ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description](#icl-nuim) | of the description |
-    of the description
-"""
-
 ENTRIES = (
     Layout(
         name="7-Scenes",
         order=3,
         matches=marked(*(f"{sequence}frame-*.pose.txt" for sequence in _SEQUENCES)),
         read=read_frames,
-        docs=_FRAMES_DOCS,
+        docs="""
+7-Scenes | `frame-*.pose.txt`, also in `seq-*/` | a file a frame, of the depth camera; moved to colour | 1 mm,
+    65535 = none, registered to colour | depth 585, 585, 320, 240; colour 525, 525, 320, 240 with another Kinect's
+    extrinsics; `--intrinsics` takes both as one
+
+3DMatch | the same, `camera-intrinsics.txt` | a file a frame | as above, not registered | that file; 585, 585,
+    320, 240 in it counts as 7-Scenes
+
+12-Scenes, BundleFusion, 3RScan | the same, also in `data/`, `sequence/`, and `info.txt` or `_info.txt` | by a
+    [description](#12-scenes) | of the description | of the description
+""",
     ),
     Layout(
         name="Open3D scene",
         order=9,
         matches=marked(*(f"{color}/ depth/ {path}" for color in COLOR_FOLDERS for path in TRAJECTORIES)),
         read=read_redwood,
-        docs=_REDWOOD_DOCS,
+        docs="""
+Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.log` (`*_trajectory.log`,
+    `*-traj.txt`, ...) | by order; by number where there are more poses than images | 1 mm |
+    `camera_intrinsic.json` in the folder or above it, else `--intrinsics`
+""",
     ),
     Layout(
         name="ScanNet export",
         order=2,
         matches=marked(*(f"color/ depth/ pose/ {lens}" for lens in ("intrinsic/", "intrinsics_color.txt"))),
         read=by_description("ScanNet export", "scannet.toml"),
-        docs=_SCANNET_DOCS,
+        docs="""
+ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | by a
+    [description](#scannet-export) | of the description | of the description
+""",
     ),
     Layout(
         name="ICL-NUIM",
         order=5,
         matches=marked("rgb/ depth/ *.gt.freiburg"),
         read=by_description("ICL-NUIM", "icl_nuim.toml"),
-        docs=_ICL_DOCS,
+        docs="""
+ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description](#icl-nuim) | of the description |
+    of the description
+""",
     ),
     Layout(
         name="Replica",
         order=6,
         matches=marked("traj.txt results/frame*", "traj_w_c.txt rgb/rgb_*"),
         read=by_description("Replica", "replica_nice_slam.toml", "replica_semantic_nerf.toml"),
-        docs=_REPLICA_DOCS,
+        docs="""
+Replica of NICE-SLAM or Semantic-NeRF | `traj.txt`, `results/frame*`; `traj_w_c.txt`, `rgb/rgb_*` | by a
+    [description](#replica) | of the description | of the description
+""",
     ),
 )

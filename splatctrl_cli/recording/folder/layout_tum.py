@@ -16,7 +16,8 @@ order, camera to world; the first pixel's centre is at 1.
 """
 
 import re
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,36 +47,16 @@ from splatctrl_cli.records import Float64
 SCALE = 1.0 / 5000.0  # [m] per count
 
 
-@dataclass(frozen=True, kw_only=True)
-class Series:
-    """A series: name pattern, fx, fy, cx, cy and k1, k2, p1, p2, k3."""
-
-    pattern: str
-    lens: tuple[float, float, float, float]
-    distortion: tuple[float, ...] = ()
-
-
-SERIES = (
-    Series(
-        pattern="(freiburg|fr)_?1",
-        lens=(517.3, 516.5, 318.6, 255.3),
-        distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+SERIES: Mapping[str, tuple[tuple[float, float, float, float], tuple[float, ...]]] = {
+    # pattern in the name: fx, fy, cx, cy; k1, k2, p1, p2, k3
+    "(freiburg|fr)_?1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "(freiburg|fr)_?2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "(freiburg|fr)_?3": ((535.4, 539.2, 320.1, 247.6), ()),
+    "bonn": (
+        (542.822841, 542.576870, 315.593520, 237.756098),
+        (0.039903, -0.099343, -0.000730, -0.000144, 0.0),
     ),
-    Series(
-        pattern="(freiburg|fr)_?2",
-        lens=(520.9, 521.0, 325.1, 249.7),
-        distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
-    ),
-    Series(pattern="(freiburg|fr)_?3", lens=(535.4, 539.2, 320.1, 247.6)),
-    Series(
-        pattern="bonn",
-        lens=(542.822841, 542.576870, 315.593520, 237.756098),
-        distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0),
-    ),
-)
-
-
-_BONN = SERIES[-1]
+}
 
 
 _BONN_T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -110,14 +91,14 @@ def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
     lost = (f"{file.name}: {num_lost} of {len(rows)} lines are no pose (nan)",) if num_lost else ()
     pairs = paired_by_stamp(folder / "rgb.txt", colors, depths, trajectory.at, options)
     return described(
-        pairs.moved(marker_to_camera) if series is _BONN else pairs,
+        pairs.moved(marker_to_camera) if series == "bonn" else pairs,
         folder,
         options,
         poses=PosesTable(format="tum", file=file.name),
         lens=lambda image: _lens(folder, series, image),
         depth=DepthTable(scale=SCALE),
         has_stamps=True,
-        notes=((_BONN_NOTE,) if series is _BONN else ()) + lost,
+        notes=((_BONN_NOTE,) if series == "bonn" else ()) + lost,
     )
 
 
@@ -134,18 +115,18 @@ def listed(path: Path) -> list[tuple[int, Path]]:
     return found
 
 
-def _series(folder: Path) -> Series | None:
-    """The series in the folder's name, else in its lists' heads."""
+def _series(folder: Path) -> str:
+    """The series, of `SERIES`, in the folder's name, else in its lists' heads; "" if none."""
     names = [folder.resolve().name]
     for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
         if (folder / file).is_file():
             with (folder / file).open(encoding="utf-8", errors="replace") as stream:
                 names += [line for line in stream.readlines(1000)[:4] if line.startswith("#")]
     pairs = ((name.lower(), series) for name in names for series in SERIES)
-    return next((series for name, series in pairs if re.search(rf"(?<![a-z]){series.pattern}(?!\d)", name)), None)
+    return next((series for name, series in pairs if re.search(rf"(?<![a-z]){series}(?!\d)", name)), "")
 
 
-def _lens(folder: Path, series: Series | None, image: ImageFile) -> CameraTable:
+def _lens(folder: Path, series: str, image: ImageFile) -> CameraTable:
     calibration = folder / "calibration.txt"
     if calibration.is_file():
         values = read_numbers(calibration)
@@ -155,8 +136,9 @@ def _lens(folder: Path, series: Series | None, image: ImageFile) -> CameraTable:
                 remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
             )
         return pinhole(values, image)
-    if series is not None:
-        return pinhole(series.lens, image, series.distortion)
+    if series:
+        lens, distortion = SERIES[series]
+        return pinhole(lens, image, distortion)
     raise InputError(
         f"{folder}: expected calibration.txt, or a name with one of freiburg1, freiburg2, freiburg3, bonn, whose"
         f" cameras are known, got {folder.name!r}",
@@ -167,18 +149,6 @@ def _lens(folder: Path, series: Series | None, image: ImageFile) -> CameraTable:
 def marker_to_camera(T_ground_truth: Float64) -> Float64:
     """T_world_camera (4, 4) of a pose in Bonn's groundtruth.txt."""
     return np.asarray(_BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m"))
-
-
-_TUM_DOCS = """
-TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
-    within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
-    `--intrinsics`
-
-Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to the camera | as TUM; the published
-    transform's scale of 1.059 is left out | of its page
-
-ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
-"""
 
 
 def read_sun3d(folder: Path, options: SourceOptions) -> Description:
@@ -212,18 +182,31 @@ def _poses(path: Path) -> list[Float64]:
     return list(np.concatenate([rows, bottom], axis=1))
 
 
-_SUN3D_DOCS = """
-SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,
-    bits rotated by three, paired within 20 ms | `intrinsics.txt`, the first pixel's centre at 1
-"""
-
 ENTRIES = (
-    Layout(name="TUM RGB-D", order=0, matches=marked("rgb.txt depth.txt"), read=read_tum_folder, docs=_TUM_DOCS),
+    Layout(
+        name="TUM RGB-D",
+        order=0,
+        matches=marked("rgb.txt depth.txt"),
+        read=read_tum_folder,
+        docs="""
+TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
+    within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
+    `--intrinsics`
+
+Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to the camera | as TUM; the published
+    transform's scale of 1.059 is left out | of its page
+
+ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
+""",
+    ),
     Layout(
         name="SUN3D",
         order=8,
         matches=marked("image/ depth/ extrinsics/ intrinsics.txt"),
         read=read_sun3d,
-        docs=_SUN3D_DOCS,
+        docs="""
+SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,
+    bits rotated by three, paired within 20 ms | `intrinsics.txt`, the first pixel's centre at 1
+""",
     ),
 )

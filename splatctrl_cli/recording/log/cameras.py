@@ -7,7 +7,7 @@ TransformStamped.
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from itertools import takewhile
+from itertools import islice, takewhile
 from typing import Any
 
 import numpy as np
@@ -28,16 +28,13 @@ from splatctrl_cli.recording.log.decoder import (
     is_ros,
     stamp_ns,
 )
-from splatctrl_cli.recording.log.image_names import DEPTH, is_other, word_of
-from splatctrl_cli.recording.log.messages import ImageMessage
+from splatctrl_cli.recording.log.messages import DEPTH, is_other, word_of
 from splatctrl_cli.recording.log.registration import is_distorted, lens_model
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.recording.log.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video
 from splatctrl_cli.recording.source_options import CameraTopics, PoseTopic, SourceOptions
 from splatctrl_cli.records import Float64
 
-_TRANSPORTS = {"compressed", "compressedDepth"}
-_REGISTERED_WORDS = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")
 _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 
 
@@ -127,7 +124,8 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
     It shares more path than the namespace, is in the image's or namespace's folder, or has the image's frame and
     size.
     """
-    folder = _parts(image.topic.name)[:-1]
+    folder, its = _parts(image.topic.name)[:-1], image.first_image
+    view = ("", 0, 0) if its is None else (its.frame_id, its.width, its.height)
     level = len(folder) - 1 if namespace is None else len(namespace)
     found: list[tuple[int, int, str]] = []
     for info in survey.of_type(CAMERA_INFO):
@@ -137,7 +135,8 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
         info_folder = _parts(info.topic.name)[:-1]
         shared = len(common_prefix(info.topic.name, image.topic.name))
         is_near = shared > level or info_folder in {folder, folder[:level]}
-        if is_near or (image.first_image is not None and _fits(calibration, image.first_image)):
+        is_same_view = view == (calibration.frame_id, calibration.width, calibration.height) and view[0] != ""
+        if is_near or is_same_view:
             found.append((-shared, len(info_folder), info.topic.name))
     return min(found)[2] if found else ""
 
@@ -183,13 +182,8 @@ def common_prefix(name: str, other: str) -> tuple[str, ...]:
     return tuple(a for a, _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def _fits(calibration: Calibration, image: ImageMessage) -> bool:
-    same_size = (calibration.width, calibration.height) == (image.width, image.height)
-    return same_size and calibration.frame_id == image.frame_id and image.frame_id != ""
-
-
 def _says_registered(topic: str) -> bool:
-    return any(word in topic for word in _REGISTERED_WORDS)
+    return any(word in topic for word in ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb"))
 
 
 def _color_rank(topic: TopicSurvey) -> tuple[bool, bool, bool, bool, str]:
@@ -200,7 +194,7 @@ def _color_rank(topic: TopicSurvey) -> tuple[bool, bool, bool, bool, str]:
 
 def _parts(name: str) -> tuple[str, ...]:
     parts = tuple(part for part in name.split("/") if part)
-    return parts[:-1] if len(parts) > 1 and parts[-1] in _TRANSPORTS else parts
+    return parts[:-1] if len(parts) > 1 and parts[-1] in {"compressed", "compressedDepth"} else parts
 
 
 def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
@@ -404,13 +398,12 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
 def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: bool) -> None:
     if survey.tf.root_of(child) != child:
         return  # added before
-    for parent, _, stamp, position, quat_xyzw in _poses(log, survey, topic, survey.damage):
+    poses = _poses(log, survey, topic, survey.damage)
+    for parent, _, stamp, position, quat_xyzw in islice(poses, 1 if only_first else None):
         try:
             survey.tf.add(parent, child, stamp, position, quat_xyzw, static=False, holds=only_first)
         except ValueError as error:
             survey.damage.add(f"{topic}: {error}")
-        if only_first:
-            return
 
 
 def _poses(log: RawLog, survey: Survey, topic: str, damage: Damage) -> Iterator[StampedPose]:

@@ -168,8 +168,7 @@ def _store_of(definition: str, form: str, type_name: str) -> Any:
     """Cached types: compiling takes some ten milliseconds."""
     store = get_typestore(Stores.EMPTY)
     if form == "idl":
-        parts = [part for part in definition.split("=" * 80 + "\n") if part.strip()]
-        for part in parts:
+        for part in filter(str.strip, definition.split("=" * 80 + "\n")):
             body = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
             store.register(get_types_from_idl(_DIRECTIVE.sub("", body)))
     else:

@@ -1,8 +1,11 @@
 """Decoders of sensor_msgs images: colour (H, W, 3) uint8 RGB, depth (H, W) float32 [m].
 
-The encodings follow sensor_msgs/image_encodings.hpp.
+The encodings follow sensor_msgs/image_encodings.hpp. 16-bit infrared has the encoding of depth: a topic's name tells.
+Drivers: /ir (Azure Kinect, Orbbec), /infra1 (RealSense), image_ir (Kinect 2), confidence (ZED, L515), amplitude and
+noise (time of flight), aux (MultiSense), signal, reflec and nearir (Ouster).
 """
 
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -412,3 +415,47 @@ def _numbers(data: bytes) -> NDArray[np.int64]:
     if place.max() > 10:  # a number of more than 33 bits
         raise ValueError("RVL: a number of more than 33 bits")
     return np.asarray(np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << (3 * place), starts), dtype=np.int64)
+
+
+DEPTH = "depth"
+_COLORS = frozenset({"color", "colour", "rgb", "bgr"})
+_OTHERS = frozenset(
+    {
+        *("ir", "infra", "infrared", "nir", "nearir", "swir", "lwir", "thermal", "aux", "mono", "gray", "grey"),
+        *(
+            "amplitude",
+            "amplitudes",
+            "amp",
+            "intensity",
+            "intensities",
+            "reflectivity",
+            "reflec",
+            "signal",
+            "ambient",
+        ),
+        *("confidence", "conf", "uncertainty", "variance", "noise", "disparity", "disparities"),
+        *("mask", "label", "labels", "segmentation", "semantic", "instance"),
+    }
+)
+_WORDS = _OTHERS | _COLORS | {DEPTH}
+_CAMERAS = frozenset({"camera", "cam"})  # words of parts that name a device, which may give more than depth
+
+
+def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
+    """The kind word in a topic's last part that has one; "" if none.
+
+    In ``a_to_b`` the first counts: ``aligned_depth_to_infra1`` is depth. is_device: parts such as ``depth_camera``
+    count too.
+    """
+    for part in reversed(parts):
+        words = re.findall("[a-z]+", part.lower())
+        words = words[: words.index("to")] if "to" in words[1:] else words
+        found = [word for word in words if word in _WORDS or word.removesuffix("map") == DEPTH]
+        if found and (is_device or _CAMERAS.isdisjoint(words)):
+            return DEPTH if found[-1].startswith(DEPTH) else found[-1]
+    return ""
+
+
+def is_other(word: str) -> bool:
+    """True if 16-bit images so named are not depth."""
+    return word in _OTHERS

@@ -7,9 +7,11 @@ import re
 from array import array
 from bisect import bisect_left
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import (
     FARTHEST_RAY,
@@ -30,6 +32,8 @@ from splatctrl_cli.geometry import (
 )
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
+
+_Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
 
 class _Edge:
@@ -55,7 +59,11 @@ class _Edge:
             return self.static[since[-1] if since else next(iter(self.static))]
         if self.holds and len(self.stamps) == 1:
             return self._at(0)
-        self._sort()
+        if not self._is_sorted:
+            order = np.argsort(np.frombuffer(self.stamps, dtype=np.int64), kind="stable")
+            self.stamps = array("q", np.frombuffer(self.stamps, dtype=np.int64)[order].tobytes())
+            self.numbers = array("q", np.frombuffer(self.numbers, dtype=np.int64)[order].tobytes())
+            self._is_sorted = True
         after = bisect_left(self.stamps, stamp_ns)
         if after == len(self.stamps):
             return self._at(-1) if stamp_ns - self.stamps[-1] <= tolerance_ns else None
@@ -72,13 +80,6 @@ class _Edge:
     def _at(self, sample: int) -> Float64:
         number = self.numbers[sample]
         return np.asarray(self._transforms.read(number, number + 1)[0])
-
-    def _sort(self) -> None:
-        if not self._is_sorted:
-            order = np.argsort(np.frombuffer(self.stamps, dtype=np.int64), kind="stable")
-            self.stamps = array("q", np.frombuffer(self.stamps, dtype=np.int64)[order].tobytes())
-            self.numbers = array("q", np.frombuffer(self.numbers, dtype=np.int64)[order].tobytes())
-            self._is_sorted = True
 
 
 def _is_still(T_a: Float64, T_b: Float64) -> bool:
@@ -234,7 +235,7 @@ class DepthToColor:
         Each depth pixel covers its square's image, so finer colour pixels get no holes; the nearest wins.
         """
         target = self.color_intrinsics
-        depth = depth if self.undistortion is None else self.undistortion.depth(depth)
+        depth = depth if self.undistortion is None else self.undistortion.nearest(depth)
         x, y, z = transform_points(self.T_color_depth, back_project(self.depth_intrinsics, depth)[depth > 0]).T
         front = z > 0
         z = z[front]
@@ -305,13 +306,9 @@ class Undistortion:
         """Undistort (H, W, 3), interpolated."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_LINEAR), dtype=np.uint8)
 
-    def labels(self, image: UInt8) -> UInt8:
-        """Undistort (H, W), nearest pixel."""
-        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.uint8)
-
-    def depth(self, image: Float32) -> Float32:
-        """Undistort (H, W) [m], nearest pixel."""
-        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
+    def nearest(self, image: NDArray[_Pixel]) -> NDArray[_Pixel]:
+        """Undistort labels or depth (H, W), nearest pixel."""
+        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=image.dtype)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -328,13 +325,13 @@ class Lens:
 
     def labels(self, image: UInt8) -> UInt8:
         """Undistort (H, W)."""
-        return image if self.undistortion is None else self.undistortion.labels(image)
+        return image if self.undistortion is None else self.undistortion.nearest(image)
 
     def depth(self, image: Float32) -> Float32:
         """Map recorded depth [m] to colour's pixels (H, W)."""
         if self.depth_to_color is not None:
             return self.depth_to_color.warp(image)
-        return image if self.undistortion is None else self.undistortion.depth(image)
+        return image if self.undistortion is None else self.undistortion.nearest(image)
 
 
 def _maps(

@@ -147,15 +147,20 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
 
 def _rectified(calibration: Calibration) -> Calibration:
     """The rectified camera: P if set, without distortion; valid if the lens is known."""
-    K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
-    pinhole = replace(calibration, K=K, distortion_model="plumb_bob", distortion=np.zeros(0))
+    pinhole = replace(
+        calibration,
+        K=calibration.projection if calibration.projection[0, 0] > 0 else calibration.K,
+        distortion_model="plumb_bob",
+        distortion=np.zeros(0),
+    )
     model = lens_model(calibration.distortion_model)
     if not is_distorted(model, calibration.distortion) or model not in DISTORTION_MODELS:
         return pinhole
     lens, R = intrinsics_of(calibration), calibration.rotation if np.any(calibration.rotation) else None
     with suppress(InputError):  # of a lens that cannot be, nothing says what it saw
-        undone = Undistortion(intrinsics_of(pinhole), model, calibration.distortion, lens=lens, R=R)
-        return replace(pinhole, valid=undone.valid)
+        return replace(
+            pinhole, valid=Undistortion(intrinsics_of(pinhole), model, calibration.distortion, lens=lens, R=R).valid
+        )
     return pinhole
 
 
@@ -188,6 +193,8 @@ class _Builder:
         self._survey = survey
         self._options = options
         self._topics = topics
+        self._frame_id = frame_of(survey, topics.color, topics.depth)
+        self._is_registered = is_registered(survey, topics.color, topics.depth, topics.info, topics.depth_info)
 
     def build(self) -> Camera:
         """Build the camera. Raises InputError for the first problem."""
@@ -231,15 +238,6 @@ class _Builder:
             except InputError as error:
                 found.append(str(error).removeprefix(f"{self._path}: "))
         return list(dict.fromkeys(found))
-
-    @property
-    def _frame_id(self) -> str:
-        return frame_of(self._survey, self._topics.color, self._topics.depth)
-
-    @property
-    def _is_registered(self) -> bool:
-        topics = self._topics
-        return is_registered(self._survey, topics.color, topics.depth, topics.info, topics.depth_info)
 
     @property
     def _depth_scale(self) -> float | None:

@@ -1,27 +1,30 @@
 """A ROS log as records: paired images, poses from tf, joints in one order.
 
-The first pass skips images, as transforms may follow them, and plans every frame. The second takes planned images, as
-few at once as the log's order allows. For `ingest`, files that a capture can keep stay undecoded.
+The first pass skips images, as transforms may follow them, and plans every frame, in some fifty bytes. The second
+takes planned images in plan order, as few at once as the log's order allows. For `ingest`, files that a capture can
+keep stay undecoded.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+import tempfile
+import weakref
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.spilled_rows import RowFile, scratch_folder
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.recording.log.decoder import MessageDecoder, UndecodableMessageError
-from splatctrl_cli.recording.log.frame_plan import FramePlan, HeldMessages, Planned, planned_images
 from splatctrl_cli.recording.log.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
 from splatctrl_cli.recording.log.rig import Camera, build_cameras, nearest_gap_ns
 from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.state_topics import joint_records
 from splatctrl_cli.recording.log.stored_frame import (
+    FrameSource,
     JointTopics,
-    Recording,
     StoredFrame,
     check_depth,
     decoded,
@@ -34,19 +37,175 @@ from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, p
 from splatctrl_cli.recording.source_options import SourceOptions, still_note
 from splatctrl_cli.records import SECOND_NS, Float64, Index, LossReport, Record, UInt8, by_stamp
 
-
-@dataclass(kw_only=True)
-class _Pass:
-    """Findings of one pass, incomplete if it ends early."""
-
-    damage: Damage = field(default_factory=Damage)
-    num_invalid: int = 0
+NO_MASK = -1
 
 
-class RosLogSource(Recording):
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """A planned frame: message numbers by topic (human_index None: no mask), and the pose."""
+
+    stamp_ns: int
+    camera: Camera
+    color_index: int
+    depth_index: int
+    human_index: int | None
+    T_world_camera: Float64
+
+    @property
+    def keys(self) -> list[tuple[str, int]]:
+        """Topic and number of each image."""
+        camera = self.camera
+        keys = [(camera.color_topic, self.color_index), (camera.depth_topic, self.depth_index)]
+        return keys if self.human_index is None else [*keys, (camera.human_topic, self.human_index)]
+
+
+class FramePlan:
+    """Frames by stamp, then camera, then colour number."""
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        self._cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
+        self._columns = np.zeros((6, 0), dtype=np.int64)  # stamp, camera, colour, depth and mask number, row of pose
+        self._poses = RowFile((4, 4))
+
+    def __len__(self) -> int:
+        return self._columns.shape[1]
+
+    def __iter__(self) -> Iterator[Planned]:
+        return (self[number] for number in range(len(self)))
+
+    def __getitem__(self, number: int) -> Planned:
+        stamp, camera, color, depth, human, row = self._columns[:, number].tolist()
+        return Planned(
+            stamp_ns=stamp,
+            camera=self._cameras[camera],
+            color_index=color,
+            depth_index=depth,
+            human_index=None if human == NO_MASK else human,
+            T_world_camera=self._poses.read(row, row + 1)[0],
+        )
+
+    def add(
+        self,
+        camera: Camera,
+        stamp_ns: Index,
+        color: Index,
+        depth: Index,
+        masks: Mapping[int, int],
+        poses: Iterable[Float64 | None],
+    ) -> int:
+        """Add frames (K,) with known poses (4, 4), masks by colour number; return their number."""
+        first = len(self._poses)
+        is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
+        human = np.array([masks.get(index, NO_MASK) for index in color[is_known].tolist()], dtype=np.int64)
+        num = int(is_known.sum())
+        rows = first + np.arange(num)
+        fresh = np.stack(
+            [
+                stamp_ns[is_known],
+                np.full(num, self._cameras.index(camera)),
+                color[is_known],
+                depth[is_known],
+                human,
+                rows,
+            ]
+        )
+        columns = np.concatenate([self._columns, fresh], axis=1)
+        self._columns = columns[:, np.lexsort((columns[2], columns[1], columns[0]))]
+        return num
+
+    def _keep(self, T: Float64 | None) -> bool:
+        if T is not None:
+            self._poses.append(T[None])
+        return T is not None
+
+    def uses(self) -> dict[str, Index]:
+        """Number of frames that need each image."""
+        found: dict[str, list[Index]] = {}
+        for number, camera in enumerate(self._cameras):
+            of_camera = self._columns[:, self._columns[1] == number]
+            for topic, row in ((camera.color_topic, 2), (camera.depth_topic, 3), (camera.human_topic, 4)):
+                found.setdefault(topic, []).append(of_camera[row][of_camera[row] != NO_MASK])
+        return {
+            topic: np.bincount(np.concatenate(indices)) for topic, indices in found.items() if any(map(len, indices))
+        }
+
+
+HELD_BYTES = 96 << 20  # of images that wait for others, in memory; more of them wait in a file without a name
+Key = tuple[str, int]  # topic, number of the message within it
+
+
+class HeldMessages:
+    """Waiting messages, which can be half of a log that stores topics apart."""
+
+    def __init__(self) -> None:
+        self._messages: dict[Key, RawMessage] = {}
+        self._places: dict[Key, tuple[int, int]] = {}  # first byte and length in the file
+        self._num_bytes = 0
+        self._file = tempfile.TemporaryFile(dir=str(scratch_folder()))  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._messages
+
+    def add(self, key: Key, message: RawMessage) -> None:
+        if self._num_bytes + len(message.data) > HELD_BYTES:
+            first = self._file.seek(0, 2)
+            self._file.write(message.data)
+            self._places[key] = (first, len(message.data))
+            message = replace(message, data=b"")
+        self._num_bytes += len(message.data)
+        self._messages[key] = message
+
+    def get(self, key: Key) -> RawMessage:
+        """A message, which stays."""
+        message, place = self._messages[key], self._places.get(key)
+        if place is None:
+            return message
+        self._file.seek(place[0])
+        return replace(message, data=self._file.read(place[1]))
+
+    def pop(self, key: Key) -> RawMessage:
+        """Remove and return a message."""
+        found = self.get(key)
+        self._num_bytes -= len(self._messages.pop(key).data)
+        self._places.pop(key, None)
+        if not self._places:
+            self._file.seek(0)
+            self._file.truncate()
+        return found
+
+
+def planned_images(
+    log: RawLog, plan: FramePlan, damage: Damage, held: HeldMessages
+) -> Iterator[tuple[Planned, list[RawMessage]]]:
+    """Yield frames in plan order with their colour, depth and mask messages, whatever the log's order.
+
+    `held` keeps waiting ones; missing frames go to `damage`.
+    """
+    uses, position, num = plan.uses(), 0, len(plan)
+    numbers, planned = dict.fromkeys(uses, 0), plan[0]
+
+    def take(topic: str, number: int) -> RawMessage:
+        uses[topic][number] -= 1
+        return held.get((topic, number)) if uses[topic][number] else held.pop((topic, number))
+
+    for message in log.messages(Damage(), set(uses)):  # the survey has counted this damage
+        topic, number = message.topic.name, numbers[message.topic.name]
+        numbers[topic] = number + 1
+        if number >= len(uses[topic]) or not uses[topic][number]:
+            continue
+        held.add((topic, number), message)
+        while position < num and all(key in held for key in planned.keys):
+            yield planned, [take(*key) for key in planned.keys]
+            position += 1
+            if position < num:
+                planned = plan[position]
+    if position < num:
+        damage.add(f"{log.path.name}: {num - position} frames that were there are gone: it changed while it was read")
+
+
+class RosLogSource(FrameSource):
     """Records of an MCAP or ROS bag."""
-
-    has_clock = True
 
     def __init__(self, log: RawLog, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
         options.refuse(("root", "holdout"), "a log", log.path)
@@ -61,7 +220,15 @@ class RosLogSource(Recording):
             )
         if not found.num_messages:
             raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
-        self._rig = _rig(log, found, options)
+        try:
+            self._rig = build_cameras(log, found, options)
+        except InputError as error:
+            if not found.damage.count:
+                raise
+            raise InputError(
+                f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
+                remedy=f"copy the file again; if this is all there is: {error.remedy}",
+            ) from None
         self._tf = found.tf
         self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.all_notes, *found.tf.notes])
         self.cameras = tuple(camera.name for camera in self._rig)
@@ -69,21 +236,22 @@ class RosLogSource(Recording):
         self.world_frame = self._rig[0].world_frame
         loss, first_note = LossReport(), len(self._loss.notes)
         self.joint_names, self.states = joint_records(found, options, loss, joints)
-        topics = found.of_type(*STATE_TYPES)
-        self.joint_topics = JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=options.joint_topic)
+        self.joint_topics = JointTopics(
+            topics=found.of_type(*STATE_TYPES), loss=loss, first_note=first_note, chosen=options.joint_topic
+        )
         self._loss = with_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
-        self._passes = [_Pass()]
+        self._passes = [Damage()]  # incomplete where a pass ends early
 
     @property
     def loss(self) -> LossReport:
         """The loss, with the undecodable images of the pass that met most."""
-        loss, most = self._loss, max(self._passes, key=lambda one: (one.damage.count, one.num_invalid))
+        loss, most = self._loss, max(self._passes, key=lambda one: (one.count, one.num_invalid))
         return replace(
             loss,
-            damaged=loss.damaged + most.damage.count,
+            damaged=loss.damaged + most.count,
             invalid_depth=most.num_invalid,
-            notes=[*loss.notes, *most.damage.all_notes],
+            notes=[*loss.notes, *most.all_notes],
         )
 
     def records(self) -> Iterator[Record]:
@@ -165,15 +333,15 @@ class RosLogSource(Recording):
 
     def _frames(self, *, lazily: bool = True) -> Iterator[StoredFrame]:
         """Yield frames; lazily: unchanged image files are decoded on demand."""
-        lost, decoder, checked = _Pass(), MessageDecoder(), set[str]()
+        lost, decoder, checked = Damage(), MessageDecoder(), set[str]()
         self._passes.append(lost)
-        for planned, messages in planned_images(self._log, self._plan, lost.damage, HeldMessages()):
+        for planned, messages in planned_images(self._log, self._plan, lost, HeldMessages()):
             camera = planned.camera
             is_whole = not lazily or camera.name not in checked  # the first depth is looked at
             try:
                 color, depth, *masks = _images(decoder, camera, messages, is_whole=is_whole)
             except UndecodableMessageError as error:
-                lost.damage.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
+                lost.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
                 continue
             where = f"{self._log.path}: topic {camera.human_topic}"
             human = [camera.labels(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]
@@ -236,18 +404,6 @@ def _stored_frame(
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
         places=tuple(replace(message, data=b"") for message in messages),
     )
-
-
-def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
-    try:
-        return build_cameras(log, found, options)
-    except InputError as error:
-        if not found.damage.count:
-            raise
-        raise InputError(
-            f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
-            remedy=f"copy the file again; if this is all there is: {error.remedy}",
-        ) from None
 
 
 def _times(found: Survey, camera: Camera) -> str:

@@ -151,8 +151,9 @@ class ColumnWriter:
         for name, shape in self._shapes.items() if states else ():
             values, nothing = [state[name] for state in states], np.full(shape, np.nan)
             if name not in self._files and any(value is not None for value in values):
-                before = (np.full((last - first, *shape), np.nan) for first, last in ranges(self._num))
-                self._files[name] = RowFile(shape, before)  # one that comes up late
+                self._files[name] = RowFile(
+                    shape, ((np.full((last - first, *shape), np.nan) for first, last in ranges(self._num)))
+                )  # one that comes up late
             if name in self._files:
                 self._files[name].append(np.array([nothing if value is None else value for value in values]))
         self._num += len(states)

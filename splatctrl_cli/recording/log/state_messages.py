@@ -23,8 +23,7 @@ NAMELESS = tuple(f"joint{number}" for number in range(1, 8))  # what a Franka's 
 _MAX_SKEW = 1e-2  # largest entry of R^T R - I of a pose that a robot logs
 
 
-def _none() -> Float64:
-    return np.zeros(0)
+_NONE: Float64 = np.zeros(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +39,7 @@ class RawJoints:
     position: Float64
     velocity: Float64
     log_time_ns: int = 0
-    commanded_velocity: Float64 = field(default_factory=_none)
+    commanded_velocity: Float64 = field(default_factory=lambda: _NONE)
     T_base_ee: Float64 | None = None
     note: str = ""
 
@@ -49,8 +48,9 @@ def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoint
     """States of a `STATE_TYPES` message, log time [ns]. Raises UndecodableMessageError."""
     if type_name == JOINT_STATE:
         names, position = tuple(str(name) for name in message.name), _array(message.position)
-        velocity = _array(message.velocity)
-        return [_checked("a JointState", message, names, position, velocity, _none(), log_time_ns, None)]
+        return [
+            _checked("a JointState", message, names, position, _array(message.velocity), _NONE, log_time_ns, None)
+        ]
     if type_name in FRANKA_STATES:
         return [_franka(message, log_time_ns)]
     if type_name == CONTROLLER_STATE:
@@ -102,7 +102,7 @@ def _controller(message: Any, log_time_ns: int) -> RawJoints:
     wanted = _filled(message, ("reference", "desired"), len(names))
     if actual is None:
         raise UndecodableMessageError(f"a controller state of {len(names)} joints without positions")
-    commanded = _none() if wanted is None else _array(wanted.velocities)
+    commanded = _NONE if wanted is None else _array(wanted.velocities)
     position, velocity = _array(actual.positions), _array(actual.velocities)
     return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
 
@@ -129,9 +129,9 @@ def _checked(
         stamp_ns=stamp_ns(message.header),
         names=names,
         position=position,
-        velocity=velocity if len(velocity) == len(names) else _none(),
+        velocity=velocity if len(velocity) == len(names) else _NONE,
         log_time_ns=log_time_ns,
-        commanded_velocity=commanded if len(commanded) == len(names) else _none(),
+        commanded_velocity=commanded if len(commanded) == len(names) else _NONE,
         T_base_ee=T_base_ee,
         note=f"{len(names)} names with {len(velocity)} velocities, which are not used" if is_odd else "",
     )
@@ -152,9 +152,9 @@ def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
                 stamp_ns=start_ns + after_ns,
                 names=names,
                 position=position,
-                velocity=velocity if len(velocity) == len(names) else _none(),
+                velocity=velocity if len(velocity) == len(names) else _NONE,
                 log_time_ns=log_time_ns + after_ns,
-                commanded_velocity=velocity if len(velocity) == len(names) else _none(),
+                commanded_velocity=velocity if len(velocity) == len(names) else _NONE,
             )
         )
     return states
@@ -165,30 +165,28 @@ def _array(values: Any) -> Float64:
 
 
 COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
+_NO_STAMPS = np.zeros(0, dtype=np.int64)
 
 
 class JointStream:
     """States with equal joints, in the first one's order."""
 
-    def __init__(self, names: tuple[str, ...], columns: Mapping[str, Iterable[Float64]] | None = None) -> None:
-        """columns: rows of known states, in blocks."""
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        stamp_ns: Stamps = _NO_STAMPS,
+        log_time_ns: Stamps = _NO_STAMPS,
+        columns: Mapping[str, Iterable[Float64]] | None = None,
+    ) -> None:
+        """Start with known states, columns of rows in blocks. Raises ValueError if they differ in length."""
         self.names = names
-        self._stamps, self._log_times = array("q"), array("q")
+        self._stamps, self._log_times = array("q", stamp_ns.tolist()), array("q", log_time_ns.tolist())
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
-        shapes = {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}
-        self._columns = ColumnWriter(shapes, columns or {})
-
-    @classmethod
-    def of(
-        cls, names: tuple[str, ...], stamp_ns: Stamps, log_time_ns: Stamps, columns: Mapping[str, Iterable[Float64]]
-    ) -> "JointStream":
-        """Build from blocks of rows. Raises ValueError for other lengths."""
-        stream = cls(names, columns)
-        stream._stamps.extend(stamp_ns.tolist())
-        stream._log_times.extend(log_time_ns.tolist())
-        if columns and len(stream._columns) != len(stream):
-            raise ValueError(f"columns of other lengths than {len(stream)}")
-        return stream
+        self._columns = ColumnWriter(
+            {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}, columns or {}
+        )
+        if columns and len(self._columns) != len(self):
+            raise ValueError(f"columns of other lengths than {len(self)}")
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -229,20 +227,12 @@ class JointStream:
 class JointLog:
     """States in file order; first_names: the first one's, or None; notes: counted."""
 
-    def __init__(self) -> None:
-        self.first_names: tuple[str, ...] | None = None
+    def __init__(self, streams: Sequence[JointStream] = (), num: int = 0) -> None:
+        """Start with the streams of `num` states."""
+        self.first_names = streams[0].names if streams else None
         self.notes: Counter[str] = Counter()
-        self._num = 0
-        self._streams: dict[frozenset[str], JointStream] = {}
-
-    @classmethod
-    def of(cls, num: int, streams: Sequence[JointStream]) -> "JointLog":
-        """Build from `num` states' streams."""
-        log = cls()
-        log._num = num
-        log._streams = {frozenset(stream.names): stream for stream in streams}
-        log.first_names = streams[0].names if streams else None
-        return log
+        self._num = num
+        self._streams = {frozenset(stream.names): stream for stream in streams}
 
     def __len__(self) -> int:
         return self._num

@@ -86,19 +86,16 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
     """/joint_states, else the JointState topic with most messages, else another type's; commands last."""
-    by_name = {topic.topic.name: topic for topic in topics}
-    chosen = by_name[
-        max(
-            by_name,
-            key=lambda name: (
-                name == "/joint_states",
-                not _is_command(name),
-                by_name[name].topic.type_name == JOINT_STATE,
-                by_name[name].count,
-                name,
-            ),
-        )
-    ]
+    chosen = max(
+        topics,
+        key=lambda t: (
+            t.topic.name == "/joint_states",
+            not _is_command(t.topic.name),
+            t.topic.type_name == JOINT_STATE,
+            t.count,
+            t.topic.name,
+        ),
+    )
     others = sorted(t.topic.name for t in topics if t is not chosen)
     if others:
         loss.notes.append(f"joint states are taken from {chosen.topic.name}, not from {', '.join(others)}")
@@ -135,8 +132,9 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
         used.append(best.where)
     others = sorted({t.topic.name for t in topics} - set(used))
     if others:
-        taken = ", ".join(dict.fromkeys(used))
-        loss.notes.append(f"joint states are taken from {taken}, not from {', '.join(others)}")
+        loss.notes.append(
+            f"joint states are taken from {', '.join(dict.fromkeys(used))}, not from {', '.join(others)}"
+        )
     return track if missing else track.of_names(wanted)
 
 

@@ -8,9 +8,10 @@ describes each K.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from io import BytesIO
 from math import prod
 from pathlib import Path
-from typing import IO, Any, Protocol, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,6 @@ from splatctrl_cli.records import (
     JointState,
     LossReport,
     Record,
-    RecordSource,
     RgbdFrame,
     UInt8,
     by_stamp,
@@ -126,10 +126,14 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
             for name in ("stamp_ns", "log_time_ns")
         )
         columns = {name: _blocks(checked(f"{place}/{name}.npy")) for name in stream["columns"]}
-        streams.append(JointStream.of(tuple(stream["joints"]), stamps, log_times, columns))
-    definition = "kept" if entry["has_definition"] else ""
-    topic = Topic(name=entry["topic"], type_name=entry["type"], encoding="cdr", definition=definition)
-    return TopicSurvey(topic=topic, count=int(entry["messages"]), joints=JointLog.of(int(entry["states"]), streams))
+        streams.append(JointStream(tuple(stream["joints"]), stamps, log_times, columns))
+    topic = Topic(
+        name=entry["topic"],
+        type_name=entry["type"],
+        encoding="cdr",
+        definition="kept" if entry["has_definition"] else "",
+    )
+    return TopicSurvey(topic=topic, count=int(entry["messages"]), joints=JointLog(streams, int(entry["states"])))
 
 
 def write_rows(stream: IO[bytes], rows: Table) -> None:
@@ -137,6 +141,13 @@ def write_rows(stream: IO[bytes], rows: Table) -> None:
     np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)})
     for block in blocks_of(rows):
         stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
+
+
+def npy_bytes(depth: Float32) -> bytes:
+    """The .npy of a depth image (H, W)."""
+    stream = BytesIO()
+    np.save(stream, np.ascontiguousarray(depth, dtype="<f4"), allow_pickle=False)
+    return stream.getvalue()
 
 
 def _blocks(path: Path) -> Iterator[Float64]:
@@ -209,40 +220,41 @@ class StoredFrame:
             raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
 
 
-class FrameSource(RecordSource, Protocol):
-    """A record source with frames as stored."""
+class FrameSource:
+    """A `RecordSource` by stamp: joint states, and `_frames`, which are read as stored.
 
-    @property
-    def world_frame(self) -> str:
-        """The source's frame of poses."""
-        ...
+    world_frame: the source's frame of poses. states: by stamp, without reading frames. joint_topics: those that a log
+    has, None if unknown.
+    """
 
-    @property
-    def states(self) -> StateColumns:
-        """Joint states by stamp, without reading frames."""
-        ...
-
-    def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Yield `records`, undecoded."""
-        ...
-
-    def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp [ns], camera, T_world_camera (4, 4) by stamp, without images."""
-        ...
-
-
-class Recording:
-    """Records by stamp: joint states, and `_frames`."""
-
+    name: str
+    cameras: tuple[str, ...] = ()
+    joint_names: tuple[str, ...] = ()
+    has_clock: bool = True
+    world_frame: str
     states: StateColumns = NO_STATES
+    joint_topics: JointTopics | None = None
+
+    @property
+    def loss(self) -> LossReport:
+        """Complete once `records` is exhausted."""
+        raise NotImplementedError
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of every input file, by name."""
+        raise NotImplementedError
 
     def records(self) -> Iterator[Record]:
         """Yield joint states and decoded frames."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Yield joint states and stored frames."""
+        """Yield `records`, undecoded."""
         return by_stamp(self.states, self._frames())
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Yield stamp [ns], camera, T_world_camera (4, 4) by stamp, without images."""
+        return iter(())
 
     def _frames(self) -> Iterator[StoredFrame]:
         return iter(())

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_FEWEST_BACK, IMAGES_GAP, IMAGES_STEADY
+from splatctrl_cli.recording.container.mcap_file import ChunkIndex
 from splatctrl_cli.recording.container.mcap_log import LogIndex, McapLog
-from splatctrl_cli.recording.container.mcap_records import ChunkIndex
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import (
     CAMERA_INFO,
@@ -314,8 +314,10 @@ def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
         return survey(log), ()
     index = inner.index()
     found = _sampled(inner, index, video)
-    how = f"{size} bytes: described by index and first messages; neither checksums nor the rest were read"
-    return found, (*index.notes, how)
+    return found, (
+        *index.notes,
+        f"{size} bytes: described by index and first messages; neither checksums nor the rest were read",
+    )
 
 
 def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:

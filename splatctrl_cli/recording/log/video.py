@@ -17,8 +17,7 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.libraries import is_installed, of_extra
-from splatctrl_cli.recording.container.foreign import AZURE_KINECT, refuse_foreign
-from splatctrl_cli.recording.container.log_formats import open_raw_log
+from splatctrl_cli.recording.container.log_formats import AZURE_KINECT, open_raw_log, refuse_foreign
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import IMAGE, VIDEO, MessageDecoder, UndecodableMessageError, pack_image
 from splatctrl_cli.records import SECOND_NS, Stamps
@@ -57,7 +56,7 @@ class _Stream:
     num_late: int = 0
 
 
-class VideoLog:
+class VideoLog(RawLog):
     """A log with video as images."""
 
     def __init__(self, log: RawLog) -> None:
@@ -96,7 +95,10 @@ class VideoLog:
         for name, stream in streams.items():
             if stream is not None:
                 yield from _images(stream, None)
-                _count(name, stream, damage)
+                _lose(stream, list(stream.waiting))
+                for num, where in ((stream.num_early, _EARLY), (stream.num_late, _LATE)):
+                    if num:
+                        damage.add(f"{name}: {num} images of video {where} left out: {OFTENER}", num)
 
 
 def _stream(name: str) -> _Stream | None:
@@ -130,8 +132,8 @@ def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[Ra
             _lose(stream, [frame.pts])
             continue
         message, header = stream.waiting.pop(frame.pts)
-        pixels = frame.to_ndarray(format="rgb24")
-        yield replace(message, topic=_decoded_topic(message.topic), data=pack_image(header, pixels))
+        data = pack_image(header, frame.to_ndarray(format="rgb24"))
+        yield replace(message, topic=_decoded_topic(message.topic), data=data)
 
 
 def _decode(context: Any, data: bytes | None, number: int) -> tuple[list[Any], bool]:
@@ -161,13 +163,6 @@ def _lose(stream: _Stream, numbers: list[int]) -> None:
         stream.num_late += len(numbers)
 
 
-def _count(topic: str, stream: _Stream, damage: Damage) -> None:
-    _lose(stream, list(stream.waiting))
-    for num, where in ((stream.num_early, _EARLY), (stream.num_late, _LATE)):
-        if num:
-            damage.add(f"{topic}: {num} images of video {where} left out: {OFTENER}", num)
-
-
 SUFFIXES = (".mp4", ".mkv", ".mov", ".avi")
 _BESIDE = ("{}.csv", "{}.txt", "{}_timestamps.csv", "{}_timestamps.txt")
 _UNITS_NS = ((11, SECOND_NS), (14, 1_000_000), (17, 1_000), (99, 1))  # by at most so many digits before the point
@@ -184,11 +179,10 @@ def open_log(path: Path) -> RawLog:
         return VideoFileLog(path)
     log = open_raw_log(path)
     topics = log.topics()  # none where there is no index
-    has_video = any(map(is_video, topics)) or not topics
-    return VideoLog(log) if has_video and is_installed(LIBRARY) else log
+    return VideoLog(log) if (any(map(is_video, topics)) or not topics) and is_installed(LIBRARY) else log
 
 
-class VideoFileLog:
+class VideoFileLog(RawLog):
     """The images of ``X.mp4`` as topic ``/X``, at the times in ``X.csv`` or its kin.
 
     That file has a stamp per line, or a column named time or stamp. Before the point, 10 digits are seconds since

@@ -1,31 +1,249 @@
-"""Joint states in CSV, NPZ, HDF5 or Parquet, described in TOML (docs/replay.md, Logs)."""
+"""Joint states in CSV, NPZ, HDF5 or Parquet, described in TOML (docs/replay.md, Logs), and libfranka's logs.
 
-from collections.abc import Callable, Mapping
+LeRobot datasets are a preset of [states]: an episode's file and its columns. Versions 2 and 3 (huggingface/lerobot,
+lerobot_dataset.py, utils.py) list features in ``meta/info.json``. v2 has ``data/chunk-000/episode_000000.parquet``
+per episode; v3 shares ``data/chunk-000/file-000.parquet`` by column ``episode_index``. ``observation.state`` is
+position, ``timestamp`` seconds from the episode's begin.
+"""
+
+import csv
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.spilled_rows import Rows, absent, scaled
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, absent, blocks_of, scaled
 from splatctrl_cli.formats.arrays import ArrayFile, Hdf5File, NpzFile, ParquetFile
 from splatctrl_cli.recording.folder.folder_description import read_table
-from splatctrl_cli.recording.log.state_messages import pose_of_columns, pose_of_quat, rigid_or_none
+from splatctrl_cli.recording.folder.layout import read_json
+from splatctrl_cli.recording.folder.poses import stamp_of_text
+from splatctrl_cli.recording.log.state_messages import NAMELESS, pose_of_columns, pose_of_quat, rigid_or_none
 from splatctrl_cli.recording.log.state_track import RawTrack
-from splatctrl_cli.recording.state import lerobot
-from splatctrl_cli.recording.state.state_csv import CsvTable, poses_of, read_csv
+from splatctrl_cli.records import Float64, Stamps
+
+
+@dataclass(frozen=True, kw_only=True)
+class CsvTable:
+    """A CSV file: stripped column names, lines read in blocks."""
+
+    path: Path
+    names: list[str]
+
+    def index(self, name: str | int) -> int:
+        """The first column so named; a number is unchanged. Raises InputError."""
+        if isinstance(name, int):
+            return name
+        if name not in self.names:
+            raise InputError(f"{self.path}: no column {name!r}", remedy=f"columns there: {', '.join(self.names)}")
+        return self.names.index(name)
+
+    def read(
+        self, time: str | int, unit_ns: int, groups: Mapping[str, Sequence[str | int]], epoch_ns: int = 0
+    ) -> tuple[Stamps, dict[str, Rows]]:
+        """Read stamps (T,) [ns] and each group's numbers (T, K), NaN for an empty cell.
+
+        Times are in `unit_ns`, every digit kept; columns are names or numbers. Raises InputError naming line and
+        column, for a line of another length, and without states.
+        """
+        chosen = {name: [self.index(column) for column in columns] for name, columns in groups.items()}
+        at, stamps = self.index(time), array("q")
+        files = {name: RowFile((len(columns),)) for name, columns in groups.items()}
+        for number, rows in self._blocks():
+            stamps.extend(self._stamp(row, number + i, at, unit_ns) + epoch_ns for i, row in enumerate(rows))
+            for name, columns in chosen.items():
+                files[name].append(self._numbers(rows, number, columns))
+        if not stamps:
+            raise InputError(f"{self.path}: expected joint states, got none", remedy="record them again")
+        return np.array(stamps, dtype=np.int64), {name: Rows(file) for name, file in files.items()}
+
+    def _blocks(self) -> Iterator[tuple[int, list[list[str]]]]:
+        """Yield a first line's number and rows; empty lines do not count."""
+        with self.path.open(newline="", encoding="utf-8-sig") as stream:
+            lines = (line for line in csv.reader(stream) if line)
+            next(lines, None)
+            number, num = 2, len(self.names)
+            while True:
+                try:
+                    rows = list(islice(lines, BLOCK))
+                except (OSError, UnicodeDecodeError, csv.Error) as error:
+                    raise _unreadable(self.path, error) from None
+                if not rows:
+                    return
+                for i, row in enumerate(rows):
+                    if len(row) != num:
+                        raise InputError(
+                            f"{self.path}:{number + i}: expected {num} columns, got {len(row)}",
+                            remedy="the file was cut there; leave the line out",
+                        )
+                yield number, rows
+                number += len(rows)
+
+    def _numbers(self, rows: list[list[str]], number: int, columns: Sequence[int]) -> Float64:
+        values = np.empty((len(rows), len(columns)))
+        for i, row in enumerate(rows):
+            for k, column in enumerate(columns):
+                cell = row[column].strip()
+                try:
+                    values[i, k] = float(cell) if cell else np.nan
+                except ValueError:
+                    raise self._no_number(row, number + i, column) from None
+        return values
+
+    def _stamp(self, row: list[str], number: int, column: int, unit_ns: int) -> int:
+        stamp_ns = stamp_of_text(row[column].strip(), unit_ns)
+        if stamp_ns is None:
+            raise self._no_number(row, number, column)
+        return stamp_ns
+
+    def _no_number(self, row: list[str], number: int, column: int) -> InputError:
+        return InputError(
+            f"{self.path}:{number}: column {self.names[column]}: expected a number, got {row[column]!r}",
+            remedy="correct the line",
+        )
+
+
+def read_csv(path: Path) -> CsvTable:
+    """Open a CSV. Raises InputError without states."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            lines = list(islice((line for line in csv.reader(stream) if line), 2))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise _unreadable(path, error) from None
+    if len(lines) < 2:
+        raise InputError(f"{path}: expected joint states, got none", remedy="record them again")
+    return CsvTable(path=path, names=[name.strip().lstrip("# ") for name in lines[0]])
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path}: cannot be read as CSV: {error}", remedy="check the file")
+
+
+def is_libfranka(table: CsvTable) -> bool:
+    """True for the columns of franka::logToCSV."""
+    return table.names[0] in {"time", "duration"} and _first(table, "q", 0) is not None
+
+
+def libfranka_track(table: CsvTable) -> RawTrack:
+    """The states of a log by franka::logToCSV, joints named joint1 ... joint7.
+
+    The first column counts milliseconds since power-on. Positions are ``q[0]`` to ``q[6]``, velocities ``dq[0]``...,
+    prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second columns ``dq_d``
+    (libfranka, src/log.cpp and src/logging/robot_state_log.cpp). An added O_T_EE is the end effector's pose by
+    columns.
+    """
+    num = len(NAMELESS)
+    position = _block(table, "q", num)
+    if position is None:
+        raise InputError(
+            f"{table.path}: expected columns q[0] to q[6], got fewer",
+            remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
+        )
+    sent, desired = _sent(table, num), _block(table, "dq_d", num)
+    wanted = {
+        "position": position,
+        "velocity": _block(table, "dq", num),
+        "sent": sent,
+        "desired": desired if desired != sent else None,
+        "pose": _block(table, "O_T_EE", 16),
+    }
+    stamps, found = table.read(0, 1_000_000, {name: of for name, of in wanted.items() if of is not None})
+    pose, velocity = found.get("pose"), found.get("velocity")
+    has_sent = "sent" in found and any(np.nan_to_num(rows).any() for rows in blocks_of(found["sent"]))
+    return RawTrack(
+        where=table.path.name,
+        names=NAMELESS,
+        stamp_ns=stamps,
+        position=found["position"],
+        velocity=absent(len(stamps), num) if velocity is None else velocity,
+        commanded_velocity=found["sent"] if has_sent else found.get("sent" if desired == sent else "desired"),
+        T_base_ee=None if pose is None else poses_of(pose, pose_of_columns),
+    )
+
+
+def poses_of(rows: Table, read: Callable[[Float64], Float64 | None]) -> Rows:
+    """(T, 4, 4) of rows (T, K); NaN where `read` gives None."""
+    nothing = np.full((4, 4), np.nan)
+    blocks = (np.array([nothing if T is None else T for T in map(read, block)]) for block in blocks_of(rows))
+    return Rows(RowFile((4, 4), blocks))
+
+
+def _first(table: CsvTable, name: str, number: int) -> int | None:
+    full = (f"state.{name}[{number}]", f"{name}[{number}]")
+    return next((table.names.index(column) for column in full if column in table.names), None)
+
+
+def _block(table: CsvTable, name: str, num: int) -> list[int] | None:
+    columns = [column for i in range(num) if (column := _first(table, name, i)) is not None]
+    return columns if len(columns) == num else None
+
+
+def _sent(table: CsvTable, num: int) -> list[int] | None:
+    sent = [table.names.index(n) for i in range(num) if (n := f"cmd.dq_d[{i}]") in table.names]
+    if not sent:
+        sent = [
+            len(table.names) - 1 - table.names[::-1].index(n)
+            for i in range(num)
+            if table.names.count(n := f"dq_d[{i}]") == 2
+        ]
+    return sent if len(sent) == num else None
+
+
+INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_index"
+
+
+def is_lerobot(path: Path) -> bool:
+    return (path / INFO).is_file() and (path / "data").is_dir()
+
+
+def lerobot_preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
+    """An episode's keys of [states], by default the only one. Raises InputError."""
+    info = read_json(folder / INFO)
+    try:
+        feature, num = info["features"][POSITION], int(info["total_episodes"])
+        size, said = int(feature["shape"][0]), feature.get("names")
+        lists = said.values() if isinstance(said, dict) else [said or []]  # by kind, as {"motors": [...]}
+        names = [
+            str(name).removesuffix(".pos") for names in lists for name in names
+        ]  # shoulder_pan.pos is shoulder_pan
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(
+            f"{folder / INFO}: expected total_episodes and the feature {POSITION}, got no usable {error}",
+            remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
+        ) from None
+    if episode is None and num != 1:
+        raise InputError(f"{folder}: {num} episodes", remedy="choose one in a .toml: [states] preset, file, episode")
+    return {
+        "time": "timestamp",
+        "position": [POSITION],
+        "episode": episode or 0,
+        **({"joints": names} if len(names) == size else {}),
+        "file": str(_file(folder, episode or 0).absolute()),
+    }
+
+
+def _file(folder: Path, episode: int) -> Path:
+    files = sorted((folder / "data").glob("*/*.parquet"))
+    of_one = [file for file in files if file.stem == f"episode_{episode:06d}"]
+    shared = (file for file in files if file.stem.startswith("file") and len(ParquetFile(file, (EPISODE, episode))))
+    found = next(iter(of_one), None) or next(shared, None)
+    if found is None:
+        raise InputError(f"{folder}: no episode {episode}", remedy="copy the whole dataset, or give another episode")
+    return found
+
 
 UNITS = {"rad": 1.0, "deg": float(np.pi / 180.0)}
 TIME_UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-POSE_FRAMES = ("base", "world")
-POSE_ORDERS = ("rows", "columns")
 ARRAY_FILES: Mapping[str, type[ArrayFile]] = {
     ".npz": NpzFile,
     **dict.fromkeys([".h5", ".hdf5"], Hdf5File),
     ".parquet": ParquetFile,
 }
-PRESETS: Mapping[str, Callable[[Path, int | None], Mapping[str, Any]]] = {"lerobot": lerobot.preset}
+PRESETS: Mapping[str, Callable[[Path, int | None], Mapping[str, Any]]] = {"lerobot": lerobot_preset}
 _SEE = "see splatctrl help replay, Logs"
 
 
@@ -59,8 +277,8 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),
         "time_unit": tuple(TIME_UNITS_NS),
-        "pose_frame": POSE_FRAMES,
-        "pose_order": POSE_ORDERS,
+        "pose_frame": ("base", "world"),
+        "pose_order": ("rows", "columns"),
     }
     for key, allowed in choices.items():
         if getattr(table, key) not in allowed:
@@ -77,10 +295,10 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
 
 def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
     """A LeRobot dataset's only episode, and its file. Raises InputError."""
-    found = dict(lerobot.preset(folder, None))
+    found = dict(lerobot_preset(folder, None))
     if "joints" not in found:
         raise InputError(
-            f"{folder / lerobot.INFO}: {lerobot.POSITION} has no name for each joint",
+            f"{folder / INFO}: {POSITION} has no name for each joint",
             remedy="give a .toml: [states] preset, file, joints (splatctrl help replay, Logs)",
         )
     return _of_episode(StatesTable(**found), found["episode"], folder)
@@ -88,7 +306,7 @@ def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
 
 def _of_episode(table: StatesTable, episode: int, path: Path) -> tuple[RawTrack, Path]:
     file = Path(table.file)
-    return _track(table, ParquetFile(file, (lerobot.EPISODE, episode)), path), file
+    return _track(table, ParquetFile(file, (EPISODE, episode)), path), file
 
 
 def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:

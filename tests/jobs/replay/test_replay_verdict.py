@@ -361,7 +361,7 @@ def test_what_came_while_the_arm_was_driven_and_the_next_map_shows_is_a_hit(stag
 def test_clocks_that_disagree_turn_the_verdict_alone(
     stage: Stage, monkeypatch: pytest.MonkeyPatch, offset: float, uncertainty: float, code: int
 ) -> None:
-    clock = ClockOffset(offset_s=offset, uncertainty_s=uncertainty, correlation=0.9, runner_up=0.2, num_intervals=50)
+    clock = ClockOffset(offset_s=offset, uncertainty_s=uncertainty, correlation=0.9, num_intervals=50)
     monkeypatch.setattr(job, "clock_of", lambda *given: clock)
     found, verdict = stage.judged()
     assert (found, decisive(verdict)) == (code, {"clocks": "not evaluable"} if code else {})

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.replay.inputs import open_log
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.report.spaces import space_of
 from splatctrl_cli.jobs.robot.logged_robot import differs, logged_urdf, urdf_of
-from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.capture.capture import is_capture
 from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.robot.urdf import read_urdf

@@ -24,9 +24,9 @@ from rosbags.rosbag2 import StoragePlugin
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.recording.capture.capture_header import COLUMNS, FileSums, FrameRows, check_header
+from splatctrl_cli.recording.capture.capture import COLUMNS, FileSums, FrameRows, check_header
 from splatctrl_cli.recording.capture.capture_writer import JOURNAL, write_capture
-from splatctrl_cli.recording.container.mcap_records import CHUNK
+from splatctrl_cli.recording.container.mcap_file import CHUNK
 from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.stored_frame import StoredFrame
 from splatctrl_cli.recording.source import SourceOptions, describe, open_source

@@ -20,7 +20,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.formats.unpacking import MAX_BLOCK
-from splatctrl_cli.recording.container.bag_logs import BagFile, Db3Log
+from splatctrl_cli.recording.container.bag_logs import Bag1Log, Db3Log
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 from tests.cases.container_cases import kill_recorder
@@ -123,7 +123,7 @@ def test_a_damaged_chunk_costs_itself_alone_and_a_cut_what_follows(
     note: str,
 ) -> None:
     bag = make_bag1(tmp_path / "x.bag", compression)
-    records, data = list(BagFile(bag).records(Damage())), bag.read_bytes()
+    records, data = list(Bag1Log(bag).records(Damage())), bag.read_bytes()
     chunks = [record for record in records if record.kind == 5]
     bag.write_bytes(change(data, data.index(chunks[1].body), records[-1].offset))
     found, damage = read(bag)

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from splatctrl_cli.recording.container.foxglove import DEFINITIONS, MessageTypes
+from splatctrl_cli.recording.container.foxglove import DEFINITIONS, read_protobuf
 from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, MessageDecoder
 from splatctrl_cli.recording.source import describe, open_source
@@ -74,7 +74,7 @@ def descriptor_set() -> bytes:
 
 def encoded(type_name: str, message: dict[str, Any]) -> bytes:
     """A message in the wire format."""
-    kind = type(MessageTypes(descriptor_set()).read(type_name, b""))
+    kind = type(read_protobuf(descriptor_set(), type_name, b""))
     return bytes(kind(**message).SerializeToString())
 
 
@@ -210,7 +210,7 @@ def test_a_message_that_does_not_decode_is_counted(tmp_path: Path) -> None:
 @pytest.mark.parametrize("data", [b"\x0a\xff", b"\xff" * 11, b"\x0b", b"\x0a\x05abc", struct.pack("<B", 9) + b"1234"])
 def test_bytes_that_are_no_message_are_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match="protobuf: Error parsing message"):
-        MessageTypes(descriptor_set()).read("foxglove.Vector3", data)
+        read_protobuf(descriptor_set(), "foxglove.Vector3", data)
 
 
 @pytest.mark.parametrize(
@@ -224,22 +224,21 @@ def test_a_schema_that_is_not_usable_is_refused(change: Callable[[FileDescriptor
     files = FileDescriptorSet.FromString(descriptor_set())
     change(files)
     with pytest.raises(ValueError, match=f"protobuf: .*{words}"):
-        MessageTypes(files.SerializeToString()).read("foxglove.RawImage", b"")
+        read_protobuf(files.SerializeToString(), "foxglove.RawImage", b"")
 
 
 def test_fields_that_were_not_written_have_their_defaults_and_unknown_ones_are_passed_over() -> None:
-    types = MessageTypes(descriptor_set())
-    message = types.read("foxglove.FrameTransform", b"\x1a\x03cam" + b"\x9a\x06\x03new")
+    message = read_protobuf(descriptor_set(), "foxglove.FrameTransform", b"\x1a\x03cam" + b"\x9a\x06\x03new")
     assert (message.child_frame_id, message.parent_frame_id, message.timestamp.seconds) == ("cam", "", 0)
     with pytest.raises(ValueError, match=r"does not define foxglove\.Nothing"):
-        types.read("foxglove.Nothing", b"")
+        read_protobuf(descriptor_set(), "foxglove.Nothing", b"")
 
 
 def test_the_descriptors_of_a_real_log_are_read(real_data: Path) -> None:
     with (real_data / "rosbag2_mcap_sensor_msgs/simple-protobuf.mcap").open("rb") as stream:
         found = [(c, s, m) for s, c, m in make_reader(stream).iter_messages() if s is not None]
     schema, message = next((s, m) for channel, s, m in found if channel.message_encoding == "protobuf")
-    pose = MessageTypes(schema.data).read(schema.name, message.data)
+    pose = read_protobuf(schema.data, schema.name, message.data)
     assert (pose.timestamp.seconds, pose.timestamp.nanos, pose.frame_id) == (39, 427100000, "device")
     assert (pose.pose.orientation.w, pose.pose.position.x) == (1.0, 0.0)
 

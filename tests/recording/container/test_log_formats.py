@@ -22,8 +22,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.recording.container.foreign import FOREIGN, Foreign, refuse_foreign
-from splatctrl_cli.recording.container.log_formats import CONTAINERS, open_raw_log
+from splatctrl_cli.recording.container.log_formats import CONTAINERS, FOREIGN, Foreign, open_raw_log, refuse_foreign
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.recording.source import describe, open_source

@@ -24,10 +24,9 @@ from mcap.writer import Writer as McapWriter
 
 from benchmarks.mcap_recovery import DAMAGES, LOGS, NUM_MESSAGES, damaged, log
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, unpacked
-from splatctrl_cli.recording.container.mcap_file import McapFile, Part
+from splatctrl_cli.recording.container.mcap_file import CHUNK, HEAD, MAGIC, MESSAGE, McapFile, Part, parse_record
+from splatctrl_cli.recording.container.mcap_file import Chunk as StoredChunk
 from splatctrl_cli.recording.container.mcap_log import McapLog
-from splatctrl_cli.recording.container.mcap_records import CHUNK, HEAD, MAGIC, MESSAGE, parse_record
-from splatctrl_cli.recording.container.mcap_records import Chunk as StoredChunk
 from splatctrl_cli.recording.container.raw_log import MAX_NOTES, Damage
 from splatctrl_cli.recording.source import SourceOptions, open_source
 from tests.recording.log.make_log import LogRecipe, make_log

@@ -12,7 +12,7 @@ from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import npy_of, read_arrays, savez
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.recording.container.mcap_records import BadRecordError, parse_record
+from splatctrl_cli.recording.container.mcap_file import BadRecordError, parse_record
 from splatctrl_cli.recording.folder.poses import READERS
 from splatctrl_cli.recording.log.messages import decode_rvl
 from splatctrl_cli.recording.log.registration import TfTree

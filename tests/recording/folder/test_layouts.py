@@ -11,8 +11,8 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.capture.capture_writer import write_capture
+from splatctrl_cli.recording.folder.image_folder import LAYOUTS, layout_of
 from splatctrl_cli.recording.folder.layout import Layout
-from splatctrl_cli.recording.folder.layouts import LAYOUTS, layout_of
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from tests.recording.folder.make_layout import (

@@ -13,8 +13,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
 from splatctrl_cli.recording.log.cameras import find_cameras
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from splatctrl_cli.recording.log.image_names import DEPTH, is_other, word_of
-from splatctrl_cli.recording.log.messages import ImageMessage
+from splatctrl_cli.recording.log.messages import DEPTH, ImageMessage, is_other, word_of
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
-from splatctrl_cli.recording.log import frame_plan
-from splatctrl_cli.recording.log.frame_plan import HeldMessages, planned_images
-from splatctrl_cli.recording.log.ros_log import RosLogSource
+from splatctrl_cli.recording.log import ros_log
+from splatctrl_cli.recording.log.ros_log import HeldMessages, RosLogSource, planned_images
 from splatctrl_cli.recording.log.survey import paired
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -26,7 +25,7 @@ TWO = LogRecipe(cameras=("cam0", "cam1"), mask_every=2)
 def test_a_log_that_keeps_its_topics_apart_gives_the_same_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held_bytes: int
 ) -> None:
-    monkeypatch.setattr(frame_plan, "HELD_BYTES", held_bytes)
+    monkeypatch.setattr(ros_log, "HELD_BYTES", held_bytes)
     log = make_log(tmp_path / "log.mcap", TWO)
     apart = write_raw(tmp_path / "apart.mcap", sorted(messages_of(log), key=lambda m: m.topic.name))
     assert_same(list(open_source(log).records()), list(open_source(apart).records()))
@@ -51,7 +50,7 @@ def test_the_plan_takes_few_bytes_a_frame_and_lets_images_go_that_none_needs_any
 
 
 def test_held_messages_come_back_and_memory_holds_few_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_plan, "HELD_BYTES", 100)
+    monkeypatch.setattr(ros_log, "HELD_BYTES", 100)
     held = HeldMessages()
     data = [bytes([i]) * 40 for i in range(10)]
     for i, content in enumerate(data):

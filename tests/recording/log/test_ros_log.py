@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.recording.container.log_formats import open_raw_log
-from splatctrl_cli.recording.container.mcap_file import McapFile
+from splatctrl_cli.recording.container.mcap_file import DATA_END, McapFile
 from splatctrl_cli.recording.container.mcap_log import McapLog
-from splatctrl_cli.recording.container.mcap_records import DATA_END
 from splatctrl_cli.recording.container.raw_log import Damage
 from splatctrl_cli.recording.log import survey as surveys
 from splatctrl_cli.recording.log.survey import survey

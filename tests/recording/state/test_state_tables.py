@@ -8,7 +8,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.recording.state.twists import read_twists
+from splatctrl_cli.recording.state.state_source import read_twists
 from splatctrl_cli.records import Float64
 from tests.recording.log.make_log import built, by_axis
 from tests.recording.log.make_states import (
