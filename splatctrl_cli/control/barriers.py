@@ -34,14 +34,10 @@ class SceneRows(BarrierTerm):
         self._balls: BallDistance | None = None
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)[self._moving]
-        self._margin = scene_margin(model, config)[self._moving]
+        self.margin = scene_margin(model, config)[self._moving]
         names = sphere_names(model.sphere_set)
         self.names = tuple(names[s] for s in self._moving)
         self._links = np.array(model.sphere_set.links)[self._moving]
-
-    @property
-    def margin(self) -> Float64:
-        return self._margin
 
     def in_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
         """Return the rows in another field, of `balls` (None: links' surfaces do not count)."""
@@ -61,7 +57,7 @@ class SceneRows(BarrierTerm):
         links = set(self._links[chosen].tolist())
         gaps = self._model.surface_gaps(postures, self._balls.centers, self._balls.radii, links)
         for link, gap in gaps.items():
-            raised = gap[0] + self._margin - self._config.margin
+            raised = gap[0] + self.margin - self._config.margin
             is_raised = chosen & (self._links == link) & (raised > distance)
             distance = np.where(is_raised, raised, distance)
             if G is not None:
@@ -74,7 +70,7 @@ class SceneRows(BarrierTerm):
         distance, gradient = self._queried(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
         distance = self.by_surfaces(state.q, distance, state.by_surface, G)
-        h = distance_bound(self._config, self._acceleration, distance, self._margin, G, state.distance_rate)
+        h = distance_bound(self._config, self._acceleration, distance, self.margin, G, state.distance_rate)
         return self._barrier(self._moving, G, h, distance)
 
     def cut(self, state: State, velocity: Float64, chosen: NDArray[np.integer], distance: Float64) -> Barrier:
@@ -91,7 +87,7 @@ class SceneRows(BarrierTerm):
         later = self.by_surfaces(q, later - self._radii, state.by_surface, G)
         now, G = np.maximum(later + period * (G @ velocity), distance)[chosen], G[chosen]
         rate = np.broadcast_to(state.distance_rate, len(self.names))[chosen]
-        h = distance_bound(self._config, self._acceleration, now, self._margin[chosen], G, rate)
+        h = distance_bound(self._config, self._acceleration, now, self.margin[chosen], G, rate)
         return self._barrier(chosen, G, h, now)
 
     def distances(self, centers: Float64) -> Float64:
@@ -126,13 +122,9 @@ class SelfRows(BarrierTerm):
         self._config, self._acceleration = config, acceleration
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
         self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
-        self._margin = config.self_margin - np.asarray(model.self_allowance, dtype=np.float64)
+        self.margin = config.self_margin - np.asarray(model.self_allowance, dtype=np.float64)
         names = sphere_names(model.sphere_set)
         self.names = tuple(f"{names[a]}~{names[b]}" for a, b in self._pairs)
-
-    @property
-    def margin(self) -> Float64:
-        return self._margin
 
     def rows(self, state: State) -> Barrier:
         """Return the rows.
@@ -143,10 +135,10 @@ class SelfRows(BarrierTerm):
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
         if self._acceleration is not None:
             G = -pair_gradient(direction, jacobians, self._pairs)
-            h = distance_bound(self._config, self._acceleration, distance, self._margin, G)
+            h = distance_bound(self._config, self._acceleration, distance, self.margin, G)
         else:
             G = np.zeros((len(distance), jacobians.shape[2]))
-            h = distance_bound(self._config, None, distance, self._margin, G)
+            h = distance_bound(self._config, None, distance, self.margin, G)
             speed = fastest_spheres(jacobians, *state.box)
             near = np.flatnonzero(h <= speed[self._pairs[:, 0]] + speed[self._pairs[:, 1]])
             G[near] = -pair_gradient(direction[near], jacobians, self._pairs[near])
@@ -164,7 +156,7 @@ class SelfRows(BarrierTerm):
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
         motion = jacobians @ velocity
         apart = motion[self._pairs[:, 0]] - motion[self._pairs[:, 1]]
-        h = distance_bound(self._config, None, distance, self._margin, None)
+        h = distance_bound(self._config, None, distance, self.margin, None)
         return np.asarray(h + np.sum(direction * apart, axis=1))
 
     def distances(self, centers: Float64) -> Float64:

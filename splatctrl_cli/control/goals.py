@@ -101,11 +101,9 @@ class Path(Protocol):
     @property
     def duration(self) -> float:
         """Seconds from start to end."""
-        ...
 
     def at(self, time: float) -> tuple[Float64, Float64]:
         """Return position and velocity (1, J) at a time [s]."""
-        ...
 
 
 @dataclass

@@ -199,7 +199,7 @@ def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) ->
         "lower": _list(model.lower),
         "upper": _list(model.upper),
         "velocity_limit": _list(model.velocity_limit),
-        "acceleration_limit": None if acceleration is None else _list(acceleration),
+        "acceleration_limit": _list(acceleration),
         "frame": frame,
         "home": _list(home),
         "period": config.period,
@@ -243,9 +243,8 @@ def _rows(controller: QpIkController, view: View) -> list[Document]:
     ]
 
 
-def _list(values: Float64) -> list[Any]:
-    found: list[Any] = np.asarray(values, np.float64).tolist()
-    return found
+def _list(values: Float64 | None) -> Any:
+    return None if values is None else np.asarray(values, np.float64).tolist()
 
 
 def _line(document: Mapping[str, Any]) -> bytes:

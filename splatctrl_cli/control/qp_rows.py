@@ -92,11 +92,6 @@ class RowBuilder:
     def _terms(self) -> tuple[BarrierTerm, ...]:
         return (self.scene, *self._others)
 
-    @property
-    def num_external(self) -> int:
-        """Number of scene rows, which come first."""
-        return len(self.scene.names)
-
     def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
         """Return the rows in another field; see `SceneRows.in_field`."""
         other = copy(self)
@@ -170,7 +165,7 @@ def solve_printed(
     """
     external, *firm = barriers
     J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)
-    solution = solver.solve(assemble_printed(state, configured_weights(config), posture, external, firm))
+    solution = solver(assemble_printed(state, configured_weights(config), posture, external, firm))
     if not is_usable(solution, config.max_residual):
         return held(J, M + num_firm, solution, num_refused=1)
     slack = np.concatenate([np.maximum(-solution.z[J + 6 :], 0.0), np.zeros(num_firm)])

@@ -126,7 +126,6 @@ class StepRecord(Protocol):
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
         """Append a step."""
-        ...
 
 
 class InMemory:

@@ -60,7 +60,6 @@ class CostTerm(Protocol):
 
     def rows(self, state: State) -> Cost:
         """Return H and c."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,12 +70,6 @@ class ReachGoal:
     """
 
     weight: Float64
-
-    @classmethod
-    def of(cls, config: ControlConfig) -> "ReachGoal":
-        """Return the term of the configured Q and R."""
-        Q, R = configured_weights(config)
-        return cls(weight=eliminated_weight(Q, R))
 
     def rows(self, state: State) -> Cost:
         return reach_cost(state.jacobian, state.reference, self.weight)
@@ -204,7 +197,7 @@ class BarrierTerm(ABC):
     kind = RowKind.LIMIT
     names: tuple[str, ...]
 
-    @property
+    @cached_property
     def margin(self) -> Float64:
         """Margins of the rows (M,) [m]."""
         return np.zeros(len(self.names))

@@ -23,15 +23,12 @@ class CollisionProbability(Protocol):
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
         """Probability (X, Y, Z) at the cells of `span`; sdf: chosen distance [m]."""
-        ...
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
         """Probability (Q,) at points (Q, 3) [m]; sdf (Q,): chosen distance [m]."""
-        ...
 
     def described(self) -> dict[str, object]:
         """Return its meaning and numbers, for a header."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

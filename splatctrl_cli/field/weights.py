@@ -232,11 +232,9 @@ class Kernel(Protocol):
 
     def value(self, distance: Float64) -> Float64:
         """k(d) for distances of any shape [m]."""
-        ...
 
     def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
         """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,6 @@ class HasDistance(Protocol):
 
     def distance(self, points: Float64) -> Float64:
         """Return signed distance (Q,) [m] at points (Q, 3) [m], world."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

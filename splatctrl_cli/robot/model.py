@@ -34,11 +34,11 @@ from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 class RobotModel:
     """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
-    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: links
-    that `frame_pose` knows; left_out: links of the sphere file missing from the URDF; bare_links: URDF links with a
-    body but no sphere; coverage: None if not measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a
-    surface point of the sphere's rigid body may lie outside all spheres, NaN if unknown; held: locked fingers and
-    their values.
+    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); middle (J,): of the limits, 0 without;
+    base_position (3,) [m]; sphere_set in link frames; frame_names: links that `frame_pose` knows; left_out: links of
+    the sphere file missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None if not
+    measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a surface point of the sphere's rigid body may
+    lie outside all spheres, NaN if unknown; held: locked fingers and their values.
     """
 
     def __init__(
@@ -57,6 +57,7 @@ class RobotModel:
         self._data = model.createData()
         self.urdf = urdf
         self.T_world_base = T_world_base
+        self.base_position: Float64 = np.array(T_world_base[:3, 3])
         self.joint_names: tuple[str, ...] = tuple(str(name) for name in model.names)[1:]
         self.sphere_set = spheres
         self.left_out = tuple(left_out)
@@ -77,6 +78,9 @@ class RobotModel:
         rows = [joint.idx_q for joint in model.joints][1:]
         self.lower: Float64 = np.where(self._is_wrapped, -np.inf, model.lowerPositionLimit[rows])
         self.upper: Float64 = np.where(self._is_wrapped, np.inf, model.upperPositionLimit[rows])
+        limited = np.isfinite(self.lower) & np.isfinite(self.upper)
+        lower, upper = np.where(limited, self.lower, 0), np.where(limited, self.upper, 0)
+        self.middle: Float64 = np.where(limited, (lower + upper) / 2, 0.0)
         self.velocity_limit: Float64 = np.array(model.velocityLimit, dtype=np.float64)
         self._frames = {
             str(frame.name): index
@@ -249,17 +253,6 @@ class RobotModel:
         """Box [m] around the base's reach."""
         reach = self.reach()
         return Box(lower=self.base_position - reach, upper=self.base_position + reach)
-
-    @property
-    def base_position(self) -> Float64:
-        """Root link's origin (3,) [m], world."""
-        return np.array(self.T_world_base[:3, 3])
-
-    @property
-    def middle(self) -> Float64:
-        """Posture (J,) in the middle of the limits; 0 for an unlimited joint."""
-        limited = np.isfinite(self.lower) & np.isfinite(self.upper)
-        return np.where(limited, (np.where(limited, self.lower, 0) + np.where(limited, self.upper, 0)) / 2, 0.0)
 
     def sphere_centers(self, q: Float64) -> Float64:
         """Return centres (S, 3) at q (J,)."""

@@ -90,7 +90,7 @@ def test_what_is_left_of_a_row_is_its_promise_along_any_velocity(arm: RobotModel
     for q in postures(arm, 4):
         velocity = random.uniform(-1.0, 1.0, arm.num_joints)
         ahead, behind = builder.distances(q + STEP * velocity), builder.distances(q - STEP * velocity)
-        margin = np.where(np.arange(len(ahead)) < builder.num_external, CONFIG.margin, CONFIG.self_margin)
+        margin = np.where(np.arange(len(ahead)) < len(builder.scene.names), CONFIG.margin, CONFIG.self_margin)
         promise = 10.0 * (builder.distances(q) - margin) + (ahead - behind) / (2 * STEP)
         np.testing.assert_allclose(builder.room(state_at(arm, q), velocity), promise, atol=1e-7)
 

@@ -10,7 +10,7 @@ from splatctrl_cli.config.fixed import MULTIPLIER
 from splatctrl_cli.control import barriers
 from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.preconditions import static_violations
-from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, Rung
+from splatctrl_cli.control.qp import QpSolution, QuadraticProgram, Residuals, Rung, solve_clarabel
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
@@ -38,10 +38,9 @@ class Scripted:
 
     def __init__(self, num_bad: int, status: str = "AlmostSolved", residual: float = 0.0) -> None:
         self.num_bad, self.status, self.residual = num_bad, status, residual
-        self.honest = ClarabelSolver()
 
-    def solve(self, program: QuadraticProgram) -> QpSolution:
-        solution = self.honest.solve(program)
+    def __call__(self, program: QuadraticProgram) -> QpSolution:
+        solution = solve_clarabel(program)
         if self.num_bad == 0:
             return solution
         self.num_bad -= 1
