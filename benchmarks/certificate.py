@@ -91,7 +91,7 @@ def judge(
     extent = voxel * (shape - 1)
     points = grid.origin + rng.uniform(-BEYOND, extent + BEYOND, (num_queries, 3))
     exact = exact_distance(points, centers, radii)
-    inside = GridField(grid).contains(points)
+    inside = GridField(grid).box.contains(points)
     within = points[inside]
     nearest = np.rint((within - grid.origin) / voxel).astype(np.int64)
     between = {

@@ -63,7 +63,7 @@ def sampled(group: Sequence[Shape], num: int) -> tuple[Float64, Float64, Float64
             centers = centers + np.random.default_rng(3).normal(0.0, NOISE, centers.shape)
             truths.append(truth)
             distances.append(make_field(centers, radii, config).query(points)[0])
-            papers.append(PaperProbability(Spheres.of(centers, radii), config).of(points))
+            papers.append(PaperProbability(Spheres.of(centers, radii), config).at(points, np.zeros(0)))
     return np.concatenate(truths), np.concatenate(distances), np.concatenate(papers)
 
 

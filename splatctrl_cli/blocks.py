@@ -17,6 +17,7 @@ from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.evaluate.protocols import SURFACE_SCANS
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.field.baker import Baker, Planes
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridLayout
 from splatctrl_cli.field.grid_field import GridField
@@ -198,6 +199,7 @@ __all__ = [
     "Solid",
     "Solids",
     "SphereField",
+    "Spheres",
     "SplatSet",
     "Stamps",
     "StateColumns",

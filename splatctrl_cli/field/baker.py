@@ -13,23 +13,13 @@ from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, SeField, SphereFi
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
 from splatctrl_cli.field.on_device import device_field
 from splatctrl_cli.field.probability import make_probability
+from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
 from splatctrl_cli.records import Bool, Float32, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid
 
-CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
-    "sdf": ("<f4", 1),
-    "gradient": ("<f4", 3),
-    "bound": ("<f4", 1),
-    "observed": ("|u1", 1),
-    "probability": ("<f4", 1),
-    "label": ("|u1", 1),
-    "hard": ("<f4", 1),
-    "se": ("<f4", 1),
-    "gpdf": ("<f4", 1),
-}
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
 
 Planes = dict[str, NDArray[np.generic]]
@@ -68,11 +58,11 @@ class Baker:
         self.channels = tuple(name for name in CHANNELS if name in channels)
         self.labels = splats.labels
         self.spheres = Spheres.of(splats.centers, splats.radii, layout.box)
-        self.exact = SphereField.over(self.spheres, threads=threads)
+        self.exact = SphereField(self.spheres, threads=threads)
         self.kernel_name = KERNEL_OF[config.distance]
         names = {self.kernel_name, *channels}
-        self.se = SeField.over(self.spheres, config, threads=threads) if "se" in names else None
-        self.gpdf = GpdfField.over(self.spheres, config, threads=threads) if "gpdf" in names else None
+        self.se = SeField(self.spheres, config, threads=threads) if "se" in names else None
+        self.gpdf = GpdfField(self.spheres, config, threads=threads) if "gpdf" in names else None
         has_probability = "probability" in channels
         self.probability = make_probability(self.spheres, config, threads=threads) if has_probability else None
         self.kernels: tuple[str, ...] = tuple(name for name in ("se", "gpdf") if name in names)
@@ -99,12 +89,8 @@ class Baker:
 
     def allocate(self, num_planes: int) -> Planes:
         """Arrays for the channels of `num_planes` x-planes."""
-        return {name: np.empty(self.shape_of(name, num_planes), CHANNELS[name][0]) for name in self.channels}
-
-    def shape_of(self, channel: str, num_planes: int) -> tuple[int, ...]:
-        """(num_planes, Y, Z), or (num_planes, Y, Z, 3)."""
-        shape = (num_planes, *self.layout.shape[1:])
-        return shape if CHANNELS[channel][1] == 1 else (*shape, CHANNELS[channel][1])
+        cells = (num_planes, *self.layout.shape[1:])
+        return {name: np.empty(CHANNELS[name].shape(cells), CHANNELS[name].dtype) for name in self.channels}
 
     def bake(self, first: int, last: int, out: Planes, mask: UInt8 | None = None) -> None:
         """Fill `out` with x-planes [first, last), whole blocks of 8 cells.

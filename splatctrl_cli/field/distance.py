@@ -1,9 +1,9 @@
 """Distance fields over splats: exact, kernel, and the smaller. Positive outside."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,10 +12,12 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import MARCH_STEPS, SIGNED_CARE
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
-from splatctrl_cli.field.weights import Matern12, SquaredExponential, weights_named
+from splatctrl_cli.field.weights import Kernel, Matern12, SquaredExponential, share_of_loss, weights_named
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import GridSpan, LogSumExp
 from splatctrl_cli.records import DistanceField, Float32, Float64
+
+DEFAULT = FieldConfig()
 
 
 class SphereField:
@@ -24,21 +26,9 @@ class SphereField:
     Inside, it is minus the depth in the deepest sphere, not the distance to the union's surface.
     """
 
-    def __init__(self, centers: ArrayLike, radii: ArrayLike, *, threads: int = 1) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m]. Raises as `Spheres.of`."""
-        self._hold(Spheres.of(centers, radii), threads)
-
-    @classmethod
-    def over(cls, spheres: Spheres, *, threads: int = 1) -> "SphereField":
-        """Make the field of clustered spheres."""
-        field = cls.__new__(cls)
-        field._hold(spheres, threads)
-        return field
-
-    def _hold(self, spheres: Spheres, threads: int) -> None:
-        self.spheres = spheres
+    def __init__(self, spheres: Spheres, *, threads: int = 1) -> None:
+        self.spheres, self._threads = spheres, threads
         self.radii = spheres.points.offsets(spheres.radii)
-        self._threads = threads
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient, as in `DistanceField.query`; zero gradient at a centre."""
@@ -54,34 +44,17 @@ class SphereField:
 
 
 class LogSumExpField(ABC):
-    """A log-sum-exp over splats."""
+    """A log-sum-exp over splats, of a kernel and weights."""
 
-    spheres: Spheres
+    kernel_type: ClassVar[type[Kernel]]
 
-    def __init__(
-        self,
-        centers: ArrayLike,
-        radii: ArrayLike,
-        length_scale: float = FieldConfig.length_scale,
-        *,
-        noise: float = FieldConfig.noise,
-        truncation: float = FieldConfig.truncation,
-        weights: str = FieldConfig.weights,
-        threads: int = 1,
-    ) -> None:
-        """centers (N, 3) [m], world; radii (N,), length_scale, truncation [m]. Raises as `Spheres.of`."""
-        config = FieldConfig(length_scale=length_scale, noise=noise, truncation=truncation, weights=weights)
-        self._hold(Spheres.of(centers, radii), config, threads)
-
-    @classmethod
-    def over(cls, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Self:
-        """Make the field of clustered spheres."""
-        field = cls.__new__(cls)
-        field._hold(spheres, config, threads)
-        return field
-
-    @abstractmethod
-    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None: ...
+    def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
+        self.spheres, self._threads = spheres, threads
+        self.kernel = self.kernel_type(config.length_scale)
+        self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
+        sign = self.weights.sign
+        self.sign = None if sign is None else spheres.points.laid_out(sign, spare=1.0).astype(np.float32)
+        self.tolerance = config.truncation * (1.0 if sign is None else SIGNED_CARE)
 
     @abstractmethod
     def terms(self) -> LogSumExp:
@@ -104,19 +77,15 @@ class GpdfField(LogSumExpField):
     undefined where weights of either sign (cg) give no positive sum.
     """
 
-    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
-        self.spheres = spheres
-        self.kernel = Matern12(config.length_scale)
-        self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
-        tolerance = config.truncation * (1.0 if self.weights.sign is None else SIGNED_CARE)
-        self.share = self.kernel.share(tolerance)
-        offsets = spheres.radii + self.kernel.length * self.weights.log_size
+    kernel_type = Matern12
+
+    def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
+        super().__init__(spheres, config, threads=threads)
+        self.share = share_of_loss(self.kernel.length, self.tolerance)
+        self.offsets = spheres.radii + self.kernel.length * self.weights.log_size
         # Float32 keeps the differences to the micrometre: the largest offset is added at the end, in float64.
-        self._common = float(offsets.max())
-        self.offsets = offsets
-        self._offsets = spheres.points.offsets(offsets - self._common)
-        self.sign = laid_out_sign(spheres, self.weights.sign)
-        self._threads = threads
+        self._common = float(self.offsets.max())
+        self._offsets = spheres.points.offsets(self.offsets - self._common)
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined.
@@ -161,18 +130,15 @@ class SeField(LogSumExpField):
     surface.
     """
 
-    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
-        self.spheres = spheres
-        self.kernel = SquaredExponential(config.length_scale)
-        self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
-        self.tolerance = config.truncation * (1.0 if self.weights.sign is None else SIGNED_CARE)
+    kernel_type = SquaredExponential
+
+    def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
+        super().__init__(spheres, config, threads=threads)
         self.unit = 2.0 * self.kernel.length**2
         log_size = self.weights.log_size
         self._common = self.unit * float(log_size.max())
         self._offsets = spheres.points.offsets(self.unit * log_size - self._common)
         self.radii = spheres.points.offsets(spheres.radii, spare=0.0)
-        self.sign = laid_out_sign(spheres, self.weights.sign)
-        self._threads = threads
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN where L >= 0."""
@@ -254,14 +220,9 @@ def or_exact(raw: tuple[Float64, Float64], spheres: Spheres, points: Float64) ->
     distance, gradient = raw
     has_none = np.isnan(distance)
     if has_none.any():
-        exact = SphereField.over(spheres)
+        exact = SphereField(spheres)
         distance[has_none], gradient[has_none] = exact.query(np.asarray(points, dtype=np.float64)[has_none])
     return distance, gradient
-
-
-def laid_out_sign(spheres: Spheres, sign: Float32 | None) -> Float32 | None:
-    """Lay out signs (N,) as (16 C,); None stays None."""
-    return None if sign is None else spheres.points.laid_out(sign, spare=1.0).astype(np.float32)
 
 
 def normalised(gradient: Float64) -> Float64:
@@ -270,30 +231,17 @@ def normalised(gradient: Float64) -> Float64:
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
 
 
-KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "hard": None}
-_Make = Callable[[Spheres, FieldConfig, int], DistanceField]
-
-
-def _safe(spheres: Spheres, config: FieldConfig, threads: int) -> DistanceField:
-    return SafeField(SphereField.over(spheres, threads=threads), SeField.over(spheres, config, threads=threads))
-
-
-def _safe_gpdf(spheres: Spheres, config: FieldConfig, threads: int) -> DistanceField:
-    return SafeField(SphereField.over(spheres, threads=threads), GpdfField.over(spheres, config, threads=threads))
-
-
-DISTANCES: Mapping[str, _Make] = {
-    "safe": _safe,
-    "safe_gpdf": _safe_gpdf,
-    "hard": lambda spheres, config, threads: SphereField.over(spheres, threads=threads),
-    "se": lambda spheres, config, threads: SeField.over(spheres, config, threads=threads),
-    "gpdf": lambda spheres, config, threads: GpdfField.over(spheres, config, threads=threads),
-}
+KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "hard": None, "se": "se", "gpdf": "gpdf"}  # of `config.distance`
+KERNELS: Mapping[str, type[LogSumExpField]] = {"se": SeField, "gpdf": GpdfField}
 
 
 def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> DistanceField:
     """Make the field that ``config.distance`` names."""
-    return DISTANCES[config.distance](spheres, config, threads)
+    name = KERNEL_OF[config.distance]
+    if name is None:
+        return SphereField(spheres, threads=threads)
+    kernel = KERNELS[name](spheres, config, threads=threads)
+    return kernel if config.distance == name else SafeField(SphereField(spheres, threads=threads), kernel)
 
 
 def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> DistanceField:

@@ -6,7 +6,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.field.clusters import checked_points
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.records import Bool, Box, DistanceGrid, Float32, Float64
+from splatctrl_cli.records import Box, DistanceGrid, Float32, Float64
 
 
 class GridField:
@@ -53,10 +53,6 @@ class GridField:
         if self._has_blank:
             certified[np.isnan(self.query(points)[0])] = np.nan
         return certified
-
-    def contains(self, points: Float64) -> Bool:
-        """True for points (Q, 3) in the box of centres."""
-        return self.box.contains(points)
 
 
 def exact_channel(grid: DistanceGrid) -> Float32:

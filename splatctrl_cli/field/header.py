@@ -1,6 +1,7 @@
 """The header of a baked field."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
+from dataclasses import asdict
 
 import numpy as np
 
@@ -29,12 +30,6 @@ def field_header(
 ) -> dict[str, object]:
     """Header of `baker`'s bake of `chosen`: labelled `splats`, then `num_unrepresented` balls."""
     config = baker.config
-    radii: Mapping[str, float] = {
-        "min": float(chosen.radii.min()),
-        "median": float(np.median(chosen.radii)),
-        "mean": float(chosen.radii.mean(dtype=np.float64)),
-        "max": float(chosen.radii.max()),
-    }
     header: dict[str, object] = {
         "format": "splatctrl distance grid",
         "version": 2,
@@ -60,8 +55,13 @@ def field_header(
         "splats_given": label_counts(splats),
         "splats_used": label_counts(chosen.select(np.arange(len(chosen)) < len(chosen) - num_unrepresented)),
         "unrepresented_voxels": num_unrepresented,
-        "radius": radii,
-        "health": field_health(chosen.centers, chosen.radii, config.length_scale, kernels=baker.kernels).as_dict(),
+        "radius": {
+            "min": float(chosen.radii.min()),
+            "median": float(np.median(chosen.radii)),
+            "mean": float(chosen.radii.mean(dtype=np.float64)),
+            "max": float(chosen.radii.max()),
+        },
+        "health": asdict(field_health(chosen.centers, chosen.radii, config.length_scale, kernels=baker.kernels)),
     }
     if baker.probability is not None:
         header |= {"probability": config.probability, "probability_numbers": baker.probability.described()}

@@ -1,7 +1,7 @@
 """Checks that splats are dense and thick enough for a distance field."""
 
 from collections.abc import Collection, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,6 @@ class FieldHealth:
     radius_per_length: float
     planar_zero_level: float
     warnings: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, object]:
-        """Return plain values for a header."""
-        return asdict(self)
 
 
 def field_health(

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.field.baker import Baker, Planes
-from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.kernels.field import BLOCK, GridSpan
+from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Float64, SplatSet, UInt8
 
 
@@ -33,40 +32,24 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
     Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
     culling bounds. Weights are compared too, as neighbours' weights change; `observed` is not.
     """
-    shape = blocks_of(new.layout)
+    shape = tuple(-(-cells // BLOCK) for cells in new.layout.shape)
     num_blocks = int(np.prod(shape))
     reason = _reason_for_all(old, new)
     if reason:
         return Changes(mask=None, num_blocks=num_blocks, reason=reason)
     mask = np.zeros(shape, np.uint8)
-    span = whole_span(new)
-    for changed, baker in zip(_changed((before, after), (old, new), with_weights=False), (old, new), strict=True):
-        _touch(baker.spheres.points.clusters, baker.exact.radii, changed, None, span, mask, baker.threads)
-    if new.se is not None:
-        for changed, baker in zip(_changed((before, after), (old, new), with_weights=True), (old, new), strict=True):
-            assert baker.se is not None
-            offsets = baker.spheres.points.offsets(baker.se.unit * baker.se.weights.log_size)
-            length = baker.se.kernel.length
-            _touch(baker.spheres.points.clusters, offsets, changed, length, span, mask, baker.threads)
+    span = new.span(0, new.layout.shape[0])
+    for with_weights in (False, True)[: 1 if new.se is None else 2]:
+        both = _changed((before, after), (old, new), with_weights=with_weights)
+        for changed, baker in zip(both, (old, new), strict=True):
+            offsets, length = baker.exact.radii, None
+            if with_weights and baker.se is not None:
+                offsets = baker.spheres.points.offsets(baker.se.unit * baker.se.weights.log_size)
+                length = baker.se.kernel.length
+            if changed.any():
+                clusters = baker.spheres.points.clusters
+                native.touched_blocks(clusters, offsets, changed, length, span, mask, threads=baker.threads)
     return Changes(mask=mask, num_blocks=num_blocks)
-
-
-def blocks_of(layout: GridLayout) -> tuple[int, int, int]:
-    """Blocks along x, y and z."""
-    x, y, z = (-(-cells // BLOCK) for cells in layout.shape)
-    return (x, y, z)
-
-
-def whole_span(baker: Baker) -> GridSpan:
-    """All cells of a baker's grid, in its spheres' frame."""
-    layout = baker.layout
-    return GridSpan(
-        origin=layout.origin - baker.spheres.points.anchor,
-        voxel=layout.voxel,
-        shape=layout.shape,
-        first=0,
-        last=layout.shape[0],
-    )
 
 
 def counts_after(
@@ -97,19 +80,6 @@ def _reason_for_all(old: Baker, new: Baker) -> str:
     if "bound" in new.channels and old.bound_margin != new.bound_margin:
         return "the farthest splat moved, and bound's margin with it"
     return ""
-
-
-def _touch(
-    clusters: native.Clusters,
-    offsets: native.Offsets,
-    changed: UInt8,
-    length: float | None,
-    span: GridSpan,
-    mask: UInt8,
-    threads: int,
-) -> None:
-    if changed.any():
-        native.touched_blocks(clusters, offsets, changed, length, span, mask, threads=threads)
 
 
 def _changed(

@@ -8,13 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.clusters import Spheres, checked_points
-from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, LogSumExpField, SeField
+from splatctrl_cli.field.distance import KERNEL_OF, KERNELS, LogSumExpField
 from splatctrl_cli.field.grid_cells import RESOLUTION
 from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField
 from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.records import Float64
-
-KERNELS: Mapping[str, type[LogSumExpField]] = {"se": SeField, "gpdf": GpdfField}
 
 
 class OnDevice:
@@ -23,7 +21,7 @@ class OnDevice:
     def __init__(self, spheres: Spheres, config: FieldConfig, device: Memory, *, threads: int = 1) -> None:
         """The processor makes the weights. Raises OutOfMemory."""
         self.spheres, kernel = spheres, KERNEL_OF[config.distance]
-        kernels = {} if kernel is None else {kernel: KERNELS[kernel].over(spheres, config, threads=threads)}
+        kernels = {} if kernel is None else {kernel: KERNELS[kernel](spheres, config, threads=threads)}
         self.field = device_field(spheres, kernels, config, device)
 
     @classmethod

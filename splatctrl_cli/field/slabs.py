@@ -7,10 +7,11 @@ import numpy as np
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker, Planes
+from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker, Planes
 from splatctrl_cli.field.grid_cells import GridLayout, check_memory, check_room, observed_planes
 from splatctrl_cli.field.header import field_header
-from splatctrl_cli.field.unknown import BOUND, DEFAULT_LABELS, Cubes, apply_unknown, blank, field_splats
+from splatctrl_cli.field.unknown import BOUND, DEFAULT_LABELS, Cubes, blank, field_splats
+from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Label, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
@@ -32,7 +33,8 @@ class Kept:
 
 def bytes_per_cell(channels: Collection[str]) -> int:
     """Bytes of the channels."""
-    return sum(np.dtype(CHANNELS[name][0]).itemsize * CHANNELS[name][1] for name in channels if name in CHANNELS)
+    kinds = [CHANNELS[name] for name in channels if name in CHANNELS]
+    return sum(np.dtype(kind.dtype).itemsize * kind.components for kind in kinds)
 
 
 def slabs(layout: GridLayout, channels: Collection[str], begin: int = 0) -> Iterator[tuple[int, int]]:
@@ -54,7 +56,11 @@ def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
 
 
 class UnknownSpace:
-    """`apply_unknown` for slabs, from never-seen cells found before the bake.
+    """Never-seen space in slabs, treated by the policy ``nan`` or ``obstacle``; its cells are found before the bake.
+
+    ``nan``: no sdf, gradient or probability there. ``obstacle``: solid cubes of probability 1; sdf, gradient and
+    bound are of the nearer of splats and cubes. Cells that only the robot swept are known
+    (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
 
     num_never_seen and num_changed count the cells treated so far.
     """
@@ -141,8 +147,10 @@ def bake(
     baker = Baker(
         chosen, layout, config, channels=channels, occupancy=occupancy, thresholds=thresholds, threads=threads
     )
-    arrays = baker.allocate(layout.shape[0])
-    baker.bake(0, layout.shape[0], arrays)
+    planes = baked_planes(baker, 0, layout.shape[0])
     header = field_header(splats, chosen, labels, baker, has_occupancy=occupancy is not None)
-    grid = DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=arrays, header=header)
-    return apply_unknown(grid, config.unknown)
+    if config.unknown != "free":
+        unknown = UnknownSpace(layout, config, occupancy, thresholds or OccupancyConfig())
+        planes = unknown.apply(planes, 0, layout.shape[0], baker.bound_margin)
+        header |= unknown.header()
+    return DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header=header)

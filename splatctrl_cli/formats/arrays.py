@@ -10,7 +10,7 @@ import zipfile
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from math import prod
@@ -214,9 +214,14 @@ class ArrayFile(ABC):
             remedy=f"arrays there: {', '.join(self.names)}",
         )
 
-    def _unreadable(self, kind: str, error: Exception) -> InputError:
-        said = " ".join(str(error).split()) or type(error).__name__
-        return InputError(f"{self.path}: cannot be read as {kind}: {said}", remedy="check the file")
+    @contextmanager
+    def _read_as(self, kind: str, *faults: type[Exception]) -> Iterator[None]:
+        """Turn `faults` into InputError."""
+        try:
+            yield
+        except faults as error:
+            said = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{self.path}: cannot be read as {kind}: {said}", remedy="check the file") from None
 
 
 _MOST_BY_COLUMNS = 1 << 28  # bytes, as they are in memory at once
@@ -227,46 +232,38 @@ class NpzFile(ArrayFile):
     def __init__(self, path: Path) -> None:
         """Raises InputError for another kind of file."""
         super().__init__(path)
-        try:
-            with zipfile.ZipFile(path) as archive:
-                self.names = [name.removesuffix(".npy") for name in archive.namelist()]
-        except _DAMAGE as error:
-            raise self._unreadable("NPZ", error) from None
+        with self._read_as("NPZ", *_DAMAGE), zipfile.ZipFile(path) as archive:
+            self.names = [name.removesuffix(".npy") for name in archive.namelist()]
 
     def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
         if name not in self.names:
             return None
-        with ExitStack() as stack:
-            shape, dtype, _, _ = self._opened(stack, name)
+        with self._opened(name) as (shape, dtype, _, _):
             return shape, dtype
 
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
         """Yield the rows; an array stored by columns is read at once."""
-        with ExitStack() as stack:
-            shape, dtype, is_by_columns, stream = self._opened(stack, name)
-            try:
-                if is_by_columns:
-                    if prod(shape) * dtype.itemsize > _MOST_BY_COLUMNS:
-                        raise ValueError(f"{name}: over {_MOST_BY_COLUMNS} bytes by columns, expected rows")
-                    whole = np.frombuffer(_read(stream, prod(shape) * dtype.itemsize), dtype).reshape(
-                        shape, order="F"
-                    )
-                    yield from (whole[first : first + BLOCK] for first in range(0, shape[0], BLOCK))
-                    return
-                row = prod(shape[1:]) * dtype.itemsize
-                for first in range(0, shape[0], BLOCK):
-                    num = min(BLOCK, shape[0] - first)
-                    yield np.frombuffer(_read(stream, num * row), dtype).reshape(num, *shape[1:])
-            except _DAMAGE as error:
-                raise self._unreadable("NPZ", error) from None
+        with self._opened(name) as (shape, dtype, is_by_columns, stream):
+            if is_by_columns:
+                if prod(shape) * dtype.itemsize > _MOST_BY_COLUMNS:
+                    raise ValueError(f"{name}: over {_MOST_BY_COLUMNS} bytes by columns, expected rows")
+                whole = np.frombuffer(_read(stream, prod(shape) * dtype.itemsize), dtype).reshape(shape, order="F")
+                yield from (whole[first : first + BLOCK] for first in range(0, shape[0], BLOCK))
+                return
+            row = prod(shape[1:]) * dtype.itemsize
+            for first in range(0, shape[0], BLOCK):
+                num = min(BLOCK, shape[0] - first)
+                yield np.frombuffer(_read(stream, num * row), dtype).reshape(num, *shape[1:])
 
-    def _opened(self, stack: ExitStack, name: str) -> tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]:
-        try:
-            stream = stack.enter_context(stack.enter_context(zipfile.ZipFile(self.path)).open(f"{name}.npy"))
+    @contextmanager
+    def _opened(self, name: str) -> Iterator[tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]]:
+        with (
+            self._read_as("NPZ", *_DAMAGE),
+            zipfile.ZipFile(self.path) as archive,
+            archive.open(f"{name}.npy") as stream,
+        ):
             shape, is_by_columns, dtype = npy_head(stream)
-        except _DAMAGE as error:
-            raise self._unreadable("NPZ", error) from None
-        return shape, dtype, is_by_columns and len(shape) > 1, stream
+            yield shape, dtype, is_by_columns and len(shape) > 1, stream
 
 
 def _read(stream: IO[bytes], num: int) -> bytes:
@@ -307,11 +304,9 @@ class Hdf5File(ArrayFile):
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        try:
-            with self._h5py.File(self.path, "r") as file:
-                yield file
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise self._unreadable("HDF5", error) from None
+        faults = (OSError, RuntimeError, KeyError, ValueError)
+        with self._read_as("HDF5", *faults), self._h5py.File(self.path, "r") as file:
+            yield file
 
 
 class ParquetFile(ArrayFile):
@@ -368,8 +363,6 @@ class ParquetFile(ArrayFile):
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        try:
-            with self._parquet.ParquetFile(self.path) as file:
-                yield file
-        except (OSError, ValueError, KeyError, self._arrow.ArrowException) as error:
-            raise self._unreadable("Parquet", error) from None
+        faults = (OSError, ValueError, KeyError, self._arrow.ArrowException)
+        with self._read_as("Parquet", *faults), self._parquet.ParquetFile(self.path) as file:
+            yield file

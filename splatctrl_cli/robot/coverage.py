@@ -257,7 +257,7 @@ def _of_link(
         deficit=max(deficits, key=lambda deficit: deficit.proven) if deficits else None,
         protrusion=float(sticking[worst]),
         worst_sphere=int(indices[own][worst]) if own.any() else -1,
-        is_closed=all(part.is_closed for part in parts),
+        is_closed=all(part.surface.is_closed for part in parts),
     )
 
 

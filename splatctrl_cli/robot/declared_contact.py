@@ -43,10 +43,6 @@ class ExpectedContact:
     reason: str
     is_learned: bool = False
 
-    def covers(self, link: str, point_world: NDArray[np.floating], time_s: float) -> bool:
-        """True for a link's contact at point (3,) [m] and time."""
-        return link == self.link and self.start <= time_s <= self.end and bool(self.box.contains(point_world))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Declarations:
@@ -77,7 +73,7 @@ class Declarations:
     def expects(self, link: str, point_world: NDArray[np.floating], time_s: float) -> ExpectedContact | None:
         """Return the first entry for a contact at a point (3,) [m]; counts its use."""
         for index, entry in enumerate(self.expected_contact):
-            if entry.covers(link, point_world, time_s):
+            if link == entry.link and entry.start <= time_s <= entry.end and entry.box.contains(point_world):
                 self.used("expected_contact", index, 1)
                 return entry
         return None

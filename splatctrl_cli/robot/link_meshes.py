@@ -37,11 +37,6 @@ class Solid:
     body: TriangleMesh | None
     ball: tuple[Float64, float] | None = None
 
-    @property
-    def is_closed(self) -> bool:
-        """True if the surface is closed."""
-        return self.surface.is_closed
-
 
 def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple[Solid, ...]]:
     """Read each link's solids, in the file's order.

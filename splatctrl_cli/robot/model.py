@@ -54,7 +54,6 @@ class RobotModel:
         held: Mapping[str, float] | None = None,
     ) -> None:
         self._model = model
-        self._data = model.createData()
         self.urdf = urdf
         self.T_world_base = T_world_base
         self.base_position: Float64 = np.array(T_world_base[:3, 3])
@@ -115,7 +114,7 @@ class RobotModel:
         model = _without(model, file.with_followers(locked or {}), file.path)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
-            return cls(file, model, spheres_of(file), T, (), are_links_renamed=False, packages=packages)
+            spheres = spheres_of(file)
         asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
         sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
         is_renamed = are_links_renamed(asked, file)
@@ -265,10 +264,6 @@ class RobotModel:
             raise InputError(f"joint positions: expected shape (T, {self.num_joints}), got {postures.shape}")
         return self.chain.centers(postures, threads=threads)
 
-    def sphere_jacobians(self, q: Float64) -> Float64:
-        """Return d centre / d q (S, 3, J) at q (J,)."""
-        return self.chain.jacobians(self._checked(q))[1]
-
     def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
         """Return centres (S, 3) and Jacobians (S, 3, J) at q (J,)."""
         return self.chain.jacobians(self._checked(q))
@@ -376,10 +371,11 @@ class RobotModel:
 
     def _as_chain(self) -> Chain:
         placement = np.array([self.T_world_base, *(p.homogeneous for p in list(self._model.jointPlacements)[1:])])
-        pinocchio.computeJointJacobians(self._model, self._data, self._configuration(self.middle))
+        data = self._model.createData()
+        pinocchio.computeJointJacobians(self._model, data, self._configuration(self.middle))
         kind, axis = [REVOLUTE], [np.array([0.0, 0.0, 1.0])]
         for body in range(1, self.num_joints + 1):
-            local = pinocchio.getJointJacobian(self._model, self._data, body, pinocchio.ReferenceFrame.LOCAL)
+            local = pinocchio.getJointJacobian(self._model, data, body, pinocchio.ReferenceFrame.LOCAL)
             column = np.asarray(local).reshape(6, -1)[:, body - 1]
             linear, angular = column[:3], column[3:]
             is_turn = bool(np.linalg.norm(angular) > 0.5)
@@ -405,7 +401,7 @@ class RobotModel:
     def _moved(self) -> Bool:
         """Spheres on the base, or centred on their only axes, never move."""
         postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
-        gain = [np.abs(self.sphere_jacobians(q)).max(axis=(1, 2)) for q in postures]
+        gain = [np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures]
         return np.asarray(np.max(gain, axis=0) > 1e-9)
 
     def _lever_arms(self) -> Float64:

@@ -49,7 +49,7 @@ class LinkSurface:
         self.triangles.addVertices(self.vertices)
         self.triangles.addTriangles(faces)
         self.triangles.endModel()
-        self._closed = [solid for solid in solids if solid.is_closed]
+        self._closed = [solid for solid in solids if solid.surface.is_closed]
         self._boxes = [(s.surface.vertices.min(axis=0), s.surface.vertices.max(axis=0)) for s in self._closed]
         self._depths: list[Depth] = []
 

@@ -67,7 +67,7 @@ def test_a_step_never_approaches_faster_than_its_row_allows() -> None:
     step = controller(wall).step(q, goal(0.0, 0.0))
     distance, gradient = wall.query(arm.sphere_centers(q))
     clearance = (distance - arm.sphere_set.radii)[1:]
-    rate = np.einsum("si,sij,j->s", gradient, arm.sphere_jacobians(q), step.velocity)[1:]
+    rate = np.einsum("si,sij,j->s", gradient, arm.spheres_at(q)[1], step.velocity)[1:]
     slack = sum(row.slack for row in step.relaxed)
     assert np.all(rate >= -CONFIG.barrier_gain * (clearance - CONFIG.margin) - slack - 1e-5)
     assert step.clearance == pytest.approx(clearance.min()) and step.nearest == "fore[1]"
@@ -81,7 +81,7 @@ def test_a_sphere_within_the_margin_is_pushed_back_out() -> None:
     wall = Plane([0.0, -1.0, 0.0], -(ahead + 0.005))  # 5 mm of clearance, 15 mm short of the margin
     step = controller(wall).step(q, goal(0.6, 0.6))
     assert step.rung is Rung.SOLVED
-    lifted = arm.sphere_jacobians(q)[4, 1] @ step.velocity
+    lifted = arm.spheres_at(q)[1][4, 1] @ step.velocity
     assert lifted == pytest.approx(-CONFIG.barrier_gain * 0.015, abs=1e-4)
 
 

@@ -142,10 +142,17 @@ def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.generic]:
     return np.asarray(array, order="C")
 
 
-_DOCS = """
+ENTRIES = (
+    GridFormat(
+        name="npz",
+        order=0,
+        suffix=".npz",
+        write=write_npz,
+        describe=describe_npz,
+        read=read_npz,
+        docs="""
 `npz` | `field.npz`: `origin` (3,) and `voxel` () float64, `header` (JSON text), an array a channel, (X, Y, Z) or
     (X, Y, Z, 3), z fastest | this tool, `numpy.load` | NumPy 2.4.6, every value | 1.7 s, 16 MiB
-"""
-ENTRIES = (
-    GridFormat(name="npz", order=0, suffix=".npz", write=write_npz, describe=describe_npz, read=read_npz, docs=_DOCS),
+""",
+    ),
 )

@@ -90,12 +90,6 @@ def describe_curobo(path: Path, head: bytes) -> Summary | None:
     return Summary(path=str(path), kind="cuRobo voxel grid", facts=facts)
 
 
-_CUROBO_DOCS = """
-`curobo` | `field.curobo.npz`: `features`, `dims`, `voxel_size`, `pose`, `shape` | NVIDIA cuRobo, by the lines
-    below | its index arithmetic; cuRobo not tried | 1.1 s, 48 MiB (one channel)
-"""
-
-
 FIELDS = ("resolution", "size_x", "size_y", "size_z", "origin_x", "origin_y", "origin_z")
 MOVEIT_MARGIN = 1e-6  # [cells] by which a size is larger, so that no rounding truncates it to a cell less
 REACH = np.sqrt(3.0) / 2.0  # [cells] from a centre to a corner
@@ -161,11 +155,6 @@ def describe_moveit(path: Path, head: bytes) -> Summary | None:
     return Summary(path=str(path), kind="MoveIt distance field", facts=facts)
 
 
-_MOVEIT_DOCS = """
-`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2 | a
-    reader that follows its source; MoveIt not tried | 0.4 s, 16 MiB (one channel)
-"""
-
 ENTRIES = (
     GridFormat(
         name="curobo",
@@ -175,7 +164,10 @@ ENTRIES = (
         describe=describe_curobo,
         holds_unknown=False,
         bytes_per_cell=4,
-        docs=_CUROBO_DOCS,
+        docs="""
+`curobo` | `field.curobo.npz`: `features`, `dims`, `voxel_size`, `pose`, `shape` | NVIDIA cuRobo, by the lines
+    below | its index arithmetic; cuRobo not tried | 1.1 s, 48 MiB (one channel)
+""",
     ),
     GridFormat(
         name="moveit",
@@ -185,6 +177,9 @@ ENTRIES = (
         describe=describe_moveit,
         needs=frozenset({"bound", "hard"}),
         bytes_per_cell=0,
-        docs=_MOVEIT_DOCS,
+        docs="""
+`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2 | a
+    reader that follows its source; MoveIt not tried | 0.4 s, 16 MiB (one channel)
+""",
     ),
 )

@@ -197,10 +197,17 @@ def describe_vti(path: Path, head: bytes) -> Summary | None:
 _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
 
 
-_DOCS = """
+ENTRIES = (
+    GridFormat(
+        name="vti",
+        order=1,
+        suffix=".vti",
+        write=write_vti,
+        describe=describe_vti,
+        read=read_vti,
+        docs="""
 `vti` | `field.vti`: ImageData, points at the cell centres; the header is a string in the field data | ParaView,
     VTK | VTK 9.7.2, every value; ParaView not tried | 3.2 s, 48 MiB
-"""
-ENTRIES = (
-    GridFormat(name="vti", order=1, suffix=".vti", write=write_vti, describe=describe_vti, read=read_vti, docs=_DOCS),
+""",
+    ),
 )

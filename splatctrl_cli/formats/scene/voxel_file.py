@@ -106,7 +106,7 @@ def read_seen(path: Path) -> SeenVoxels | None:
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
-        arrays = read_arrays(path, ("last_seen", *_edges_in(header)), most=2 * MOST_VOXELS + _MOST_EDGES)
+        arrays = read_arrays(path, ("last_seen", *({"edges"} & header.keys())), most=2 * MOST_VOXELS + _MOST_EDGES)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
         return SeenVoxels(
             origin=np.array(header["origin"], np.float64),
@@ -135,7 +135,8 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
-        arrays = read_arrays(path, (*_GRID, *_EVIDENCE, *_edges_in(header)), most=22 * MOST_VOXELS + _MOST_EDGES)
+        names = (*_GRID, *_EVIDENCE, *({"edges"} & header.keys()))
+        arrays = read_arrays(path, names, most=22 * MOST_VOXELS + _MOST_EDGES)
         grid = _grid_of(arrays, header)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
         last_seen = _last_seen(arrays["last_seen"], header, len(stamps_ns))
@@ -195,10 +196,6 @@ def _balls(arrays: Arrays, voxel: float) -> Balls:
     if not np.isfinite(centers).all():
         raise ValueError("unrepresented: expected finite centres")
     return Balls.of_voxels(centers, voxel, labels)
-
-
-def _edges_in(header: Mapping[str, Any]) -> set[str]:
-    return {"edges"} & header.keys()
 
 
 def _edges(arrays: Arrays) -> LostEdges:

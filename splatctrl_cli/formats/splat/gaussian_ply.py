@@ -210,14 +210,18 @@ def _harmonics(ply: PlyFile) -> Float32:
     return np.ascontiguousarray(np.array(values).transpose(2, 1, 0))
 
 
-_DOCS = """
+_PLY = SplatFormat(
+    name="3D-GS PLY",
+    order=0,
+    suffix=".ply",
+    write=write_gaussian_ply,
+    read=read_gaussian_ply,
+    docs="""
 `.ply`, short | 3D-GS PLY with `label` and `density`, for isotropic splats | float32 | view-dependent colour
 
 `.ply`, full | 3D-GS PLY, the reference's 62 properties | float32 | density; labels (kept as a 63rd property
     unless `--layout full`)
-"""
-_PLY = SplatFormat(
-    name="3D-GS PLY", order=0, suffix=".ply", write=write_gaussian_ply, read=read_gaussian_ply, docs=_DOCS
+""",
 )
 REFERENCE_PLY = replace(
     _PLY,

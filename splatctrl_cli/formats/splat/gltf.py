@@ -213,15 +213,17 @@ def _gaussians(path: Path, attributes: Mapping[str, int], table: Callable[[int, 
     )
 
 
-_DOCS = """
+ENTRIES = (
+    SplatFormat(
+        name="glTF with KHR_gaussian_splatting",
+        order=3,
+        suffix=".glb",
+        write=write_glb,
+        read=read_gltf,
+        docs="""
 `.glb` | glTF 2.0 with
     [KHR_gaussian_splatting](https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting)
     | float32 | density
-"""
-
-
-ENTRIES = (
-    SplatFormat(
-        name="glTF with KHR_gaussian_splatting", order=3, suffix=".glb", write=write_glb, read=read_gltf, docs=_DOCS
+""",
     ),
 )

@@ -13,7 +13,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
-from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
+from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
@@ -21,7 +21,7 @@ from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
 from splatctrl_cli.field.unknown import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
-from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
+from splatctrl_cli.formats.grid.grid_format import CHANNELS, GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
 from splatctrl_cli.jobs.bake.accuracy import (
     SUMMARY_METRICS,

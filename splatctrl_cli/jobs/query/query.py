@@ -93,7 +93,7 @@ class SceneAnswers:
         self._exact: SphereField | OnDevice
         self._field: DistanceField
         if device is None:
-            self._exact = SphereField.over(self._spheres, threads=threads)
+            self._exact = SphereField(self._spheres, threads=threads)
             self._field = field_over(self._spheres, config.field, threads=threads)
         else:
             self._exact = OnDevice(self._spheres, replace(config.field, distance="hard"), device)
@@ -160,7 +160,7 @@ class GridAnswers:
 
     def at(self, points: Float64) -> Answers:
         """Answer at points (Q, 3) [m], world; none outside the box of cell centres."""
-        inside = self._field.contains(points)
+        inside = self._field.box.contains(points)
         distance, gradient = self._field.query(points)
         probability = None if self._probability is None else self._probability.query(points)[0]
         return Answers(

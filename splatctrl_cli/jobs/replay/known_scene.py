@@ -240,9 +240,13 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
     chosen = obstacles.splats
     spheres = Spheres.of(chosen.centers, chosen.radii)
     people = chosen.labels == Label.HUMAN
-    human = SphereField(chosen.centers[people], chosen.radii[people], threads=threads) if people.any() else None
+    human = (
+        SphereField(Spheres.of(chosen.centers[people], chosen.radii[people]), threads=threads)
+        if people.any()
+        else None
+    )
     barrier = guarded(field_over(spheres, config.field, threads=threads), human, config.control)
-    exact = SphereField.over(spheres, threads=threads)
+    exact = SphereField(spheres, threads=threads)
     balls = BallDistance(of_points=_distance(exact), centers=chosen.centers, radii=chosen.radii)
     return KnownFields(
         barrier=barrier,
@@ -265,7 +269,7 @@ def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction 
     centers, radii = obstacles.splats.centers[is_splat], obstacles.splats.radii[is_splat]
     if not len(radii):
         return lambda points: np.full(len(points), np.inf)
-    field = SphereField(centers, radii, threads=threads)
+    field = SphereField(Spheres.of(centers, radii), threads=threads)
     return BallDistance(of_points=_distance(field), centers=centers, radii=radii)
 
 

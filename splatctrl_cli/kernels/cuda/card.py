@@ -91,21 +91,18 @@ class CudaDevice:
         with _named_faults():
             for count in (1, MANY):
                 builder = self._device.create_graph_builder().begin_building()
-                self._queue(builder, [*launches] * count)
+                self.queue([*launches] * count, builder)
                 graphs[count] = builder.end_building().complete()
                 graphs[count].upload(self._stream)
         return CudaGraph(graphs, self._stream)
 
-    def queue(self, launches: Sequence[Launch]) -> None:
-        """Queue launches singly, for tools that inspect each."""
-        self._queue(self._stream, launches)
-
-    def _queue(self, target: Any, launches: Sequence[Launch]) -> None:
+    def queue(self, launches: Sequence[Launch], target: Any = None) -> None:
+        """Queue launches singly, for tools that inspect each, or in the `target` of a graph."""
         for one in launches:
             config = LaunchConfig(grid=one.grid, block=one.block)
             if one.source not in self._codes:
                 self._codes[one.source] = compiled(self.capability, source=one.source)
-            launch(target, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
+            launch(target or self._stream, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
 
     def seconds(self, graph: Graph, num_times: int) -> float:
         """Mean time of a replay on the device."""

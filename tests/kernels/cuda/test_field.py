@@ -39,8 +39,8 @@ def device_field(
     **choice: object,
 ) -> DeviceField:
     chosen: dict[str, object] = {"kernel": kernels[0] if kernels else None, "resolution": RESOLUTION, **choice}
-    terms = {name: KINDS[name].over(of, config).terms() for name in kernels}
-    return DeviceField(memory, of.points.clusters, SphereField.over(of).radii, terms, Choice(**chosen))  # type: ignore[arg-type]
+    terms = {name: KINDS[name](of, config).terms() for name in kernels}
+    return DeviceField(memory, of.points.clusters, SphereField(of).radii, terms, Choice(**chosen))  # type: ignore[arg-type]
 
 
 def span_of(of: Spheres, box: Box, voxel: float, first: int = 0, last: int | None = None) -> tuple[GridSpan, Float64]:
@@ -63,9 +63,9 @@ def by_processor(of: Spheres, config: FieldConfig, span: GridSpan, name: str) ->
     distance = np.zeros(span.shape_of_channel, np.float32)
     gradient = np.zeros((*distance.shape, 3), np.float32)
     if name == "hard":
-        native.bake_hard(of.points.clusters, SphereField.over(of).radii, span, distance, gradient)
+        native.bake_hard(of.points.clusters, SphereField(of).radii, span, distance, gradient)
     else:
-        KINDS[name].over(of, config).bake_raw(span, distance, gradient, threads=1)
+        KINDS[name](of, config).bake_raw(span, distance, gradient, threads=1)
     return distance, gradient
 
 
@@ -158,13 +158,13 @@ def test_points_are_answered_as_by_the_processor(num: int, device: Memory) -> No
     points = np.concatenate([queries(200), 3.0 * queries(40, seed=2), cloud(num)[0][:4]])
     field = device_field(device, of, config)
     found = field.query(points, of.points.anchor, ALL)
-    hard, _ = SphereField.over(of).query(points)
+    hard, _ = SphereField(of).query(points)
     np.testing.assert_allclose(found.hard, hard, rtol=1e-5, atol=1e-6)
-    nearest = SphereField.over(of).nearest(points)
+    nearest = SphereField(of).nearest(points)
     assert found.entry is not None
     assert np.mean(of.points.source[found.entry] == nearest) > 0.99
     for name, kind in KINDS.items():
-        raw, raw_slope = kind.over(of, config).query_raw(points)
+        raw, raw_slope = kind(of, config).query_raw(points)
         raw[np.isnan(raw)] = hard[np.isnan(raw)]
         np.testing.assert_allclose(found.kernels[name], raw, rtol=1e-5, atol=2e-6)
         single = device_field(device, of, config, (name,), is_single=True).query(points, of.points.anchor)
@@ -250,7 +250,7 @@ def test_a_certified_bound_never_exceeds_the_exact_distance_of_the_processor(dev
     baker.bake(0, layout.shape[0], planes)
     field = GridField(DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header={}))
     points = rng.uniform(layout.box.lower - 0.1, layout.box.upper + 0.1, (1_000_000, 3))
-    exact = SphereField(*cloud(NUM), threads=2).query(points)[0]
+    exact = SphereField(Spheres.of(*cloud(NUM)), threads=2).query(points)[0]
     gap = exact - field.certified(points)
     assert gap.min() >= 0.0
     assert gap.min() < 0.01  # it comes near
@@ -263,7 +263,7 @@ def test_a_field_on_a_device_answers_as_that_of_the_processor(device: Memory) ->
         field = OnDevice.of(*cloud(NUM), named, device)
         found, expected = field.distance(points), make_field(*cloud(NUM), named).query(points)[0]
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2 * config.truncation)
-        np.testing.assert_array_equal(field.nearest(points), SphereField(*cloud(NUM)).nearest(points))
+        np.testing.assert_array_equal(field.nearest(points), SphereField(Spheres.of(*cloud(NUM))).nearest(points))
         np.testing.assert_array_equal(field.query(points)[0], found)
         assert len(field.query(points[:0])[0]) == len(field.distance(points[:0])) == 0
         assert len(field.nearest(points[:0])) == 0
