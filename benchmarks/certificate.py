@@ -14,7 +14,7 @@ from benchmarks.measure import Limit, Options, Result
 from benchmarks.surfaces import exact_distance, random_balls, shapes, splats_on
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid, Float64
 from tests.field.scenes import splat_set

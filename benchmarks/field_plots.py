@@ -12,7 +12,7 @@ from benchmarks.surfaces import Shape, exact_distance, lone_splat, points_around
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceField, Float64
 from tests.field.scenes import splat_set

@@ -3,11 +3,8 @@
 from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from splatctrl_cli.kernels.chain import Chain
-from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.records import Bool, Float64, Floats, Integers, SphereSet
 
 
 class ArmModel(Protocol):
@@ -44,13 +41,13 @@ class ArmModel(Protocol):
 
     def lever_arms(self) -> Float64: ...
 
-    def self_pairs(self) -> NDArray[np.integer]: ...
+    def self_pairs(self) -> Integers: ...
 
     def surface_gaps(
         self,
         positions: Float64,
-        centers: NDArray[np.floating],
-        radii: NDArray[np.floating],
+        centers: Floats,
+        radii: Floats,
         links: Collection[str] | None = None,
     ) -> Mapping[str, Float64]: ...
 

@@ -10,7 +10,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
@@ -19,7 +18,7 @@ from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind, is_imm
 from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, held, is_usable
 from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
-from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +104,7 @@ class RowBuilder:
         binds = np.concatenate([can_bind(b.G, b.h, *state.box) for b in barriers])
         return Rows(barriers=barriers, margin=self._margin, is_fixed=is_fixed, in_qp=binds & ~is_fixed)
 
-    def cut(self, rows: Rows, state: State, velocity: Float64, chosen: NDArray[np.integer]) -> Rows:
+    def cut(self, rows: Rows, state: State, velocity: Float64, chosen: Integers) -> Rows:
         """Return the rows with a cut per `chosen` scene row (`SceneRows.cut`)."""
         cut = self.scene.cut(state, velocity, chosen, rows.external.distance)
         return replace(rows, cuts=cut if rows.cuts is None else rows.cuts.joined(cut))

@@ -20,11 +20,11 @@ from splatctrl_cli.control.terms import (
     BarrierTerm,
     Cost,
     CostTerm,
-    ReachGoal,
     RowKind,
     State,
     configured_weights,
     eliminated_weight,
+    reach_cost,
     standard_costs,
     summed,
 )
@@ -153,7 +153,7 @@ class QpIkController:
         costs = [term for term in terms if not isinstance(term, BarrierTerm)]
         home = np.asarray(model.middle if home is None else home, dtype=np.float64)
         self._costs: tuple[CostTerm, ...] = (*standard_costs(config, home), *costs)
-        self._reach = ReachGoal(weight=eliminated_weight(*configured_weights(config)))
+        self._reach_weight = eliminated_weight(*configured_weights(config))
 
     def with_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
         """Return the controller on a newer field; see `SceneRows.in_field`."""
@@ -193,11 +193,11 @@ class QpIkController:
         """Return the step of a view. Raises as `step`."""
         config, error, state, rows = self._config, view.error, view.state, view.rows
         rest = self._limits.rest(state.last_velocity)
-        costs = [term.rows(state) for term in self._costs]
+        costs = [cost(state) for cost in self._costs]
         if config.program == PRINTED:
             printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
             return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
-        costs.append(self._reach.rows(state))
+        costs.append(reach_cost(state.jacobian, state.reference, self._reach_weight))
         rows, choice, is_kept = self._descended(state, costs, rows)
         while np.any(newly := self._sticking_out(state, rows, choice)):
             state = replace(state, by_surface=state.by_surface | newly)

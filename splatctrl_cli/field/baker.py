@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, SeField, SphereField
+from splatctrl_cli.field.distance import KERNEL_OF, KERNELS, SphereField, device_field
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
-from splatctrl_cli.field.on_device import device_field
 from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels import field as native
@@ -61,15 +60,13 @@ class Baker:
         self.exact = SphereField(self.spheres, threads=threads)
         self.kernel_name = KERNEL_OF[config.distance]
         names = {self.kernel_name, *channels}
-        self.se = SeField(self.spheres, config, threads=threads) if "se" in names else None
-        self.gpdf = GpdfField(self.spheres, config, threads=threads) if "gpdf" in names else None
+        kinds = {name: kind for name, kind in KERNELS.items() if name in names}
+        self.kernels = {name: kind(self.spheres, config, threads=threads) for name, kind in kinds.items()}
         has_probability = "probability" in channels
         self.probability = make_probability(self.spheres, config, threads=threads) if has_probability else None
-        self.kernels: tuple[str, ...] = tuple(name for name in ("se", "gpdf") if name in names)
         self.counts = {f"{name}_{what}": 0 for name in self.kernels for what in ("without_value", "over_estimates")}
         self._occupancy, self._thresholds = occupancy, thresholds or OccupancyConfig()
-        fields = {name: field for name, field in (("se", self.se), ("gpdf", self.gpdf)) if field is not None}
-        self.on_device = None if device is None else device_field(self.spheres, fields, config, device)
+        self.on_device = None if device is None else device_field(self.spheres, self.kernels, config, device)
 
     def close(self) -> None:
         """Free a card's memory."""
@@ -178,9 +175,7 @@ class Baker:
         distance = np.zeros(span.shape_of_channel, np.float32)
         has_gradient = "gradient" in self.channels and name == self.kernel_name
         gradient = np.zeros((*distance.shape, 3), np.float32) if has_gradient else None
-        field = self.se if name == "se" else self.gpdf
-        assert field is not None
-        field.bake_raw(span, distance, gradient, threads=self.threads)
+        self.kernels[name].bake_raw(span, distance, gradient, threads=self.threads)
         return distance, gradient
 
     def _chosen(

@@ -6,11 +6,11 @@ A space-filling curve sorts points into clusters of 16, and these into groups of
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Offsets
-from splatctrl_cli.records import Box, Float32, Float64, UInt8
+from splatctrl_cli.records import Box, Float32, Float64, Floats, Index, UInt8
 
 _BITS = 10  # per coordinate of a Hilbert code
 _GROUPS = 8  # their number is a multiple of this
@@ -25,7 +25,7 @@ class ClusteredPoints:
     """
 
     anchor: Float64
-    source: NDArray[np.int64]
+    source: Index
     is_point: UInt8
     clusters: Clusters
 
@@ -34,22 +34,22 @@ class ClusteredPoints:
         """N."""
         return int(np.count_nonzero(self.is_point))
 
-    def relative(self, points_world: NDArray[np.floating]) -> Float32:
+    def relative(self, points_world: Floats) -> Float32:
         """Return world points (Q, 3) relative to the anchor."""
         return np.ascontiguousarray(points_world - self.anchor, dtype=np.float32)
 
-    def laid_out(self, values: NDArray[np.floating], *, spare: float) -> Float64:
+    def laid_out(self, values: Floats, *, spare: float) -> Float64:
         """Values (N,) -> (16 C,), `spare` without a point."""
         return np.where(self.is_point, np.asarray(values, dtype=np.float64)[self.source], spare)
 
-    def gathered(self, values: NDArray[np.float64]) -> Float64:
+    def gathered(self, values: Float64) -> Float64:
         """Values (16 C,) -> (N,)."""
         result = np.empty(self.num_points)
         is_point = self.is_point.view(np.bool_)
         result[self.source[is_point]] = values[is_point]
         return result
 
-    def offsets(self, values: NDArray[np.floating], *, spare: float = SPARE_OFFSET) -> Offsets:
+    def offsets(self, values: Floats, *, spare: float = SPARE_OFFSET) -> Offsets:
         """Lay out offsets (N,), with each cluster's and group's largest."""
         laid_out = self.laid_out(values, spare=spare).astype(np.float32)
         by_cluster = laid_out.reshape(-1, LANES).max(axis=1)
@@ -58,7 +58,7 @@ class ClusteredPoints:
         return Offsets(values=laid_out, maxima=np.concatenate([by_cluster, by_group]))
 
 
-def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None) -> ClusteredPoints:
+def cluster_points(points_world: Floats, frame: Box | None = None) -> ClusteredPoints:
     """Cluster points (N, 3) [m], N > 0.
 
     Anchor and curve follow `frame`, by default the points' box. With one frame, points of two sets keep order and
@@ -99,7 +99,7 @@ def _padded(count: int, multiple: int) -> int:
     return -(-count // multiple) * multiple
 
 
-def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np.int64]:
+def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> Index:
     """Places (N,) along a Hilbert curve, whose neighbours are near in space.
 
     Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004).
@@ -144,7 +144,7 @@ class Spheres:
         return cls(points=cluster_points(center_array, frame), radii=radius_array)
 
 
-def checked_points(points: NDArray[np.floating]) -> Float64:
+def checked_points(points: Floats) -> Float64:
     """Return points as float64. Raises InputError unless (Q, 3) and finite."""
     array = shaped_points(points)
     if not np.isfinite(array).all():
@@ -152,7 +152,7 @@ def checked_points(points: NDArray[np.floating]) -> Float64:
     return array
 
 
-def shaped_points(points: NDArray[np.floating]) -> Float64:
+def shaped_points(points: Floats) -> Float64:
     """Return points as float64. Raises InputError unless (Q, 3)."""
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:

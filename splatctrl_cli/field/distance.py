@@ -1,9 +1,9 @@
-"""Distance fields over splats: exact, kernel, and the smaller. Positive outside."""
+"""Distance fields over splats, on the processor or a card: exact, kernel, and the smaller. Positive outside."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,8 +12,11 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import MARCH_STEPS, SIGNED_CARE
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
+from splatctrl_cli.field.grid_cells import RESOLUTION
 from splatctrl_cli.field.weights import Kernel, Matern12, SquaredExponential, share_of_loss, weights_named
 from splatctrl_cli.kernels import field as native
+from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField
+from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import GridSpan, LogSumExp
 from splatctrl_cli.records import DistanceField, Float32, Float64
 
@@ -63,6 +66,12 @@ class LogSumExpField(ABC):
     @abstractmethod
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined."""
+
+    def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
+        """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
+        terms = self.terms()
+        bake = native.bake_matern if terms.is_matern else native.bake_gaussian
+        bake(self.spheres.points.clusters, terms, span, distance, gradient, threads=threads)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient as in `query_raw`, or the exact ones where those are undefined."""
@@ -116,10 +125,6 @@ class GpdfField(LogSumExpField):
             length=self.kernel.length,
             tolerance=self.share,
         )
-
-    def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
-        native.bake_matern(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
 class SeField(LogSumExpField):
@@ -188,10 +193,6 @@ class SeField(LogSumExpField):
             tolerance=self.tolerance,
         )
 
-    def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """See `GpdfField.bake_raw`."""
-        native.bake_gaussian(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
-
 
 class SafeField:
     """The smaller of the exact distance and a kernel field; exact where the kernel field is undefined.
@@ -244,11 +245,6 @@ def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Di
     return kernel if config.distance == name else SafeField(SphereField(spheres, threads=threads), kernel)
 
 
-def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> DistanceField:
-    """Make the field that ``config.distance`` names, over spheres (N, 3), (N,) [m]. Raises as `Spheres.of`."""
-    return field_over(Spheres.of(centers, radii), config, threads=threads)
-
-
 @dataclass(frozen=True, kw_only=True)
 class March:
     """Result of a march from Q points.
@@ -282,3 +278,56 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
         walked += np.where(direction.any(axis=1), length, 0.0)  # without a slope there is nowhere to go
         rest, gradient = field.query(hit)
     return March(distance=walked + rest, hit=hit, rest=rest)
+
+
+class OnDevice:
+    """The field that ``config.distance`` names, on a device."""
+
+    def __init__(self, spheres: Spheres, config: FieldConfig, device: Memory, *, threads: int = 1) -> None:
+        """The processor makes the weights. Raises OutOfMemory."""
+        self.spheres, kernel = spheres, KERNEL_OF[config.distance]
+        kernels = {} if kernel is None else {kernel: KERNELS[kernel](spheres, config, threads=threads)}
+        self.field = device_field(spheres, kernels, config, device)
+
+    @classmethod
+    def of(cls, centers: ArrayLike, radii: ArrayLike, config: FieldConfig, device: Memory) -> Self:
+        """Make the field over (N, 3), (N,) [m]. Raises as `Spheres.of`."""
+        return cls(Spheres.of(centers, radii), config, device)
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """Distance and gradient, as in `DistanceField.query`."""
+        if not len(points):
+            return np.zeros(0), np.zeros((0, 3))
+        found = self._asked(points, "gradient")
+        assert found.gradient is not None
+        return found.distance.astype(np.float64), found.gradient.astype(np.float64)
+
+    def distance(self, points: Float64) -> Float64:
+        """points (Q, 3) [m] -> distance (Q,) [m]."""
+        return self._asked(points).distance.astype(np.float64) if len(points) else np.zeros(0)
+
+    def nearest(self, points: Float64) -> NDArray[np.int64]:
+        """points (Q, 3) [m] -> index (Q,) of the sphere that gives the exact distance."""
+        if not len(points):
+            return np.zeros(0, np.int64)
+        found = self._asked(points, "entry")
+        assert found.entry is not None
+        return self.spheres.points.source[found.entry]
+
+    def _asked(self, points: Float64, *wanted: str) -> Answers:
+        return self.field.query(checked_points(points), self.spheres.points.anchor, wanted)
+
+    def close(self) -> None:
+        """Free the device's memory."""
+        self.field.close()
+
+
+def device_field(
+    spheres: Spheres, kernels: Mapping[str, LogSumExpField], config: FieldConfig, device: Memory
+) -> DeviceField:
+    """Put the exact distance and `kernels` on a device, for ``config.distance``."""
+    chosen = KERNEL_OF[config.distance]
+    choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
+    terms = {name: field.terms() for name, field in kernels.items()}
+    radii = spheres.points.offsets(spheres.radii)
+    return DeviceField(device, spheres.points.clusters, radii, terms, choice)

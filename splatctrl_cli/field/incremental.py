@@ -39,13 +39,11 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
         return Changes(mask=None, num_blocks=num_blocks, reason=reason)
     mask = np.zeros(shape, np.uint8)
     span = new.span(0, new.layout.shape[0])
-    for with_weights in (False, True)[: 1 if new.se is None else 2]:
+    for with_weights in (False, True) if "se" in new.kernels else (False,):
         both = _changed((before, after), (old, new), with_weights=with_weights)
         for changed, baker in zip(both, (old, new), strict=True):
-            offsets, length = baker.exact.radii, None
-            if with_weights and baker.se is not None:
-                offsets = baker.spheres.points.offsets(baker.se.unit * baker.se.weights.log_size)
-                length = baker.se.kernel.length
+            se = baker.kernels["se"] if with_weights else None
+            offsets, length = (baker.exact.radii, None) if se is None else (se.terms().offsets, se.kernel.length)
             if changed.any():
                 clusters = baker.spheres.points.clusters
                 native.touched_blocks(clusters, offsets, changed, length, span, mask, threads=baker.threads)
@@ -71,7 +69,7 @@ def counts_after(
 
 
 def _reason_for_all(old: Baker, new: Baker) -> str:
-    if new.gpdf is not None:
+    if "gpdf" in new.kernels:
         return "every splat reaches every cell of gpdf"
     if new.probability is not None and new.config.probability == "paper":
         return "every splat reaches every cell of the paper's probability"
@@ -106,10 +104,10 @@ def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.v
     centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0
     values: list[NDArray[np.floating | np.integer]] = [*centers.T, splats.radii[order], splats.labels[order]]
     if with_weights:
-        assert baker.se is not None
-        values.append(baker.se.weights.log_size[order])
-        if baker.se.weights.sign is not None:
-            values.append(baker.se.weights.sign[order])
+        weights = baker.kernels["se"].weights
+        values.append(weights.log_size[order])
+        if weights.sign is not None:
+            values.append(weights.sign[order])
     table = np.stack([*values, _ranks(centers)], axis=1, dtype=np.float64)
     return table.view(np.dtype((np.void, table.strides[0]))).ravel()
 

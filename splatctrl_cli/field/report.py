@@ -10,8 +10,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import NEAR_ONE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.field.distance import KERNELS
-from splatctrl_cli.field.grid_cells import RESOLUTION
-from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.field.grid_cells import RESOLUTION, exact_channel
 from splatctrl_cli.records import DistanceGrid, Float32
 from splatctrl_cli.voxels import VoxelState
 

@@ -4,12 +4,11 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_cdt, distance_transform_edt
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL
-from splatctrl_cli.records import Bool, Float32, Index, Label, SplatSet
+from splatctrl_cli.records import Bool, Float32, Index, Label, SplatSet, Values
 from splatctrl_cli.voxels import Balls
 
 DEFAULT_LABELS = frozenset({Label.OBJECT, Label.HUMAN})
@@ -88,10 +87,10 @@ BOUND = (
     "bound + bound_margin is the lesser of hard and the distance to never-seen cells at its centre"
 )
 
-Channels = dict[str, NDArray[np.generic]]
+Channels = dict[str, Values]
 
 
-def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Channels:
+def blank(channels: Mapping[str, Values], is_unknown: Bool) -> Channels:
     """Set distance, gradient, probability (X, Y, Z) to NaN where unknown."""
     blanked = dict(channels)
     for name in BLANKED:
@@ -143,7 +142,7 @@ class Cubes:
             away=self.away[first:last],
         )
 
-    def joined(self, channels: Mapping[str, NDArray[np.generic]], bound_margin: float) -> tuple[Channels, int]:
+    def joined(self, channels: Mapping[str, Values], bound_margin: float) -> tuple[Channels, int]:
         """Channels of the nearer of field and cubes, and the number of changed cells."""
         joined = dict(channels)
         is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))

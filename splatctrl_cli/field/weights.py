@@ -54,7 +54,8 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
     transformed = _transformed_kernel(sampled)
     alone = np.ones(len(centers), np.bool_)
     for first, near, own in meetings:
-        density = _convolved(_spread(cells[near] - first, share[near]), transformed)
+        mass = _spread(cells[near] - first, share[near])
+        density = irfftn(rfftn(mass) * transformed, s=mass.shape)  # circular: what wraps stays within reach of faces
         result[own] += _read(density, cells[own] - first, share[own])
         alone[own] = False
     result[alone] = 1.0
@@ -105,11 +106,6 @@ def _transformed_kernel(sampled: Float64) -> NDArray[np.complex128]:
     padded = np.zeros((NODES,) * 3)
     padded[:size, :size, :size] = sampled
     return np.asarray(rfftn(np.roll(padded, -(size // 2), axis=(0, 1, 2))))
-
-
-def _convolved(mass: Float64, transformed: NDArray[np.complex128]) -> Float64:
-    """Convolve circularly: what wraps stays within `reach` of faces."""
-    return np.asarray(irfftn(rfftn(mass) * transformed, s=mass.shape))
 
 
 def _corners(cells: Index, share: Float64) -> list[tuple[Index, Float64]]:

@@ -18,13 +18,12 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, ranges
 from splatctrl_cli.formats.unpacking import PIECE
 from splatctrl_cli.libraries import of_extra
-from splatctrl_cli.records import Stamps
+from splatctrl_cli.records import Array, Stamps, Values
 
 DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a place in it lies before its start
     *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError),
@@ -38,10 +37,10 @@ class Pieces:
 
     dtype: str
     shape: tuple[int, ...]
-    make: Callable[[], Iterable[NDArray[np.generic]]]
+    make: Callable[[], Iterable[Values]]
 
 
-def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, level: int = 6) -> None:
+def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) -> None:
     """Write as `np.savez_compressed`, at zlib's `level` (0: stored), one array at a time."""
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
@@ -57,7 +56,7 @@ def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, lev
                     np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
 
 
-def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, NDArray[np.generic]]:
+def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, Values]:
     """Read the arrays `names` (default: all) of a ``.npz``, at most `most` bytes together.
 
     Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or another size than
@@ -105,7 +104,7 @@ def check_numbers(dtype: np.dtype[Any]) -> None:
         raise ValueError("objects, expected numbers")
 
 
-def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> NDArray[np.generic]:
+def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> Values:
     shape, is_fortran, dtype = npy_head(member)
     check_numbers(dtype)
     size = prod(shape) * dtype.itemsize
@@ -120,11 +119,11 @@ def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> ND
         at += len(piece)
     if at < size or member.read(1):  # reading to the end is what checks the sum
         raise ValueError(f"{name}expected {size} bytes, got {'more' if at == size else at}")
-    values: NDArray[np.generic] = np.frombuffer(content, dtype) if size else np.zeros(0, dtype)
+    values: Values = np.frombuffer(content, dtype) if size else np.zeros(0, dtype)
     return values.reshape(shape, order="F" if is_fortran else "C")
 
 
-def npy_of(data: bytes) -> NDArray[np.generic]:
+def npy_of(data: bytes) -> Values:
     """The array of ``.npy`` bytes. Raises ValueError for objects, or another number of bytes than announced.
 
     `np.load` would allocate what the header announces.
@@ -149,7 +148,7 @@ class ArrayFile(ABC):
         """Shape and dtype, None if missing. Raises InputError if unreadable."""
 
     @abstractmethod
-    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+    def _blocks(self, name: str) -> Iterator[Array]:
         """Yield about `BLOCK` rows at a time. Raises InputError if unreadable."""
 
     def columns(self, names: Sequence[str]) -> Rows:
@@ -241,7 +240,7 @@ class NpzFile(ArrayFile):
         with self._opened(name) as (shape, dtype, _, _):
             return shape, dtype
 
-    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+    def _blocks(self, name: str) -> Iterator[Array]:
         """Yield the rows; an array stored by columns is read at once."""
         with self._opened(name) as (shape, dtype, is_by_columns, stream):
             if is_by_columns:
@@ -296,7 +295,7 @@ class Hdf5File(ArrayFile):
                 raise InputError(f"{self.path}: {name}: ragged: its rows differ in length", remedy=_RAGGED)
             return array.shape, array.dtype
 
-    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+    def _blocks(self, name: str) -> Iterator[Array]:
         with self._opened() as file:
             array = file[name]
             for first in range(0, array.shape[0], BLOCK):
@@ -336,7 +335,7 @@ class ParquetFile(ArrayFile):
         block = next(self._blocks(name), None)
         return ((0,), np.dtype(np.float64)) if block is None else ((self._num, *block.shape[1:]), block.dtype)
 
-    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+    def _blocks(self, name: str) -> Iterator[Array]:
         shape: tuple[int, ...] | None = None
         names = [name] if self._only is None else list(dict.fromkeys([name, self._only[0]]))
         with self._opened() as file:
@@ -350,7 +349,7 @@ class ParquetFile(ArrayFile):
                 if len(values):
                     yield values
 
-    def _values(self, column: Any, name: str) -> NDArray[Any]:
+    def _values(self, column: Any, name: str) -> Array:
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
         if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:

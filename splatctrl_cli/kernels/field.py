@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import Float32, Float64, Int32, UInt8, native, num_threads
+from splatctrl_cli.kernels import Float32, Float64, Int32, Int64, UInt8, native, num_threads
 
 LANES = 16
 BLOCK = 8  # cells of a block along each axis
@@ -59,7 +58,7 @@ class GridSpan:
         return (self.last - self.first, self.shape[1], self.shape[2])
 
     @property
-    def arrays(self) -> tuple[Float64, float, NDArray[np.int64], UInt8 | None]:
+    def arrays(self) -> tuple[Float64, float, Int64, UInt8 | None]:
         """Arguments of the kernels."""
         sizes = np.array([*self.shape, self.first, self.last], dtype=np.int64)
         return self.origin, self.voxel, sizes, self.mask

@@ -63,7 +63,7 @@ class Solids:
         object.__setattr__(self, "_packed", np.array([_packed(solid) for solid in self.solids]).reshape(-1, 16))
 
     def rows(self) -> tuple[Float64, Float64, Float64]:
-        """Return balls (., 4), boxes (., 15), rods (., 15) for `kernels.joint_edges.EdgeRoom`."""
+        """Return balls (., 4), boxes (., 15), rods (., 15) for `kernels.chain.EdgeRoom`."""
         balls, boxes, cylinders, capsules = (
             self._packed[self._packed[:, 0] == kind, 1:] for kind in (BALL, BOX, CYLINDER, CAPSULE)
         )

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
-from splatctrl_cli.records import Bool, Box, Float64, Index, SphereSet
+from splatctrl_cli.records import Bool, Box, Float64, Floats, Index, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import (
@@ -275,8 +274,8 @@ class RobotModel:
     def surface_gaps(
         self,
         positions: Float64,
-        centers: NDArray[np.floating],
-        radii: NDArray[np.floating],
+        centers: Floats,
+        radii: Floats,
         links: Collection[str] | None = None,
     ) -> dict[str, Float64]:
         """Return the signed gap (T,) [m] of each meshed link to the nearest ball.

@@ -5,13 +5,11 @@ K configurations in order of time, N cells.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from splatctrl_cli.records import Bool, Float32, Float64, Index, Stamps
+from splatctrl_cli.records import Array, Bool, Float32, Float64, Index, Stamps
 from splatctrl_cli.robot.self_model import ALWAYS
 
 VOXEL = 0.004  # [m]
@@ -151,7 +149,7 @@ def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence
     return np.where(is_robot[chosen, np.arange(len(chosen))], chosen, -1)
 
 
-def spread_cells(mask: Bool, values: NDArray[Any], rest: float) -> Float32:
+def spread_cells(mask: Bool, values: Array, rest: float) -> Float32:
     """Return a grid (X, Y, Z) of values (N,) in the mask and `rest` elsewhere."""
     grid = np.full(mask.shape, np.float32(rest))
     grid[mask] = values

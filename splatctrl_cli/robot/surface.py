@@ -20,9 +20,10 @@ from splatctrl_cli.kernels.surface_image import (
     SurfaceImage,
     SurfaceMesh,
     SurfaceScene,
+    TriangleTree,
+    better,
     render_surface,
 )
-from splatctrl_cli.kernels.triangles import TriangleTree, better
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Intrinsics, SphereSet
 from splatctrl_cli.robot.link_meshes import mesh_path, placed
 from splatctrl_cli.robot.urdf import Shape, UrdfFile, visual_urdf

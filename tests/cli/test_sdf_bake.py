@@ -13,7 +13,7 @@ from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.field.grid_cells import exact_channel
 from splatctrl_cli.formats.grid import grid_format, grid_formats
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
@@ -193,7 +193,7 @@ def test_the_field_that_is_updated_is_not_replaced(tmp_path: Path, splats: Path)
 def test_resume_goes_on_with_what_is_left(tmp_path: Path, splats: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = ["sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--formats", "npz"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("splatctrl_cli.field.header.label_counts", interrupt)
+        patch.setattr("splatctrl_cli.field.slabs.label_counts", interrupt)
         stopped = splatctrl(*given)
     assert stopped.returncode == 130
     assert f"field.partial is kept; continue it with: splatctrl sdf-bake --resume {splats} " in stopped.stderr

@@ -10,7 +10,7 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field import weights as weights_module
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, make_field
+from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, field_over
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.weights import METHODS
 from splatctrl_cli.records import Box
@@ -47,7 +47,7 @@ def test_every_length_scale_gives_finite_distances_or_is_refused_in_words(
     for length in LENGTHS:
         config = FieldConfig(distance=distance, weights=weights, length_scale=length, noise=1e-3)
         try:
-            found, gradient = make_field(centers, radii, config).query(points)
+            found, gradient = field_over(Spheres.of(centers, radii), config).query(points)
         except (UsageError, NotEvaluableError) as error:
             assert weights == "cg", (length, error)  # what is lumped can always be made
             assert "field.weights" in str(error)
@@ -76,7 +76,7 @@ def test_bad_splats_are_refused_by_every_field(distance: str) -> None:
         (centers[:0], radii[:0], "got none"),
     ):
         with pytest.raises((InputError, NotEvaluableError), match=words):
-            make_field(place, size, FieldConfig(distance=distance))
+            field_over(Spheres.of(place, size), FieldConfig(distance=distance))
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_bad_splats_are_refused_by_every_field(distance: str) -> None:
 )
 def test_bad_queries_are_named(distance: str, points: ArrayLike, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        make_field(*cloud(10), FieldConfig(distance=distance)).query(np.array(points))
+        field_over(Spheres.of(*cloud(10)), FieldConfig(distance=distance)).query(np.array(points))
 
 
 @pytest.mark.parametrize(

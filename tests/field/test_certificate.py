@@ -22,8 +22,7 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
-from splatctrl_cli.field.grid_cells import LOSS, check_loss
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import LOSS, GridField, check_loss
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid, Float64
 from tests.field.scenes import plane, splat_set

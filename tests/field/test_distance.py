@@ -15,7 +15,7 @@ from splatctrl_cli.field.distance import (
     SafeField,
     SeField,
     SphereField,
-    make_field,
+    field_over,
     march,
     normalised,
 )
@@ -30,7 +30,8 @@ TRUNCATION_BOUND = FieldConfig.truncation + 1e-6  # [m], and float32
 
 def fields(centers: np.ndarray, radii: np.ndarray) -> list[DistanceField]:
     """Every field of the configuration."""
-    return [make_field(centers, radii, FieldConfig(distance=name, length_scale=LENGTH)) for name in KERNEL_OF]
+    spheres = Spheres.of(centers, radii)
+    return [field_over(spheres, FieldConfig(distance=name, length_scale=LENGTH)) for name in KERNEL_OF]
 
 
 def test_an_isolated_sphere_is_as_far_as_it_is_and_the_gradient_points_away() -> None:
@@ -120,7 +121,7 @@ def test_safe_field_never_exceeds_the_exact_distance() -> None:
         SphereField(Spheres.of(centers, radii)).query(points)[0],
         GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH)).query(points)[0],
     )
-    safe, gradient = make_field(centers, radii, FieldConfig(distance="safe_gpdf")).query(points)
+    safe, gradient = field_over(Spheres.of(centers, radii), FieldConfig(distance="safe_gpdf")).query(points)
     assert (kernel > hard + 1e-3).any()
     assert (safe <= hard).all()
     np.testing.assert_array_equal(safe, np.minimum(hard, kernel))
@@ -145,7 +146,7 @@ def test_safe_in_one_walk_is_the_smaller_of_two_queries(largest: float, weights:
         smooth = SeField(Spheres.of(centers[:num], radii[:num]), FieldConfig(weights=weights)).query_raw(points)
         is_smooth = smooth[0] < exact[0]
         assert largest > 0.1 or (is_smooth.any() and not is_smooth.all())
-        distance, gradient = make_field(centers[:num], radii[:num], config).query(points)
+        distance, gradient = field_over(Spheres.of(centers[:num], radii[:num]), config).query(points)
         np.testing.assert_array_equal(distance, np.where(is_smooth, smooth[0], exact[0]))
         np.testing.assert_array_equal(gradient, np.where(is_smooth[:, None], smooth[1], exact[1]))
 

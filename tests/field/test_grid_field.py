@@ -5,7 +5,7 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid
 from tests.field.scenes import cloud, queries, splat_set

@@ -4,7 +4,7 @@ import pytest
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import make_field
+from splatctrl_cli.field.distance import field_over
 from splatctrl_cli.field.probability import (
     CalibratedProbability,
     PaperProbability,
@@ -77,7 +77,7 @@ def test_the_baked_channel_is_the_probability_at_the_cell_centres(form: str) -> 
     if form == "paper":
         expected = PaperProbability(Spheres.of(centers, radii), config).at(points, np.zeros(0))
     else:
-        found = make_field(centers, radii, config).query(points)[0]
+        found = field_over(Spheres.of(centers, radii), config).query(points)[0]
         expected = CalibratedProbability(sigma=config.error, mean=config.error_mean).of(found)
     np.testing.assert_allclose(values.ravel(), expected, atol=5e-3)  # 2e-5 m of truncation over 2 mm
     assert values.max() > 0.3

@@ -21,7 +21,6 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Summary
@@ -35,7 +34,7 @@ from splatctrl_cli.formats.grid.grid_format import (
     header_text,
     slabs,
 )
-from splatctrl_cli.records import Bool, DistanceGrid
+from splatctrl_cli.records import Bool, DistanceGrid, Values
 
 CUROBO = "0.7"  # the version that a file is for, as it says
 
@@ -55,7 +54,7 @@ def write_curobo(path: Path, grid: DistanceGrid) -> None:
         shape=(shape[0] * shape[1] * shape[2],),
         make=lambda: (-layers.astype(np.float32, copy=False) for layers in slabs(distances)),
     )
-    arrays: dict[str, NDArray[np.generic] | Pieces] = {
+    arrays: dict[str, Values | Pieces] = {
         "features": features,
         "dims": grid.voxel * sides,
         "voxel_size": np.asarray(grid.voxel, "<f8"),
@@ -124,7 +123,7 @@ def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
     """True (L, Y, Z) for cells written as occupied."""
     name, most = ("bound", 0.0) if "bound" in grid.channels else ("hard", REACH * grid.voxel + ROUNDING)
     reached = np.asarray(grid.channels[name][layers]) <= np.float32(most)
-    is_clear: NDArray[np.bool_] = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
+    is_clear: Bool = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
     return reached | ~is_clear
 
 

@@ -18,10 +18,8 @@ from splatctrl_cli.config.fixed import CARD_LEAST_TABLE, MARCH_STEPS
 from splatctrl_cli.control.audit import observed_at
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import SphereField, field_over, march
-from splatctrl_cli.field.grid_cells import check_room
-from splatctrl_cli.field.grid_field import GridField
-from splatctrl_cli.field.on_device import OnDevice
+from splatctrl_cli.field.distance import OnDevice, SphereField, field_over, march
+from splatctrl_cli.field.grid_cells import GridField, check_room
 from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.field.unknown import DEFAULT_LABELS, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Parts, Stopwatch, output_path

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEXT_SCENE_NS
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_at
+from splatctrl_cli.control.barriers import SceneStep, guarded
 from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
-from splatctrl_cli.control.scene_field import SceneStep, guarded
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField, field_over
-from splatctrl_cli.field.grid_field import GridField, exact_channel
+from splatctrl_cli.field.grid_cells import GridField, exact_channel
 from splatctrl_cli.field.unknown import NO_SPLAT, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz

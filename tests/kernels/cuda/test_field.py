@@ -8,10 +8,8 @@ import pytest
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import GpdfField, SeField, SphereField, make_field
-from splatctrl_cli.field.grid_cells import RESOLUTION, GridLayout
-from splatctrl_cli.field.grid_field import GridField
-from splatctrl_cli.field.on_device import OnDevice
+from splatctrl_cli.field.distance import GpdfField, OnDevice, SeField, SphereField, field_over
+from splatctrl_cli.field.grid_cells import RESOLUTION, GridField, GridLayout
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.field import Choice, DeviceField
 from splatctrl_cli.kernels.cuda.memory import Memory
@@ -261,7 +259,7 @@ def test_a_field_on_a_device_answers_as_that_of_the_processor(device: Memory) ->
     for distance in ("safe", "hard", "gpdf"):
         named = replace(config, distance=distance)
         field = OnDevice.of(*cloud(NUM), named, device)
-        found, expected = field.distance(points), make_field(*cloud(NUM), named).query(points)[0]
+        found, expected = field.distance(points), field_over(Spheres.of(*cloud(NUM)), named).query(points)[0]
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2 * config.truncation)
         np.testing.assert_array_equal(field.nearest(points), SphereField(Spheres.of(*cloud(NUM))).nearest(points))
         np.testing.assert_array_equal(field.query(points)[0], found)
