@@ -15,8 +15,6 @@ from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Bool, Float64, Floats, Index, Integers, Stamps, UInt8
 
-Channel = UInt8
-
 DistanceFunction = Callable[[Float64], Float64]
 """points (Q, 3) [m], world -> distance (Q,) [m], NaN where there is none."""
 
@@ -36,7 +34,7 @@ class BallDistance:
 DistancesAt = Callable[[int], Mapping[str, DistanceFunction]]
 """The distances known at a stamp [ns], by name; the same object for the same scene, so that states share a query."""
 
-Observed = Callable[[Float64], Channel]
+Observed = Callable[[Float64], UInt8]
 """points (Q, 3) [m], world -> the observed channel (Q,) uint8: 0 = never seen."""
 
 CHUNK = 256  # states per query
@@ -150,7 +148,7 @@ def audit(
     )
 
 
-def observed_at(seen: Channel, origin: Float64, voxel: float, points: Float64) -> Channel:
+def observed_at(seen: UInt8, origin: Float64, voxel: float, points: Float64) -> UInt8:
     """Return the value (Q,) of the voxel of `seen` (X, Y, Z) nearest to each point; 0 (never seen) outside."""
     cell = np.floor((points - origin) / voxel + 0.5).astype(np.int64)
     is_inside = np.all((cell >= 0) & (cell < seen.shape), axis=1)

@@ -80,7 +80,7 @@ class Baker:
         Half a cell's diagonal (hard is 1-Lipschitz), plus float32 rounding.
         """
         box = self.layout.box
-        reach = np.abs(self.spheres.points.clusters.centers[:, self.spheres.points.is_point.view(np.bool_)]).max()
+        reach = np.abs(self.spheres.clusters.centers[:, self.spheres.is_point.view(np.bool_)]).max()
         size = float(np.abs(box.upper - box.lower).max()) + float(reach)
         return HALF_DIAGONAL * self.layout.voxel + 1e-6 + 1e-6 * size
 
@@ -103,7 +103,7 @@ class Baker:
 
     def span(self, first: int, last: int, mask: UInt8 | None = None) -> GridSpan:
         """Cells of x-planes [first, last), in the spheres' frame."""
-        origin = self.layout.origin - self.spheres.points.anchor
+        origin = self.layout.origin - self.spheres.anchor
         return GridSpan(
             origin=origin, voxel=self.layout.voxel, shape=self.layout.shape, first=first, last=last, mask=mask
         )
@@ -125,7 +125,7 @@ class Baker:
             whole[... if where is None else where] = made["sdf"]
             made["probability"] = _picked(self.probability.baked(span, whole, threads=self.threads), cells)
         if entry is not None:
-            made["label"] = self.labels[self.spheres.points.source[entry]]
+            made["label"] = self.labels[self.spheres.source[entry]]
         if "observed" in self.channels:
             observed = observed_planes(self._occupancy, self.layout, self._thresholds, span.first, span.last)
             made["observed"] = _picked(observed, cells)
@@ -166,9 +166,7 @@ class Baker:
         hard = np.zeros(span.shape_of_channel, np.float32)
         gradient = np.zeros((*hard.shape, 3), np.float32) if "gradient" in self.channels else None
         entry = np.zeros(hard.shape, np.int32) if "label" in self.channels else None
-        native.bake_hard(
-            self.spheres.points.clusters, self.exact.radii, span, hard, gradient, entry, threads=self.threads
-        )
+        native.bake_hard(self.spheres.clusters, self.exact.radii, span, hard, gradient, entry, threads=self.threads)
         return hard, gradient, entry
 
     def _kernel(self, name: str, span: GridSpan) -> tuple[Float32, Float32 | None]:

@@ -17,10 +17,10 @@ _GROUPS = 8  # their number is a multiple of this
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClusteredPoints:
-    """N points as C clusters, relative to an anchor.
+class Spheres:
+    """N spheres, their centres as C clusters, relative to an anchor; radii (N,) [m].
 
-    float32 then keeps 0.1 um within a metre or two. anchor (3,) [m], world; source (16 C,): point of each entry;
+    float32 then keeps 0.1 um within a metre or two. anchor (3,) [m], world; source (16 C,): sphere of each entry;
     is_point (16 C,): 0 if spare.
     """
 
@@ -28,6 +28,32 @@ class ClusteredPoints:
     source: Index
     is_point: UInt8
     clusters: Clusters
+    radii: Float64
+
+    @classmethod
+    def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
+        """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
+
+        Anchor and curve follow `frame`, by default the centres' box. With one frame, centres of two sets keep order
+        and coordinates to the bit. Raises NotEvaluableError without any, InputError for a wrong shape, a value not
+        finite, or a negative radius.
+        """
+        points, radius_array = _checked(centers, radii)
+        lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
+        anchor = 0.5 * (lower + upper)
+        codes = _hilbert_codes(points, lower, float((upper - lower).max()))
+        order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], codes))
+        source = np.zeros(LANES * _padded(-(-len(points) // LANES), LANES), dtype=np.int64)
+        source[: len(order)] = order
+        relative = np.full((len(source), 3), SPARE_PLACE, dtype=np.float32)
+        relative[: len(order)] = (points - anchor)[order]
+        return cls(
+            anchor=anchor,
+            source=source,
+            is_point=(np.arange(len(source)) < len(order)).astype(np.uint8),
+            clusters=Clusters(centers=np.ascontiguousarray(relative.T), boxes=_boxes(relative, len(order))),
+            radii=radius_array,
+        )
 
     @property
     def num_points(self) -> int:
@@ -56,30 +82,6 @@ class ClusteredPoints:
         by_group = np.full(_padded(len(by_cluster) // LANES, _GROUPS), spare, np.float32)
         by_group[: len(by_cluster) // LANES] = by_cluster.reshape(-1, LANES).max(axis=1)
         return Offsets(values=laid_out, maxima=np.concatenate([by_cluster, by_group]))
-
-
-def cluster_points(points_world: Floats, frame: Box | None = None) -> ClusteredPoints:
-    """Cluster points (N, 3) [m], N > 0.
-
-    Anchor and curve follow `frame`, by default the points' box. With one frame, points of two sets keep order and
-    coordinates to the bit.
-    """
-    points = np.asarray(points_world, dtype=np.float64)
-    lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
-    anchor = 0.5 * (lower + upper)
-    codes = _hilbert_codes(points, lower, float((upper - lower).max()))
-    order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], codes))
-    num_clusters = _padded(-(-len(points) // LANES), LANES)
-    source = np.zeros(LANES * num_clusters, dtype=np.int64)
-    source[: len(order)] = order
-    relative = np.full((len(source), 3), SPARE_PLACE, dtype=np.float32)
-    relative[: len(order)] = (points - anchor)[order]
-    return ClusteredPoints(
-        anchor=anchor,
-        source=source,
-        is_point=(np.arange(len(source)) < len(order)).astype(np.uint8),
-        clusters=Clusters(centers=np.ascontiguousarray(relative.T), boxes=_boxes(relative, len(order))),
-    )
 
 
 def _boxes(relative: Float32, num_points: int) -> Float32:
@@ -124,24 +126,6 @@ def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> Index:
         for axis in range(3):
             codes |= ((cells[axis] >> bit) & 1) << (3 * bit + 2 - axis)
     return codes
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spheres:
-    """N spheres: clustered centres, radii (N,) [m]."""
-
-    points: ClusteredPoints
-    radii: Float64
-
-    @classmethod
-    def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
-        """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
-
-        Raises NotEvaluableError without any, InputError for a wrong shape, a value not finite, or a negative
-        radius.
-        """
-        center_array, radius_array = _checked(centers, radii)
-        return cls(points=cluster_points(center_array, frame), radii=radius_array)
 
 
 def checked_points(points: Floats) -> Float64:

@@ -13,7 +13,7 @@ from splatctrl_cli.config.fixed import MARCH_STEPS, SIGNED_CARE
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.grid_cells import RESOLUTION
-from splatctrl_cli.field.weights import Kernel, Matern12, SquaredExponential, share_of_loss, weights_named
+from splatctrl_cli.field.weights import METHODS, Kernel, Matern12, SquaredExponential, share_of_loss
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField
 from splatctrl_cli.kernels.cuda.memory import Memory
@@ -31,19 +31,19 @@ class SphereField:
 
     def __init__(self, spheres: Spheres, *, threads: int = 1) -> None:
         self.spheres, self._threads = spheres, threads
-        self.radii = spheres.points.offsets(spheres.radii)
+        self.radii = spheres.offsets(spheres.radii)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient, as in `DistanceField.query`; zero gradient at a centre."""
-        local = self.spheres.points.relative(checked_points(points))
-        score, gradient, _ = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)
+        local = self.spheres.relative(checked_points(points))
+        score, gradient, _ = native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the distance."""
-        local = self.spheres.points.relative(checked_points(points))
-        entry = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)[2]
-        return self.spheres.points.source[entry]
+        local = self.spheres.relative(checked_points(points))
+        entry = native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]
+        return self.spheres.source[entry]
 
 
 class LogSumExpField(ABC):
@@ -54,9 +54,9 @@ class LogSumExpField(ABC):
     def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
         self.spheres, self._threads = spheres, threads
         self.kernel = self.kernel_type(config.length_scale)
-        self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
+        self.weights = METHODS[config.weights](spheres, self.kernel, config.noise, threads)
         sign = self.weights.sign
-        self.sign = None if sign is None else spheres.points.laid_out(sign, spare=1.0).astype(np.float32)
+        self.sign = None if sign is None else spheres.laid_out(sign, spare=1.0).astype(np.float32)
         self.tolerance = config.truncation * (1.0 if sign is None else SIGNED_CARE)
 
     @abstractmethod
@@ -71,11 +71,16 @@ class LogSumExpField(ABC):
         """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
         terms = self.terms()
         bake = native.bake_matern if terms.is_matern else native.bake_gaussian
-        bake(self.spheres.points.clusters, terms, span, distance, gradient, threads=threads)
+        bake(self.spheres.clusters, terms, span, distance, gradient, threads=threads)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient as in `query_raw`, or the exact ones where those are undefined."""
-        return or_exact(self.query_raw(points), self.spheres, points)
+        distance, gradient = self.query_raw(points)
+        has_none = np.isnan(distance)
+        if has_none.any():
+            exact = SphereField(self.spheres)
+            distance[has_none], gradient[has_none] = exact.query(np.asarray(points, dtype=np.float64)[has_none])
+        return distance, gradient
 
 
 class GpdfField(LogSumExpField):
@@ -94,7 +99,7 @@ class GpdfField(LogSumExpField):
         self.offsets = spheres.radii + self.kernel.length * self.weights.log_size
         # Float32 keeps the differences to the micrometre: the largest offset is added at the end, in float64.
         self._common = float(self.offsets.max())
-        self._offsets = spheres.points.offsets(self.offsets - self._common)
+        self._offsets = spheres.offsets(self.offsets - self._common)
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined.
@@ -102,25 +107,23 @@ class GpdfField(LogSumExpField):
         ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this,
         normalised (`normalised`).
         """
-        points_ = self.spheres.points
         score, gradient = native.matern(
-            points_.clusters,
+            self.spheres.clusters,
             self._offsets,
             self.sign,
             self.kernel.length,
             self.share,
-            points_.relative(checked_points(points)),
+            self.spheres.relative(checked_points(points)),
             threads=self._threads,
         )
         return score.astype(np.float64) - self._common, gradient.astype(np.float64)
 
     def terms(self) -> LogSumExp:
-        points = self.spheres.points
         return LogSumExp(
             is_matern=True,
-            offsets=points.offsets(self.offsets),
-            exact=points.laid_out(self.offsets, spare=native.SPARE_OFFSET),
-            radii=points.laid_out(self.spheres.radii, spare=0.0).astype(np.float32),
+            offsets=self.spheres.offsets(self.offsets),
+            exact=self.spheres.laid_out(self.offsets, spare=native.SPARE_OFFSET),
+            radii=self.spheres.laid_out(self.spheres.radii, spare=0.0).astype(np.float32),
             sign=self.sign,
             length=self.kernel.length,
             tolerance=self.share,
@@ -142,38 +145,36 @@ class SeField(LogSumExpField):
         self.unit = 2.0 * self.kernel.length**2
         log_size = self.weights.log_size
         self._common = self.unit * float(log_size.max())
-        self._offsets = spheres.points.offsets(self.unit * log_size - self._common)
-        self.radii = spheres.points.offsets(spheres.radii, spare=0.0)
+        self._offsets = spheres.offsets(self.unit * log_size - self._common)
+        self.radii = spheres.offsets(spheres.radii, spare=0.0)
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN where L >= 0."""
-        points_ = self.spheres.points
         score, gradient = native.gaussian(
-            points_.clusters,
+            self.spheres.clusters,
             self._offsets,
             self.radii.values,
             self.sign,
             self._common,
             self.kernel.length,
             self.tolerance,
-            points_.relative(checked_points(points)),
+            self.spheres.relative(checked_points(points)),
             threads=self._threads,
         )
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def query_safe(self, points: Float64) -> tuple[Float64, Float64]:
         """Return what `SafeField` returns, in one walk."""
-        points_ = self.spheres.points
         asked = shaped_points(points)
         found = native.safe(
-            points_.clusters,
+            self.spheres.clusters,
             self._offsets,
             self.radii,
             self.sign,
             self._common,
             self.kernel.length,
             self.tolerance,
-            points_.anchor,
+            self.spheres.anchor,
             asked,
             threads=self._threads,
         )
@@ -182,11 +183,11 @@ class SeField(LogSumExpField):
         return found
 
     def terms(self) -> LogSumExp:
-        points, log_size = self.spheres.points, self.weights.log_size
+        log_size = self.weights.log_size
         return LogSumExp(
             is_matern=False,
-            offsets=points.offsets(self.unit * log_size),
-            exact=points.laid_out(log_size, spare=native.SPARE_OFFSET),
+            offsets=self.spheres.offsets(self.unit * log_size),
+            exact=self.spheres.laid_out(log_size, spare=native.SPARE_OFFSET),
             radii=self.radii.values,
             sign=self.sign,
             length=self.kernel.length,
@@ -214,16 +215,6 @@ class SafeField:
         smooth, smooth_gradient = self._kernel.query_raw(points)
         is_less = smooth < distance  # False for NaN
         return np.where(is_less, smooth, distance), np.where(is_less[:, None], smooth_gradient, gradient)
-
-
-def or_exact(raw: tuple[Float64, Float64], spheres: Spheres, points: Float64) -> tuple[Float64, Float64]:
-    """Replace NaN distances (Q,) and their gradients (Q, 3) by exact ones."""
-    distance, gradient = raw
-    has_none = np.isnan(distance)
-    if has_none.any():
-        exact = SphereField(spheres)
-        distance[has_none], gradient[has_none] = exact.query(np.asarray(points, dtype=np.float64)[has_none])
-    return distance, gradient
 
 
 def normalised(gradient: Float64) -> Float64:
@@ -312,10 +303,10 @@ class OnDevice:
             return np.zeros(0, np.int64)
         found = self._asked(points, "entry")
         assert found.entry is not None
-        return self.spheres.points.source[found.entry]
+        return self.spheres.source[found.entry]
 
     def _asked(self, points: Float64, *wanted: str) -> Answers:
-        return self.field.query(checked_points(points), self.spheres.points.anchor, wanted)
+        return self.field.query(checked_points(points), self.spheres.anchor, wanted)
 
     def close(self) -> None:
         """Free the device's memory."""
@@ -329,5 +320,5 @@ def device_field(
     chosen = KERNEL_OF[config.distance]
     choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
     terms = {name: field.terms() for name, field in kernels.items()}
-    radii = spheres.points.offsets(spheres.radii)
-    return DeviceField(device, spheres.points.clusters, radii, terms, choice)
+    radii = spheres.offsets(spheres.radii)
+    return DeviceField(device, spheres.clusters, radii, terms, choice)

@@ -45,7 +45,7 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
             se = baker.kernels["se"] if with_weights else None
             offsets, length = (baker.exact.radii, None) if se is None else (se.terms().offsets, se.kernel.length)
             if changed.any():
-                clusters = baker.spheres.points.clusters
+                clusters = baker.spheres.clusters
                 native.touched_blocks(clusters, offsets, changed, length, span, mask, threads=baker.threads)
     return Changes(mask=mask, num_blocks=num_blocks)
 
@@ -89,8 +89,8 @@ def _changed(
     here, there = np.split(kinds, [len(rows[0])])
     laid_out = []
     for own, other, baker in ((here, there, bakers[0]), (there, here, bakers[1])):
-        changed = np.zeros(len(baker.spheres.points.source), np.uint8)
-        changed[np.flatnonzero(baker.spheres.points.is_point)] = ~np.isin(own, other)
+        changed = np.zeros(len(baker.spheres.source), np.uint8)
+        changed[np.flatnonzero(baker.spheres.is_point)] = ~np.isin(own, other)
         laid_out.append(changed)
     return laid_out[0], laid_out[1]
 
@@ -100,7 +100,7 @@ def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.v
 
     A rank separates splats of one centre: their order can decide the last bit.
     """
-    order = baker.spheres.points.source[baker.spheres.points.is_point.view(np.bool_)]
+    order = baker.spheres.source[baker.spheres.is_point.view(np.bool_)]
     centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0
     values: list[NDArray[np.floating | np.integer]] = [*centers.T, splats.radii[order], splats.labels[order]]
     if with_weights:

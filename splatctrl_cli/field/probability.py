@@ -67,7 +67,7 @@ class PaperProbability:
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
         """Probability (Q,) at points (Q, 3) [m], whatever the sdf."""
-        places = self._gpdf.spheres.points
+        places = self._gpdf.spheres
         half, _ = native.matern(
             places.clusters,
             places.offsets(self._offsets),
@@ -81,7 +81,7 @@ class PaperProbability:
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
         """Probability (X, Y, Z), whatever the sdf."""
-        places = self._gpdf.spheres.points
+        places = self._gpdf.spheres
         gpdf, half = np.zeros_like(sdf), np.zeros_like(sdf)
         self._gpdf.bake_raw(span, gpdf, None, threads=threads)
         terms = replace(

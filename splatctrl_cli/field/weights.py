@@ -21,7 +21,7 @@ from splatctrl_cli.config.fixed import (
     VOXELS_PER_LENGTH,
 )
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.field.clusters import ClusteredPoints, Spheres
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.grid_cells import available_memory
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Float32, Float64, Index
@@ -243,11 +243,11 @@ def share_of_loss(length: float, tolerance: float) -> float:
     return min(-float(np.expm1(-tolerance / length)), KERNEL_MAX_SHARE)
 
 
-def log_row_sums(kernel: Kernel, points: ClusteredPoints, *, threads: int = 0) -> Float64:
+def log_row_sums(kernel: Kernel, spheres: Spheres, *, threads: int = 0) -> Float64:
     """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
     is_matern = isinstance(kernel, Matern12)
-    sums = native.row_sums(points.clusters, points.is_point, kernel.length, is_matern=is_matern, threads=threads)
-    return np.asarray(np.log(points.gathered(sums)))
+    sums = native.row_sums(spheres.clusters, spheres.is_point, kernel.length, is_matern=is_matern, threads=threads)
+    return np.asarray(np.log(spheres.gathered(sums)))
 
 
 NO_LOG = -1e4  # for a weight of zero: negligible, and finite
@@ -272,7 +272,7 @@ def row_sum_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
 
     M of eq. 12 is ``w_i k_d(-r_i)``.
     """
-    return _lumped(log_row_sums(kernel, spheres.points, threads=threads), noise)
+    return _lumped(log_row_sums(kernel, spheres, threads=threads), noise)
 
 
 def voxel_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
@@ -304,16 +304,10 @@ Method = Callable[[Spheres, Kernel, float, int], Weights]
 METHODS: Mapping[str, Method] = {"rowsum": row_sum_weights, "voxel": voxel_weights, "cg": process_weights}
 
 
-def weights_named(name: str, spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """Weights of a configured method."""
-    return METHODS[name](spheres, kernel, noise, threads)
-
-
 def _lumped(log_sums: Float64, noise: float) -> Weights:
     with np.errstate(divide="ignore"):  # noise 0 gives log 0 = -inf, rightly
         return Weights(log_size=np.asarray(-np.logaddexp(log_sums, np.log(noise))), sign=None)
 
 
 def _centers(spheres: Spheres) -> Float64:
-    points = spheres.points
-    return np.stack([points.gathered(axis.astype(np.float64)) for axis in points.clusters.centers], axis=1)
+    return np.stack([spheres.gathered(axis.astype(np.float64)) for axis in spheres.clusters.centers], axis=1)

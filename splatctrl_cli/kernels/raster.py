@@ -31,7 +31,7 @@ def empty_planes(height: int, width: int) -> Float32:
     return memory[first : first + size].reshape(5, height, width)
 
 
-class _Rasteriser:
+class PreparedView:
     """Renders a prepared view; keeps its buffers."""
 
     def __init__(self, num_threads: int) -> None:
@@ -47,7 +47,7 @@ class _Rasteriser:
         return planes
 
 
-class Rasteriser(_Rasteriser):
+class Rasteriser(PreparedView):
     """Renders and differentiates a view of splats."""
 
     def prepare(self, camera: Float64, centers: Float32, radii: Float32, opacities: Float32, colors: Float32) -> None:
@@ -190,7 +190,7 @@ NUM_PARAMETERS = 59
 CENTER, LOG_SCALE, QUAT, LOGIT, HARMONICS = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 59)
 
 
-class GaussianRasteriser(_Rasteriser):
+class GaussianRasteriser(PreparedView):
     """Renders a view of Gaussians."""
 
     def prepare(self, camera: Float64, parameters: Float32, degree: int = 3) -> None:

@@ -11,7 +11,6 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
-from splatctrl_cli.config.fixed import FRAME_SPACING
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import Detour, PlanDetour, TimedPath, pose_error
@@ -40,7 +39,7 @@ def effector_rates(
     """
     rates = np.full(len(waypoints) - 1, np.inf)
     for edge, ends in enumerate(pairwise(waypoints)):
-        for q in resampled(np.array(ends), FRAME_SPACING):
+        for q in resampled(np.array(ends), fixed.FRAME_SPACING):
             twist = model.frame_jacobian(q, frame) @ (ends[1] - ends[0])
             for part, limit in ((twist[:3], max_linear), (twist[3:], max_angular)):
                 speed = float(np.linalg.norm(part))

@@ -9,13 +9,13 @@ from splatctrl_cli.field import weights as weights_module
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField
 from splatctrl_cli.field.weights import (
+    METHODS,
     Matern12,
     SquaredExponential,
     conjugate_gradients,
     log_row_sums,
     solve_process,
     voxel_row_sums,
-    weights_named,
 )
 from splatctrl_cli.geometry import rotation_from_quat
 from tests.field.scenes import cloud, queries
@@ -38,7 +38,7 @@ def test_voxel_density_is_spread_convolved_and_read_back(monkeypatch: pytest.Mon
 def test_voxel_density_is_near_the_exact_one_across_blocks(kernel: Matern12 | SquaredExponential) -> None:
     centers, radii = cloud(3000)
     centers *= 2.0  # 1.2 m: blocks of 0.63 m
-    exact = np.exp(log_row_sums(kernel, Spheres.of(centers, radii).points))
+    exact = np.exp(log_row_sums(kernel, Spheres.of(centers, radii)))
     sums = voxel_row_sums(centers, LENGTH, kernel.value)
     error = LENGTH * np.log(sums / exact)  # of the distance, were the splat alone in being near [m]
     assert np.sqrt(np.mean(error**2)) < 3e-4
@@ -75,7 +75,7 @@ def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
     np.testing.assert_allclose(scaled * np.exp(log_scale), dense, atol=3e-3)
     assert (dense < 0).any()
     assert residual < 1e-6
-    weights = weights_named("cg", Spheres.of(centers, radii), kernel, NOISE, 1)
+    weights = METHODS["cg"](Spheres.of(centers, radii), kernel, NOISE, 1)
     assert weights.num_iterations
     size = np.exp(weights.log_size + log_values)
     np.testing.assert_allclose(weights.sign * size, dense, atol=3e-3)

@@ -103,14 +103,14 @@ class SceneAnswers:
         if known is not None:
             states = known.states(limits.free_below, limits.occupied_above)
             self._observed = partial(observed_at, states, known.origin, known.voxel)
-        self._reach = float(np.abs(splats.centers - self._spheres.points.anchor).max())
+        self._reach = float(np.abs(splats.centers - self._spheres.anchor).max())
 
     def at(self, points: Float64) -> Answers:
         """Answer at points (Q, 3) [m], world."""
         distance, gradient = self._field.query(points)
         nearest = self._exact.nearest(points)
         walked = march(self._field, self._exact, points, steps=MARCH_STEPS)
-        size = self._reach + np.abs(points - self._spheres.points.anchor).max(axis=1)
+        size = self._reach + np.abs(points - self._spheres.anchor).max(axis=1)
         return Answers(
             in_box=None if self._workspace is None else self._workspace.contains(points),
             distance=distance,
