@@ -5,17 +5,16 @@ rows (M moving spheres, then P pairs).
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.kernels import Float64, Int64, native, num_threads
 
 REVOLUTE, PRISMATIC = 0, 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class Chain:
+class Chain(NamedTuple):
     """Body b > 0 hangs on its parent by joint b - 1: ``T_b = T_parent placement_b joint(q)``.
 
     parent, kind (B,): parents first, `REVOLUTE` or `PRISMATIC`; placement (B, 3, 4), the base's in world; axis (B,
@@ -32,25 +31,21 @@ class Chain:
     def centers(self, q: Float64, *, threads: int = 1) -> Float64:
         """Sphere centres (T, S, 3) [m], world, at q (T, J)."""
         out = np.empty((len(q), len(self.sphere_body), 3))
-        native.chain_centers(*self._arrays, np.ascontiguousarray(q), num_threads(threads), out)
+        native.chain_centers(*self, np.ascontiguousarray(q), num_threads(threads), out)
         return out
 
     def jacobians(self, q: Float64) -> tuple[Float64, Float64]:
         """Sphere centres (S, 3) [m] and d centre / d q (S, 3, J), world, at q (J,)."""
         num = len(self.sphere_body)
         centers, jacobians = np.empty((num, 3)), np.empty((num, 3, len(q)))
-        native.chain_jacobians(*self._arrays, np.ascontiguousarray(q), centers, jacobians)
+        native.chain_jacobians(*self, np.ascontiguousarray(q), centers, jacobians)
         return centers, jacobians
 
     def frame(self, q: Float64, body: int, in_body: Float64) -> tuple[Float64, Float64]:
         """World pose (3, 4) of a frame at `in_body` (3, 4) in `body`, and its Jacobian (6, J), linear first."""
         pose, jacobian = np.empty((3, 4)), np.empty((6, len(q)))
-        native.chain_frame(*self._arrays, np.ascontiguousarray(q), body, in_body, pose, jacobian)
+        native.chain_frame(*self, np.ascontiguousarray(q), body, in_body, pose, jacobian)
         return pose, jacobian
-
-    @property
-    def _arrays(self) -> tuple[NDArray[np.generic], ...]:
-        return self.parent, self.kind, self.placement, self.axis, self.sphere_body, self.offset
 
 
 def pair_gaps(centers: Float64, radii: Float64, pairs: Int64) -> tuple[Float64, Float64]:
@@ -103,8 +98,7 @@ class EdgeRoom:
         is_first = np.r_[True, np.any(between[1:] != between[:-1], axis=1)][: len(between)]
         first = np.flatnonzero(is_first)
         return cls(
-            chain=replace(
-                chain,
+            chain=chain._replace(
                 sphere_body=np.concatenate([chain.sphere_body, part_body]),
                 offset=np.concatenate([chain.offset, middles]),
             ),
@@ -145,12 +139,7 @@ class EdgeRoom:
         """
         share, num_checks = np.empty(len(start)), np.empty(len(start), np.int64)
         native.advance_edges(
-            self.chain.parent,
-            self.chain.kind,
-            self.chain.placement,
-            self.chain.axis,
-            self.chain.sphere_body,
-            self.chain.offset,
+            *self.chain,
             self.moving,
             self.pairs,
             self.taken,
