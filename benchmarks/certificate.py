@@ -14,7 +14,7 @@ from benchmarks.measure import Limit, Options, Result
 from benchmarks.surfaces import exact_distance, random_balls, shapes, splats_on
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid, Float64
 from tests.field.scenes import splat_set
@@ -91,7 +91,7 @@ def judge(
     extent = voxel * (shape - 1)
     points = grid.origin + rng.uniform(-BEYOND, extent + BEYOND, (num_queries, 3))
     exact = exact_distance(points, centers, radii)
-    inside = GridField(grid).contains(points)
+    inside = GridField(grid).box.contains(points)
     within = points[inside]
     nearest = np.rint((within - grid.origin) / voxel).astype(np.int64)
     between = {

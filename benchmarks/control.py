@@ -13,8 +13,9 @@ from benchmarks.scenes import sample_fitter, sample_robot, sample_states
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import audit
 from splatctrl_cli.control.step import QpIkController
-from splatctrl_cli.field.distance import make_field
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.distance import field_over
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.unknown import field_splats
 from splatctrl_cli.records import DistanceField, Float64, SplatSet
@@ -28,7 +29,7 @@ def run(options: Options) -> Result:
     """The sample log's arm and map: steps from its logged states towards the last one's pose, and their audit."""
     config, model = Config(), sample_robot()
     splats = _scene()
-    analytic = make_field(splats.centers, splats.radii, config.field)
+    analytic = field_over(Spheres.of(splats.centers, splats.radii), config.field)
     grid = GridField(bake(splats, model.reach_box, config.field))
     fields: dict[str, DistanceField] = {"grid": grid, "analytic": analytic}
     steps = {f"{name}_{solver}": _step(field, solver) for name, field in fields.items() for solver in SOLVERS}

@@ -11,9 +11,9 @@ from benchmarks.measure import Limit, Options, Result, medians
 from benchmarks.scenes import surface_splats
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.distance import GpdfField, SphereField, make_field
-from splatctrl_cli.field.grid_cells import GridLayout
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.distance import GpdfField, SphereField, field_over
+from splatctrl_cli.field.grid_cells import GridField, GridLayout
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, Float64, SplatSet
 
@@ -88,7 +88,7 @@ def _few_points(report: Report, options: Options) -> None:
     tree = cKDTree(splats.centers)
     coarse = GridField(bake(splats, _box(64, 2 * VOXEL), FieldConfig(voxel=2 * VOXEL)))
     tasks: Tasks = {
-        name: partial(make_field(splats.centers, splats.radii, FieldConfig(distance=name)).query, points)
+        name: partial(field_over(Spheres.of(splats.centers, splats.radii), FieldConfig(distance=name)).query, points)
         for name in ("hard", "safe", "gpdf", "safe_gpdf")
     }
     times = medians(
@@ -111,9 +111,9 @@ def _many_points(report: Report, options: Options) -> None:
     num = MANY_POINTS // 10 if options.is_quick else MANY_POINTS
     points = CENTER + np.random.default_rng(4).uniform(-0.5, 0.5, (num, 3))
     tree = cKDTree(splats.centers)
-    exact = SphereField(splats.centers, splats.radii, threads=THREADS)
-    safe = make_field(splats.centers, splats.radii, FieldConfig(), threads=THREADS)
-    kernel = GpdfField(splats.centers, splats.radii, threads=THREADS)
+    exact = SphereField(Spheres.of(splats.centers, splats.radii), threads=THREADS)
+    safe = field_over(Spheres.of(splats.centers, splats.radii), FieldConfig(), threads=THREADS)
+    kernel = GpdfField(Spheres.of(splats.centers, splats.radii), threads=THREADS)
     tasks: Tasks = {
         "hard": partial(exact.query, points),
         "safe": partial(safe.query, points),

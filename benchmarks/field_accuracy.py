@@ -26,6 +26,7 @@ from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import BANDS
 from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, band_accuracy
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, LogSumExpField, SafeField, SeField, SphereField
 from splatctrl_cli.field.health import median_spacing
 from splatctrl_cli.field.weights import METHODS
@@ -130,13 +131,13 @@ def distances(
     centers: Float64, radii: Float64, points: Float64, methods: Sequence[str]
 ) -> dict[tuple[str, str], Float64]:
     """Distance (Q,) [m] by (field, weights); hard has no weights."""
-    exact = SphereField(centers, radii, threads=0)
+    exact = SphereField(Spheres.of(centers, radii), threads=0)
     found = {("hard", ""): exact.query(points)[0]}
     for weights in methods:
         noise = CG_NOISE if weights == "cg" else FieldConfig.noise
         kernels: dict[str, LogSumExpField] = {
-            "se": SeField(centers, radii, noise=noise, weights=weights, threads=0),
-            "gpdf": GpdfField(centers, radii, noise=noise, weights=weights, threads=0),
+            "se": SeField(Spheres.of(centers, radii), FieldConfig(noise=noise, weights=weights), threads=0),
+            "gpdf": GpdfField(Spheres.of(centers, radii), FieldConfig(noise=noise, weights=weights), threads=0),
         }
         for name, kernel in kernels.items():
             found[name, weights] = kernel.query(points)[0]
@@ -153,7 +154,9 @@ def planar_bias(length: float) -> PlanarBias:
     centers = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     heights = np.linspace(0.005, 0.20, num)
     points = np.stack([np.full(num, 0.3 * step), np.full(num, 0.2 * step), heights], axis=1)
-    measured = GpdfField(centers, np.zeros(len(centers)), length, threads=0).query(points)[0]
+    measured = GpdfField(
+        Spheres.of(centers, np.zeros(len(centers))), FieldConfig(length_scale=length), threads=0
+    ).query(points)[0]
     closed_form = heights - length * np.log1p(heights / length)
     return PlanarBias(
         length=length,
@@ -217,8 +220,12 @@ def lone_reading(case: LoneSplat) -> LoneReading:
     steps = case.radius + np.linspace(0.002, 0.15, 149)
     points = np.stack([steps, np.zeros_like(steps), np.zeros_like(steps)], axis=1)
     hard = exact_distance(points, centers, radii)
-    se = SeField(centers, radii, case.length)
-    fields = (GpdfField(centers, radii, case.length), se, SafeField(SphereField(centers, radii), se))
+    se = SeField(Spheres.of(centers, radii), FieldConfig(length_scale=case.length))
+    fields = (
+        GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=case.length)),
+        se,
+        SafeField(SphereField(Spheres.of(centers, radii)), se),
+    )
     gpdf_over, se_over, safe_over = (float((field.query(points)[0] - hard).max()) for field in fields)
     return LoneReading(case=case, gpdf=gpdf_over, se=se_over, safe=safe_over)
 

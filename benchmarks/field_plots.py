@@ -10,8 +10,9 @@ import numpy as np
 
 from benchmarks.surfaces import Shape, exact_distance, lone_splat, points_around, shapes, splats_on
 from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceField, Float64
 from tests.field.scenes import splat_set
@@ -158,8 +159,16 @@ def draw_certificate() -> Any:
 
 def fields(centers: Float64, radii: Float64, length: float) -> dict[str, DistanceField]:
     """The four fields with the default weights."""
-    exact, kernel = SphereField(centers, radii), SeField(centers, radii, length)
-    return {"hard": exact, "gpdf": GpdfField(centers, radii, length), "se": kernel, "safe": SafeField(exact, kernel)}
+    exact, kernel = (
+        SphereField(Spheres.of(centers, radii)),
+        SeField(Spheres.of(centers, radii), FieldConfig(length_scale=length)),
+    )
+    return {
+        "hard": exact,
+        "gpdf": GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=length)),
+        "se": kernel,
+        "safe": SafeField(exact, kernel),
+    }
 
 
 def new_figure(columns: int = 1) -> tuple[Any, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.measure import Options, Result, rms
 from benchmarks.surfaces import points_around, shapes, splats_on
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SphereField, march
 from splatctrl_cli.records import Float64
 
@@ -61,7 +62,7 @@ def plane(radius: float) -> Scene:
 def measured(name: str, scene: Scene) -> list[str]:
     """The field before and after marching."""
     centers, radii, points, truth = scene
-    field, exact = GpdfField(centers, radii), SphereField(centers, radii)
+    field, exact = GpdfField(Spheres.of(centers, radii)), SphereField(Spheres.of(centers, radii))
     errors = {steps: march(field, exact, points, steps=steps).distance - truth for steps in STEPS}
     plain, hard = (rms(one.query(points)[0] - truth) for one in (field, exact))
     figures = (plain, *map(rms, errors.values()), float(errors[5].mean()), hard)

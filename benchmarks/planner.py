@@ -16,12 +16,12 @@ from experiments.paths import effector_length, joint_length, least_clearance
 from experiments.problems import Problem, panda, read_archive
 from experiments.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.config import ControlConfig, PlannerConfig
-from splatctrl_cli.control.goals import pose_error
+from splatctrl_cli.control.goals import TimedPath, pose_error
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.planner.birrt import Plan, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
-from splatctrl_cli.planner.planned import TimedPath, resampled, timed
+from splatctrl_cli.planner.planned import resampled, timed
 from splatctrl_cli.records import Bool, Float64
 
 FRAME = "panda_grasptarget"

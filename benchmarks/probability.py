@@ -15,7 +15,7 @@ from benchmarks.measure import Options, Result, rms
 from benchmarks.surfaces import Shape, points_around, shapes, splats_on
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import make_field
+from splatctrl_cli.field.distance import field_over
 from splatctrl_cli.field.probability import CalibratedProbability, PaperProbability
 from splatctrl_cli.records import Float64
 from splatctrl_cli.report.field_pictures import Reliability, reliability, reliability_picture
@@ -62,8 +62,8 @@ def sampled(group: Sequence[Shape], num: int) -> tuple[Float64, Float64, Float64
             centers, radii = splats_on(shape, spacing, is_inset=True, seed=0)
             centers = centers + np.random.default_rng(3).normal(0.0, NOISE, centers.shape)
             truths.append(truth)
-            distances.append(make_field(centers, radii, config).query(points)[0])
-            papers.append(PaperProbability(Spheres.of(centers, radii), config).of(points))
+            distances.append(field_over(Spheres.of(centers, radii), config).query(points)[0])
+            papers.append(PaperProbability(Spheres.of(centers, radii), config).at(points, np.zeros(0)))
     return np.concatenate(truths), np.concatenate(distances), np.concatenate(papers)
 
 

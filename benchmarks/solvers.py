@@ -7,11 +7,12 @@ import importlib.util
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from benchmarks.measure import Options, Result, seconds
-from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QpSolver, QuadraticProgram, assemble
+from splatctrl_cli.control.qp import QpSolver, QuadraticProgram, assemble, solve_clarabel, solve_daqp
 from splatctrl_cli.control.terms import Barrier, reach_cost, stray_cost
 from splatctrl_cli.records import Float64
 
@@ -24,16 +25,16 @@ def run(options: Options) -> Result:
     rng, num = np.random.default_rng(0), NUM_STEPS // (50 if options.is_quick else 1)
     programs = [random_program(rng) for _ in range(num)]
     solvers: dict[str, QpSolver] = {
-        "daqp": DaqpSolver(),
-        "clarabel": ClarabelSolver(),
-        "clarabel, tolerance 1e-14": ClarabelSolver(tolerance=1e-14),
+        "daqp": solve_daqp,
+        "clarabel": solve_clarabel,
+        "clarabel, tolerance 1e-14": partial(solve_clarabel, tolerance=1e-14),
     }
-    exact, rows = [solvers["daqp"].solve(program) for program in programs], []
+    exact, rows = [solvers["daqp"](program) for program in programs], []
     for name, solver in solvers.items():
         answers, times = [], []
         for program in programs:
             start = time.perf_counter()
-            answers.append(solver.solve(program))
+            answers.append(solver(program))
             times.append(time.perf_counter() - start)
         compared = zip(programs, exact, answers, strict=True)
         apart = np.array([differences(p, e.z, a.z) for p, e, a in compared if a.is_solved])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measure import Options, Result
 from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField
 from splatctrl_cli.records import Float64
 
@@ -116,7 +117,9 @@ def own_cell(radii: Float64, length: float) -> Cell:
     log_size, sign = log_weights(centers, radii, length, "lumped", np.float64)
     truth = log_domain(distances(points, centers), log_size, sign, length)
     flat = [np.column_stack([array, np.zeros(len(array))]) for array in (centers, points)]
-    return cell_of(length, GpdfField(flat[0], radii, length).query_raw(flat[1])[0], truth)
+    return cell_of(
+        length, GpdfField(Spheres.of(flat[0], radii), FieldConfig(length_scale=length)).query_raw(flat[1])[0], truth
+    )
 
 
 def cell_of(length: float, found: Array, truth: Float64) -> Cell:

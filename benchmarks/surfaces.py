@@ -12,7 +12,7 @@ from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_m
 from splatctrl_cli.formats.mesh import TriangleMesh, load_mesh
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.records import Box, Float64
-from splatctrl_cli.robot.mesh_distance import MeshDistance
+from splatctrl_cli.robot.link_meshes import MeshDistance
 from splatctrl_cli.simulate.primitives import Primitive, Texture, closest_point, normals
 from splatctrl_cli.simulate.truth import distance_to
 

@@ -39,6 +39,7 @@ from splatctrl_cli.blocks import (
     RobotPosture,
     SceneFitter,
     SphereField,
+    Spheres,
     SplatSet,
     VoxelState,
     field_splats,
@@ -127,7 +128,7 @@ def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> M
         threads=threads,
     )
     return Map(
-        scene=Certified(distance=_less_rounding(SphereField(centers, radii, threads=threads))),
+        scene=Certified(distance=_less_rounding(SphereField(Spheres.of(centers, radii), threads=threads))),
         ways=surroundings.ways,
         known=known,
         barrier=lambda: barrier_of(problem, spheres, config, threads),
@@ -172,7 +173,7 @@ def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
         raise NotEvaluableError("occupancy grid: no voxel is occupied")
     balls = Balls.of_voxels(centers.astype(np.float32), grid.voxel, np.zeros(len(centers), np.uint8))
     radii = np.full(len(balls), balls.radius, np.float32)
-    field = SphereField(balls.centers, radii, threads=threads)
+    field = SphereField(Spheres.of(balls.centers, radii), threads=threads)
     scene = Certified(distance=_less_rounding(field))
     return Map(scene=scene, num_parts=len(balls), things=(balls.centers, radii))
 
@@ -189,7 +190,7 @@ def gaussian_map(problem: Problem, views: Views, config: Config, threads: int) -
     centers, radii = beside_the_start(problem, splats.centers, splats.radii)
     if not len(radii):
         raise NotEvaluableError("3D-GS: no Gaussian is left")
-    field = SphereField(centers, radii, threads=threads)
+    field = SphereField(Spheres.of(centers, radii), threads=threads)
     return Map(scene=Certified(distance=_less_rounding(field)), num_parts=len(splats), things=(centers, radii))
 
 

@@ -31,6 +31,7 @@ from splatctrl_cli.blocks import (
     OccupancyGrid,
     Planes,
     SphereField,
+    Spheres,
     VoxelState,
     resampled,
 )
@@ -128,7 +129,9 @@ class Surroundings:
             radii[: self.num_known] = np.minimum(radii[: self.num_known], np.float32(THIN))
             radii[self.num_known :] *= np.float32(0.5)
         radii = yielded(self.problem, self.centers, radii, margin)
-        field = SphereField(self.centers, radii + np.float32(margin), threads=self.threads)  # no radius below 0
+        field = SphereField(
+            Spheres.of(self.centers, radii + np.float32(margin)), threads=self.threads
+        )  # no radius below 0
         return lambda points: field.query(points)[0] + (margin - ROUNDING)
 
     @cached_property
@@ -164,7 +167,7 @@ class Surroundings:
         high = np.ceil(ends[1].max(axis=0)).astype(np.int64) + 1
         window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
         cells = low + np.argwhere(is_unseen[window])
-        near = SphereField(centers, radii).query(grid.origin + grid.voxel * cells)[0] < UNSEEN_NEAR
+        near = SphereField(Spheres.of(centers, radii)).query(grid.origin + grid.voxel * cells)[0] < UNSEEN_NEAR
         is_unseen[tuple(cells[near].T)] = False
         return is_unseen
 
@@ -181,7 +184,7 @@ class Surroundings:
 def _body(problem: Problem, q: Float64) -> SphereField:
     """The arm's moving spheres at a posture (J,)."""
     moving = problem.model.moving_spheres
-    return SphereField(problem.model.sphere_centers(q)[moving], problem.model.sphere_set.radii[moving])
+    return SphereField(Spheres.of(problem.model.sphere_centers(q)[moving], problem.model.sphere_set.radii[moving]))
 
 
 def beside_the_start(problem: Problem, centers: Float32, radii: Float32) -> tuple[Float32, Float32]:

@@ -7,19 +7,19 @@ from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
 from splatctrl_cli.config.fixed import START_ROOM
 from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audit
+from splatctrl_cli.control.barriers import SceneStep, rate_of
 from splatctrl_cli.control.events import runs_of
-from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, guided_goal, pose_error
+from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TimedPath, guided_goal, pose_error
 from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.replay import Outcome as MotionOutcome
 from splatctrl_cli.control.replay import ReplayTask, closed_loop, is_at_goal
-from splatctrl_cli.control.scene_field import SceneStep, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.evaluate.protocols import SURFACE_SCANS
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.field.baker import Baker, Planes
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridLayout
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridField, GridLayout
 from splatctrl_cli.field.unknown import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import (
     Stopwatch,
@@ -60,8 +60,8 @@ from splatctrl_cli.jobs.replay.request import ReplayInputs
 from splatctrl_cli.jobs.replay.verdict import replay_verdict
 from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
-from splatctrl_cli.kernels import gaussians as gaussian_kernels
 from splatctrl_cli.kernels import native, num_threads
+from splatctrl_cli.kernels import raster as gaussian_kernels
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
 from splatctrl_cli.libraries import is_installed, mpl, of_extra
 from splatctrl_cli.planner.birrt import plan
@@ -70,7 +70,6 @@ from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     START_BLOCKED,
     PlannedPath,
-    TimedPath,
     goal_postures,
     planned_detours,
     planned_path,
@@ -198,6 +197,7 @@ __all__ = [
     "Solid",
     "Solids",
     "SphereField",
+    "Spheres",
     "SplatSet",
     "Stamps",
     "StateColumns",

@@ -19,9 +19,9 @@ import numpy as np
 from benchmarks.scenes import surface_splats
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.distance import make_field
+from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.distance import OnDevice, field_over
 from splatctrl_cli.field.grid_cells import GridLayout
-from splatctrl_cli.field.on_device import OnDevice
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.kernels.cuda.card import CudaDevice
 from splatctrl_cli.kernels.cuda.field import Answers
@@ -178,7 +178,7 @@ def points(device: CudaDevice) -> list[str]:
 
 def row_of_points(device: CudaDevice, asked: Float64, what: str, count: int, distance: str) -> str:
     splats, config = surface_splats(count), FieldConfig(distance=distance)
-    theirs = make_field(splats.centers, splats.radii, config, threads=0)
+    theirs = field_over(Spheres.of(splats.centers, splats.radii), config, threads=0)
     mine = OnDevice.of(splats.centers, splats.radii, config, device)
     query = mine.query if len(asked) == POINTS else mine.distance  # an audit needs no gradient
     found = mine.query(asked)[0]

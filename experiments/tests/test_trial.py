@@ -14,10 +14,9 @@ from experiments.problems import Problem, Views
 from experiments.trial import LITTLE, PLANS, Attempt, Rig, by_planner
 from experiments.ways import Way
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.goals import Detour, PlanDetour
+from splatctrl_cli.control.goals import Detour, PlanDetour, TimedPath
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.planner.configuration_clearance import HasDistance
-from splatctrl_cli.planner.planned import TimedPath
 from splatctrl_cli.records import Float64
 
 NONE = Attempt(position=None, cause=judge.NO_PLAN)

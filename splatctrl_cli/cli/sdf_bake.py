@@ -11,7 +11,7 @@ from splatctrl_cli.cli.options import names_of, request_of
 from splatctrl_cli.config import load_config
 from splatctrl_cli.config.fixed import PROBABILITY_NEAR
 from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, TruthComparison
-from splatctrl_cli.field.baker import CHANNELS
+from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.formats.grid.grid_formats import FORMATS
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest

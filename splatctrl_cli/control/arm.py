@@ -1,13 +1,10 @@
 """The one seam between control and kinematics."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from splatctrl_cli.kernels.chain import Chain
-from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.records import Bool, Float64, Floats, Integers, SphereSet
 
 
 class ArmModel(Protocol):
@@ -16,38 +13,21 @@ class ArmModel(Protocol):
     J joints, S spheres; positions [m] and poses in world. chain: None if only the methods know the kinematics.
     """
 
+    joint_names: tuple[str, ...]
+    lower: Float64
+    upper: Float64
+    middle: Float64
+    velocity_limit: Float64
+    base_position: Float64
+    sphere_set: SphereSet
+    moving_spheres: Bool
+    sphere_deficit: Float64
+
     @property
     def chain(self) -> Chain | None: ...
 
     @property
-    def joint_names(self) -> Sequence[str]: ...
-
-    @property
-    def lower(self) -> Float64: ...
-
-    @property
-    def upper(self) -> Float64: ...
-
-    @property
-    def velocity_limit(self) -> Float64: ...
-
-    @property
-    def sphere_set(self) -> SphereSet: ...
-
-    @property
-    def moving_spheres(self) -> Bool: ...
-
-    @property
-    def sphere_deficit(self) -> Float64: ...
-
-    @property
     def self_allowance(self) -> Float64: ...
-
-    @property
-    def middle(self) -> Float64: ...
-
-    @property
-    def base_position(self) -> Float64: ...
 
     def sphere_centers(self, q: Float64) -> Float64: ...
 
@@ -61,13 +41,13 @@ class ArmModel(Protocol):
 
     def lever_arms(self) -> Float64: ...
 
-    def self_pairs(self) -> NDArray[np.integer]: ...
+    def self_pairs(self) -> Integers: ...
 
     def surface_gaps(
         self,
         positions: Float64,
-        centers: NDArray[np.floating],
-        radii: NDArray[np.floating],
+        centers: Floats,
+        radii: Floats,
         links: Collection[str] | None = None,
     ) -> Mapping[str, Float64]: ...
 

@@ -1,9 +1,10 @@
-"""Barrier rows of III-E: moving spheres against the scene, and pairs of spheres."""
+"""Barrier rows of III-E: moving spheres against the scene, and pairs of spheres; larger people, and rates dd/dt."""
 
+from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import BRAKING_SHARE, IMMOVABLE_ROW, SURFACE_STEP
@@ -13,7 +14,7 @@ from splatctrl_cli.control.limits import braking_speed
 from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.kernels.chain import pair_gaps
-from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
 
 MARGIN = "margin"
 
@@ -34,14 +35,10 @@ class SceneRows(BarrierTerm):
         self._balls: BallDistance | None = None
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)[self._moving]
-        self._margin = scene_margin(model, config)[self._moving]
+        self.margin = scene_margin(model, config)[self._moving]
         names = sphere_names(model.sphere_set)
         self.names = tuple(names[s] for s in self._moving)
         self._links = np.array(model.sphere_set.links)[self._moving]
-
-    @property
-    def margin(self) -> Float64:
-        return self._margin
 
     def in_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
         """Return the rows in another field, of `balls` (None: links' surfaces do not count)."""
@@ -61,7 +58,7 @@ class SceneRows(BarrierTerm):
         links = set(self._links[chosen].tolist())
         gaps = self._model.surface_gaps(postures, self._balls.centers, self._balls.radii, links)
         for link, gap in gaps.items():
-            raised = gap[0] + self._margin - self._config.margin
+            raised = gap[0] + self.margin - self._config.margin
             is_raised = chosen & (self._links == link) & (raised > distance)
             distance = np.where(is_raised, raised, distance)
             if G is not None:
@@ -74,10 +71,10 @@ class SceneRows(BarrierTerm):
         distance, gradient = self._queried(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
         distance = self.by_surfaces(state.q, distance, state.by_surface, G)
-        h = distance_bound(self._config, self._acceleration, distance, self._margin, G, state.distance_rate)
+        h = distance_bound(self._config, self._acceleration, distance, self.margin, G, state.distance_rate)
         return self._barrier(self._moving, G, h, distance)
 
-    def cut(self, state: State, velocity: Float64, chosen: NDArray[np.integer], distance: Float64) -> Barrier:
+    def cut(self, state: State, velocity: Float64, chosen: Integers, distance: Float64) -> Barrier:
         """Return rows of `chosen` spheres against their nearest surfaces after a period of `velocity` (J,).
 
         The distance to such a surface is linearised at that later place. This is conservative for a surface that is
@@ -91,14 +88,14 @@ class SceneRows(BarrierTerm):
         later = self.by_surfaces(q, later - self._radii, state.by_surface, G)
         now, G = np.maximum(later + period * (G @ velocity), distance)[chosen], G[chosen]
         rate = np.broadcast_to(state.distance_rate, len(self.names))[chosen]
-        h = distance_bound(self._config, self._acceleration, now, self._margin[chosen], G, rate)
+        h = distance_bound(self._config, self._acceleration, now, self.margin[chosen], G, rate)
         return self._barrier(chosen, G, h, now)
 
     def distances(self, centers: Float64) -> Float64:
         """Return distances (M,) [m]; NaN where unknown, which breaks a row's promise."""
         return self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii
 
-    def _barrier(self, index: NDArray[np.integer], G: Float64, h: Float64, distance: Float64) -> Barrier:
+    def _barrier(self, index: Integers, G: Float64, h: Float64, distance: Float64) -> Barrier:
         cost, weight = self._config.slack_cost, self._config.weight_slack
         return Barrier(index=index, G=G, h=h, distance=distance, slack_cost=cost, slack_weight=weight)
 
@@ -126,13 +123,9 @@ class SelfRows(BarrierTerm):
         self._config, self._acceleration = config, acceleration
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
         self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
-        self._margin = config.self_margin - np.asarray(model.self_allowance, dtype=np.float64)
+        self.margin = config.self_margin - np.asarray(model.self_allowance, dtype=np.float64)
         names = sphere_names(model.sphere_set)
         self.names = tuple(f"{names[a]}~{names[b]}" for a, b in self._pairs)
-
-    @property
-    def margin(self) -> Float64:
-        return self._margin
 
     def rows(self, state: State) -> Barrier:
         """Return the rows.
@@ -143,10 +136,10 @@ class SelfRows(BarrierTerm):
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
         if self._acceleration is not None:
             G = -pair_gradient(direction, jacobians, self._pairs)
-            h = distance_bound(self._config, self._acceleration, distance, self._margin, G)
+            h = distance_bound(self._config, self._acceleration, distance, self.margin, G)
         else:
             G = np.zeros((len(distance), jacobians.shape[2]))
-            h = distance_bound(self._config, None, distance, self._margin, G)
+            h = distance_bound(self._config, None, distance, self.margin, G)
             speed = fastest_spheres(jacobians, *state.box)
             near = np.flatnonzero(h <= speed[self._pairs[:, 0]] + speed[self._pairs[:, 1]])
             G[near] = -pair_gradient(direction[near], jacobians, self._pairs[near])
@@ -164,7 +157,7 @@ class SelfRows(BarrierTerm):
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
         motion = jacobians @ velocity
         apart = motion[self._pairs[:, 0]] - motion[self._pairs[:, 1]]
-        h = distance_bound(self._config, None, distance, self._margin, None)
+        h = distance_bound(self._config, None, distance, self.margin, None)
         return np.asarray(h + np.sum(direction * apart, axis=1))
 
     def distances(self, centers: Float64) -> Float64:
@@ -205,7 +198,7 @@ def external_gradient(gradient: Float64, jacobians: Float64) -> Float64:
     return np.asarray(np.matmul(gradient[:, None, :], jacobians)[:, 0, :])
 
 
-def pair_gradient(direction: Float64, jacobians: Float64, pairs: NDArray[np.integer]) -> Float64:
+def pair_gradient(direction: Float64, jacobians: Float64, pairs: Integers) -> Float64:
     """Return ``dd/dq`` (P, J) of sphere pairs; jacobians (S, 3, J)."""
     relative = jacobians[pairs[:, 0]] - jacobians[pairs[:, 1]]
     return np.asarray(np.matmul(direction[:, None, :], relative)[:, 0, :])
@@ -221,7 +214,7 @@ def fastest_approach(G: Float64, lowest: Float64, highest: Float64) -> Float64:
     return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1))
 
 
-def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> NDArray[np.bool_]:
+def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> Bool:
     """True for rows (M,) that some velocity of the box violates; to drop the others changes no solution."""
     return np.asarray(fastest_approach(G, lowest, highest) > h)
 
@@ -232,6 +225,71 @@ def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Fl
     return np.asarray(np.sqrt(np.einsum("si,si->s", speed, speed)))
 
 
-def is_immovable(G: Float64, velocity_limit: Float64) -> NDArray[np.bool_]:
+def is_immovable(G: Float64, velocity_limit: Float64) -> Bool:
     """True for rows (M,) that no joint velocity changes: fixed spheres or flat field."""
     return np.asarray(np.abs(G) @ velocity_limit < IMMOVABLE_ROW)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneStep:
+    """The two newest scenes known at a time, `seconds` apart."""
+
+    newer: DistanceField
+    older: DistanceField
+    seconds: float
+
+
+SceneStepAt = Callable[[int], SceneStep | None]
+"""What was known at a stamp [ns], None where there was only one scene; never anything later."""
+
+
+def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
+    """Return dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
+
+    Clipped to [-limit, 0], so a row is only ever tightened; missing distances give 0. The past rate holds until the
+    next scene.
+    """
+    if step is None:
+        return 0.0
+    change = (step.newer.query(points)[0] - step.older.query(points)[0]) / step.seconds
+    return np.asarray(np.clip(np.nan_to_num(change), -limit, 0.0))
+
+
+def rate_of(
+    config: ControlConfig, model: ArmModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
+) -> float | Float64:
+    """Return the configured dd/dt of the moving spheres at a posture (J,) and stamp."""
+    step = None if scene_step_at is None or config.distance_rate == "none" else scene_step_at(stamp_ns)
+    if step is None:
+        return 0.0
+    points = np.ascontiguousarray(model.sphere_centers(q)[np.flatnonzero(model.moving_spheres)])
+    return distance_rate(step, points, config.max_distance_rate)
+
+
+class PeopleGrown:
+    """min(scene, people - extra): a field in which people extend `extra` [m] farther.
+
+    At epsilon or more, the scene is at least epsilon away, and people epsilon + extra. Distance and gradient are the
+    smaller one's.
+    """
+
+    def __init__(self, scene: DistanceField, people: DistanceField, extra: float) -> None:
+        self._scene, self._people, self._extra = scene, people, extra
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        distance, gradient = self._scene.query(points)
+        to_people, from_people = self._people.query(points)
+        is_nearer = to_people - self._extra < distance
+        return (
+            np.where(is_nearer, to_people - self._extra, distance),
+            np.where(is_nearer[:, None], from_people, gradient),
+        )
+
+
+def guarded(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
+    """Return the field from which a controller keeps `config.margin`.
+
+    People count as nearer by `config.human_margin` less the margin.
+    """
+    extra = config.human_margin - config.margin
+    return scene if people is None or extra <= 0 else PeopleGrown(scene, people, extra)

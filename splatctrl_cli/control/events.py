@@ -1,8 +1,9 @@
 """Events of an audit and a controller: intervals with worst value and names."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
@@ -156,31 +157,13 @@ Near = Callable[[EventKind, str, int], Obstacle | None]
 """Kind of an event, name of its worst and at which of the states -> what is nearest there."""
 
 
-@dataclass(kw_only=True)
-class _Run:
-    """An unfinished interval; state: index of the worst state, counted over all blocks."""
-
-    order: int
-    kind: EventKind
-    source: str
-    first_ns: int
-    last_ns: int = 0
-    num_states: int = 0
-    worst: float = np.nan
-    state: int = -1
-    worst_ns: int = 0
-    worst_name: str = ""
-    names: dict[str, None] = field(default_factory=dict)
-    obstacle: Obstacle | None = None
-
-
 class EventFold:
     """Intervals of signals in blocks of states; an interval may cross blocks."""
 
     def __init__(self) -> None:
         self._num, self._start_ns = 0, 0
-        self._open: dict[int, _Run] = {}
-        self._closed: list[_Run] = []
+        self._open: dict[int, Event] = {}  # by the signal's order, with all their names
+        self._closed: list[tuple[int, Event]] = []
 
     def add(self, stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> None:
         """Add a block of stamps (T,) and signals (T,), in the same order each time.
@@ -193,58 +176,46 @@ class EventFold:
             before = self._open.pop(order, None)
             runs = runs_of(signal.is_on)
             if before is not None and not (runs and runs[0][0] == 0):
-                self._closed.append(before)
+                self._closed.append((order, before))
                 before = None
             for first, end in runs:
-                run = before or _Run(
-                    order=order, kind=signal.kind, source=signal.source, first_ns=int(stamp_ns[first])
-                )
+                event = self._grown(before, stamp_ns, signal, first, end, near)
                 before = None
-                self._grown(run, stamp_ns, signal, first, end, near)
                 if end == len(stamp_ns):
-                    self._open[order] = run
+                    self._open[order] = event
                 else:
-                    self._closed.append(run)
+                    self._closed.append((order, event))
         self._num += len(stamp_ns)
 
     def events(self) -> tuple[Event, ...]:
         """Return all intervals so far, by start; an open one ends with the last state."""
-        runs = [*self._closed, *self._open.values()]
-        return tuple(self._event(run) for run in sorted(runs, key=lambda r: (r.first_ns, -r.last_ns, r.order)))
+        events = sorted([*self._closed, *self._open.items()], key=lambda e: (e[1].first_ns, -e[1].last_ns, e[0]))
+        return tuple(replace(event, names=event.names[:MAX_NAMES]) for _, event in events)
 
-    def _grown(self, run: _Run, stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None) -> None:
+    def _grown(
+        self, before: Event | None, stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None
+    ) -> Event:
+        """Return `before` (None: a new event) with the states [first, end) of this block."""
         values = signal.value[first:end]
         at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
         worst = float(signal.value[at])
-        run.last_ns = int(stamp_ns[end - 1])
-        run.num_states += end - first
-        run.names |= dict.fromkeys(signal.names_over(first, end))
-        if run.state < 0 or (worst > run.worst if signal.is_high_worse else worst < run.worst):
-            run.worst, run.state, run.worst_ns = worst, self._num + at, int(stamp_ns[at])
-            run.worst_name = next(iter(signal.names_at(at)), "")
-            run.obstacle = None if near is None else near(signal.kind, run.worst_name, at)
-
-    def _event(self, run: _Run) -> Event:
-        start_s, end_s, worst_s = (
-            float(stamp - self._start_ns) * 1e-9 for stamp in (run.first_ns, run.last_ns, run.worst_ns)
-        )
-        names = tuple(run.names)
-        return Event(
-            kind=run.kind,
-            source=run.source,
-            first_ns=run.first_ns,
-            last_ns=run.last_ns,
-            start_s=start_s,
-            end_s=end_s,
-            num_states=run.num_states,
-            worst=run.worst,
-            worst_s=worst_s,
-            state=run.state,
-            worst_name=run.worst_name,
-            names=names[:MAX_NAMES],
-            num_names=len(names),
-            obstacle=run.obstacle,
-        )
+        start_s, end_s, worst_s = (float(int(stamp_ns[i]) - self._start_ns) * 1e-9 for i in (first, end - 1, at))
+        names = tuple(dict.fromkeys([*(before.names if before else ()), *signal.names_over(first, end)]))
+        grown: dict[str, Any] = {
+            "last_ns": int(stamp_ns[end - 1]),
+            "end_s": end_s,
+            "num_states": end - first + (before.num_states if before else 0),
+            "names": names,
+            "num_names": len(names),
+        }
+        if before is None or (worst > before.worst if signal.is_high_worse else worst < before.worst):
+            name = next(iter(signal.names_at(at)), "")
+            obstacle = None if near is None else near(signal.kind, name, at)
+            grown |= {"worst": worst, "worst_s": worst_s, "state": self._num + at, "worst_name": name}
+            grown["obstacle"] = obstacle
+        if before is not None:
+            return replace(before, **grown)
+        return Event(kind=signal.kind, source=signal.source, first_ns=int(stamp_ns[first]), start_s=start_s, **grown)
 
 
 def first_intervention(events: Sequence[Event]) -> Event | None:

@@ -5,14 +5,13 @@ Twists are world-aligned, linear part first.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.records import Bool, Float64, FloatRows, Stamps
+from splatctrl_cli.records import Bool, Float64, FloatRows, Floats, Stamps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,24 +94,43 @@ def guided_goal(model: ArmModel, frame: str, position: Float64, velocity: Float6
     return model.frame_pose(position, frame), Guide(twist=twist, posture=position, velocity=velocity)
 
 
-class Path(Protocol):
-    """A timed motion, such as `planner.planned.TimedPath`."""
+@dataclass(frozen=True, kw_only=True)
+class TimedPath:
+    """A timed path (W, J), at rest at each waypoint to keep straight edges.
+
+    start_time (W,) [s]; top_speed, acceleration (W - 1,): trapezoids of the share of each edge, per s and s^2.
+    """
+
+    waypoints: Float64
+    start_time: Float64
+    top_speed: Float64
+    acceleration: Float64
 
     @property
     def duration(self) -> float:
         """Seconds from start to end."""
-        ...
+        return float(self.start_time[-1])
 
-    def at(self, time: float) -> tuple[Float64, Float64]:
-        """Return position and velocity (1, J) at a time [s]."""
-        ...
+    def at(self, time: Floats | float) -> tuple[Float64, Float64]:
+        """Return position and velocity (K, J) at times (K,) [s]; at rest outside the path."""
+        clock = np.clip(np.atleast_1d(np.asarray(time, dtype=np.float64)), 0.0, self.duration)
+        edge = np.clip(np.searchsorted(self.start_time, clock, side="right") - 1, 0, len(self.top_speed) - 1)
+        speed, gain = self.top_speed[edge], self.acceleration[edge]
+        since, left = clock - self.start_time[edge], self.start_time[edge + 1] - clock
+        ramp = speed / gain
+        is_late = left < ramp
+        share = np.where(since < ramp, gain * since**2 / 2, speed * (since - ramp / 2))
+        share = np.where(is_late & (left <= since), 1.0 - gain * left**2 / 2, share)
+        rate = np.minimum(speed, gain * np.minimum(since, left))
+        motion = self.waypoints[edge + 1] - self.waypoints[edge]
+        return self.waypoints[edge] + share[:, None] * motion, rate[:, None] * motion
 
 
 @dataclass
 class Detour:
     """A path whose clock runs while the frame is within `wait_distance` [m] of its goal."""
 
-    path: Path
+    path: TimedPath
     wait_distance: float
     clock: float = 0.0
 

@@ -91,11 +91,6 @@ def braking_speed(room: Float64, gain: float, deceleration: Float64, period: flo
     return speed
 
 
-def brought_to_rest(last_velocity: Float64, change: Float64) -> Float64:
-    """Return the velocity (J,) nearest zero within `change` (J,) of the last."""
-    return np.asarray(np.clip(0.0, last_velocity - change, last_velocity + change))
-
-
 @dataclass(frozen=True, kw_only=True)
 class JointLimits:
     """Limits of J joints: lower, upper [rad], velocity [rad/s], acceleration [rad/s^2] (None: none).
@@ -149,7 +144,8 @@ class JointLimits:
         """Return standstill (J,) [rad/s]: zero, or the nearest that the acceleration allows."""
         if self.acceleration is None or last_velocity is None:
             return np.zeros(len(self.lower))
-        return brought_to_rest(last_velocity, self.acceleration * self.period)
+        change = self.acceleration * self.period
+        return np.asarray(np.clip(0.0, last_velocity - change, last_velocity + change))
 
 
 def velocity_box(

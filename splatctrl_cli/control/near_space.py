@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
@@ -33,7 +32,7 @@ class Seen:
     surface may extend past its lost edge. origin (3,), voxel [m]: of the underlying voxels.
     """
 
-    look: Callable[[Float64], tuple[NDArray[np.int64], UInt8]]
+    look: Callable[[Float64], tuple[Index, UInt8]]
     edges: Float64 = field(default_factory=lambda: np.empty((0, 4)))
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
     voxel: float = fixed.NEAR_LATTICE
@@ -78,7 +77,7 @@ class NearSpace:
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres at the last evaluation
 
-    def due(self, stamps: NDArray[np.int64], centers: Float64) -> dict[int, bool]:
+    def due(self, stamps: Index, centers: Float64) -> dict[int, bool]:
         """Return indices of states to evaluate; True if their ages count.
 
         A state is due once a sphere has moved by `NEAR_MOVED`, and (True) every `NEAR_EVERY_NS`. stamps (T,) [ns]
@@ -108,7 +107,9 @@ class NearSpace:
         self, stamp_ns: int, q: Float64, known: Seen, distance: Callable[[Float64], Float64] | None = None
     ) -> Account:
         """Return the evidence at posture q (J,); distance: to the map's surfaces."""
-        centers, step = self._model.sphere_centers(q), _step_of(known.voxel)
+        centers, voxels = self._model.sphere_centers(q), fixed.NEAR_LATTICE / known.voxel
+        # A multiple or a part of a voxel.
+        step = float(known.voxel * np.ceil(voxels - 1e-6) / np.ceil(1 / voxels - 1e-6))
         points = self._lattice(known.origin, step, centers)
         gaps, spheres = self._gaps(q, centers, points, self._margin + step / 2)
         is_near = (gaps > 0) & (gaps <= self._margin + step / 2)  # the voxel of such a point reaches into the margin
@@ -203,11 +204,6 @@ class NearSpace:
         away = self._gaps(q, centers, balls[:, :3], reach)[0] - balls[:, 3] if len(balls) else np.array([np.inf])
         least = int(away.argmin())
         return max(float(away[least]), 0.0), balls[least, :3] if len(balls) else np.full(3, np.nan)
-
-
-def _step_of(voxel: float) -> float:
-    """Lattice step [m]: a multiple or fraction of a voxel."""
-    return float(voxel * np.ceil(fixed.NEAR_LATTICE / voxel - 1e-6) / np.ceil(voxel / fixed.NEAR_LATTICE - 1e-6))
 
 
 def _nearest_of(points: Float64, away: Float64) -> tuple[float, Float64]:

@@ -8,9 +8,10 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Failure:
     stamp_ns: int
 
 
-class Program:
+class Program(LineProcess):
     """A controller process with the lines of docs/controllers.md."""
 
     def __init__(self, name: str, command: Sequence[str], start: Document, step_limit: float) -> None:
@@ -51,7 +52,7 @@ class Program:
         self._step_limit, self._seconds, self._num = step_limit, 0.0, 0
         self.spent = 0.0  # [s] on the last step
         try:
-            self._process = LineProcess(command)
+            super().__init__(command)
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(
@@ -59,7 +60,7 @@ class Program:
             ) from None
         try:
             limit = max(START_LIMIT, step_limit)
-            version = _document(self._process.exchange(_line(start), limit)).get("protocol")
+            version = _document(self.exchange(_line(start), limit)).get("protocol")
             if version != PROTOCOL:
                 raise Misbehaved(Fault.OTHER_PROTOCOL, f"expected protocol {PROTOCOL}, got {shown(repr(version))}")
         except Misbehaved as error:
@@ -91,14 +92,11 @@ class Program:
                 return _velocity(answer, limits)
             line, has_rows = _line({"rows": rows()}), True
 
-    def close(self) -> None:
-        self._process.close()
-
     def _asked(self, line: bytes) -> Document:
         if self._seconds > RUN_LIMIT:
             raise Misbehaved(Fault.OUT_OF_TIME, f"took {RUN_LIMIT:g} s for all its answers together")
         began = time.monotonic()
-        answer = self._process.exchange(line, PATIENCE * self._step_limit)
+        answer = self.exchange(line, PATIENCE * self._step_limit)
         seconds = time.monotonic() - began
         self.spent, self._seconds = self.spent + seconds, self._seconds + seconds
         if self.spent > self._step_limit:
@@ -108,7 +106,7 @@ class Program:
         return _document(answer)
 
 
-class OutsideController:
+class OutsideController(AbstractContextManager["OutsideController"]):
     """The `Commander` of a user's controller, or of two copies that must agree to the bit.
 
     num_answers, seconds, slowest: count of answers, total and longest time [s].
@@ -138,9 +136,6 @@ class OutsideController:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
@@ -199,7 +194,7 @@ def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) ->
         "lower": _list(model.lower),
         "upper": _list(model.upper),
         "velocity_limit": _list(model.velocity_limit),
-        "acceleration_limit": None if acceleration is None else _list(acceleration),
+        "acceleration_limit": _list(acceleration),
         "frame": frame,
         "home": _list(home),
         "period": config.period,
@@ -243,9 +238,8 @@ def _rows(controller: QpIkController, view: View) -> list[Document]:
     ]
 
 
-def _list(values: Float64) -> list[Any]:
-    found: list[Any] = np.asarray(values, np.float64).tolist()
-    return found
+def _list(values: Float64 | None) -> Any:
+    return None if values is None else np.asarray(values, np.float64).tolist()
 
 
 def _line(document: Mapping[str, Any]) -> bytes:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
 
 import clarabel
 import daqp
@@ -51,16 +50,10 @@ class QpSolution:
     status: str
     is_solved: bool
     residuals: Residuals
-    iterations: int
 
 
-class QpSolver(Protocol):
-    """Solver of a QuadraticProgram; a non-finite program returns unsolved.
-
-    `is_solved` only if the solver reports exactly that.
-    """
-
-    def solve(self, program: QuadraticProgram) -> QpSolution: ...
+QpSolver = Callable[[QuadraticProgram], QpSolution]
+"""A non-finite program returns unsolved; `is_solved` only if the solver reports exactly that."""
 
 
 def residuals(program: QuadraticProgram, z: Float64, multipliers: Float64) -> Residuals:
@@ -77,80 +70,63 @@ def residuals(program: QuadraticProgram, z: Float64, multipliers: Float64) -> Re
     return Residuals(primal=primal, dual=dual, gap=gap)
 
 
-class ClarabelSolver:
-    """Clarabel, an interior point method; one thread, for identical bits."""
+def solve_clarabel(program: QuadraticProgram, *, tolerance: float | None = None) -> QpSolution:
+    """Solve by Clarabel, an interior point method; one thread, for identical bits.
 
-    def __init__(self, *, tolerance: float | None = None) -> None:
-        """tolerance: of feasibility, gap and linear refinement (default: Clarabel's, 1e-8)."""
-        self._settings = clarabel.DefaultSettings()
-        self._settings.verbose = False
-        self._settings.max_threads = 1
-        self._settings.presolve_enable = False  # every row keeps its multiplier
-        if tolerance is not None:
-            self._settings.tol_feas = self._settings.tol_gap_abs = self._settings.tol_gap_rel = tolerance
-            self._settings.iterative_refinement_reltol = self._settings.iterative_refinement_abstol = 0.1 * tolerance
-            self._settings.iterative_refinement_max_iter = 30
-
-    def solve(self, program: QuadraticProgram) -> QpSolution:
-        num_rows = len(program.h)
-        if not is_finite(program):
-            return unsolved(len(program.c), len(program.h), "NotFinite")
-        solver = clarabel.DefaultSolver(
-            sparse.csc_matrix(np.triu(program.H)),
-            program.c,
-            sparse.csc_matrix(program.G),
-            program.h,
-            [clarabel.NonnegativeConeT(num_rows)],
-            self._settings,
-        )
-        answer = solver.solve()
-        z, multipliers = np.asarray(answer.x), np.asarray(answer.z)
-        return QpSolution(
-            z=z,
-            multipliers=multipliers,
-            status=str(answer.status),
-            is_solved=answer.status == clarabel.SolverStatus.Solved,
-            residuals=residuals(program, z, multipliers),
-            iterations=int(answer.iterations),
-        )
+    tolerance: of feasibility, gap and linear refinement (default: Clarabel's, 1e-8).
+    """
+    if not is_finite(program):
+        return unsolved(len(program.c), len(program.h), "NotFinite")
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_threads = 1
+    settings.presolve_enable = False  # every row keeps its multiplier
+    if tolerance is not None:
+        settings.tol_feas = settings.tol_gap_abs = settings.tol_gap_rel = tolerance
+        settings.iterative_refinement_reltol = settings.iterative_refinement_abstol = 0.1 * tolerance
+        settings.iterative_refinement_max_iter = 30
+    H, G = sparse.csc_matrix(np.triu(program.H)), sparse.csc_matrix(program.G)
+    cones = [clarabel.NonnegativeConeT(len(program.h))]
+    answer = clarabel.DefaultSolver(H, program.c, G, program.h, cones, settings).solve()
+    z, multipliers = np.asarray(answer.x), np.asarray(answer.z)
+    return QpSolution(
+        z=z,
+        multipliers=multipliers,
+        status=str(answer.status),
+        is_solved=answer.status == clarabel.SolverStatus.Solved,
+        residuals=residuals(program, z, multipliers),
+    )
 
 
-class DaqpSolver:
-    """DAQP, a dual active-set method: exact to rounding at this size, several times faster."""
-
-    PRIMAL_TOLERANCE = 1e-10  # [of the rows' own units]
-    STATUS: Mapping[int, str] = {
-        1: "Optimal",
-        -1: "Infeasible",
-        -2: "Cycling",
-        -3: "Unbounded",
-        -4: "IterationLimit",
-        -5: "NonConvex",
-        -6: "Overdetermined",
-    }
-
-    def solve(self, program: QuadraticProgram) -> QpSolution:
-        if not is_finite(program):
-            return unsolved(len(program.c), len(program.h), "NotFinite")
-        z, _, flag, info = daqp.solve(
-            np.ascontiguousarray(program.H),
-            np.ascontiguousarray(program.c),
-            np.ascontiguousarray(program.G),
-            np.ascontiguousarray(program.h),
-            primal_tol=self.PRIMAL_TOLERANCE,
-        )
-        z, multipliers = np.array(z), np.array(info["lam"])
-        return QpSolution(
-            z=z,
-            multipliers=multipliers,
-            status=self.STATUS.get(flag, f"exit flag {flag}"),
-            is_solved=flag == 1,
-            residuals=residuals(program, z, multipliers),
-            iterations=int(info["iterations"]),
-        )
+DAQP_TOLERANCE = 1e-10  # [of the rows' own units]
+DAQP_STATUS: Mapping[int, str] = {
+    1: "Optimal",
+    -1: "Infeasible",
+    -2: "Cycling",
+    -3: "Unbounded",
+    -4: "IterationLimit",
+    -5: "NonConvex",
+    -6: "Overdetermined",
+}
 
 
-SOLVERS: Mapping[str, Callable[[], QpSolver]] = {"clarabel": ClarabelSolver, "daqp": DaqpSolver}
+def solve_daqp(program: QuadraticProgram) -> QpSolution:
+    """Solve by DAQP, a dual active-set method: exact to rounding at this size, several times faster."""
+    if not is_finite(program):
+        return unsolved(len(program.c), len(program.h), "NotFinite")
+    arrays = (np.ascontiguousarray(a) for a in (program.H, program.c, program.G, program.h))
+    z, _, flag, info = daqp.solve(*arrays, primal_tol=DAQP_TOLERANCE)
+    z, multipliers = np.array(z), np.array(info["lam"])
+    return QpSolution(
+        z=z,
+        multipliers=multipliers,
+        status=DAQP_STATUS.get(flag, f"exit flag {flag}"),
+        is_solved=flag == 1,
+        residuals=residuals(program, z, multipliers),
+    )
+
+
+SOLVERS: Mapping[str, QpSolver] = {"clarabel": solve_clarabel, "daqp": solve_daqp}
 
 
 def is_finite(program: QuadraticProgram) -> bool:
@@ -165,7 +141,6 @@ def unsolved(num_variables: int, num_rows: int, status: str) -> QpSolution:
         status=status,
         is_solved=False,
         residuals=Residuals(primal=np.inf, dual=np.inf, gap=np.inf),
-        iterations=0,
     )
 
 
@@ -214,7 +189,7 @@ def descend(
     slack cost. Programs with slacks are feasible by construction, so the lower rungs are for failing solvers.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
-    firm = solver.solve(assemble_hard(costs, *box, barriers))
+    firm = solver(assemble_hard(costs, *box, barriers))
     price = np.concatenate([np.full(len(barrier), barrier.slack_cost) for barrier in barriers] or [np.zeros(0)])
     if is_usable(firm, config.max_residual) and bool(np.all(firm.multipliers[2 * J :] <= price)):
         return Choice(
@@ -228,7 +203,7 @@ def descend(
         )
     least_violation = [stray_cost(np.zeros(J), 1.0)]
     for num_refused, (rung, terms) in enumerate(((Rung.SOLVED, costs), (Rung.MINIMUM_VIOLATION, least_violation))):
-        solution = solver.solve(assemble(terms, *box, barriers))
+        solution = solver(assemble(terms, *box, barriers))
         if is_usable(solution, config.max_residual):
             slack = np.maximum(solution.z[J:], 0.0)
             has_given_way = bool(np.any(slack > config.slack_tolerance))

@@ -10,7 +10,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
@@ -19,7 +18,7 @@ from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind, is_imm
 from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, held, is_usable
 from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
-from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,11 +91,6 @@ class RowBuilder:
     def _terms(self) -> tuple[BarrierTerm, ...]:
         return (self.scene, *self._others)
 
-    @property
-    def num_external(self) -> int:
-        """Number of scene rows, which come first."""
-        return len(self.scene.names)
-
     def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
         """Return the rows in another field; see `SceneRows.in_field`."""
         other = copy(self)
@@ -110,7 +104,7 @@ class RowBuilder:
         binds = np.concatenate([can_bind(b.G, b.h, *state.box) for b in barriers])
         return Rows(barriers=barriers, margin=self._margin, is_fixed=is_fixed, in_qp=binds & ~is_fixed)
 
-    def cut(self, rows: Rows, state: State, velocity: Float64, chosen: NDArray[np.integer]) -> Rows:
+    def cut(self, rows: Rows, state: State, velocity: Float64, chosen: Integers) -> Rows:
         """Return the rows with a cut per `chosen` scene row (`SceneRows.cut`)."""
         cut = self.scene.cut(state, velocity, chosen, rows.external.distance)
         return replace(rows, cuts=cut if rows.cuts is None else rows.cuts.joined(cut))
@@ -170,7 +164,7 @@ def solve_printed(
     """
     external, *firm = barriers
     J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)
-    solution = solver.solve(assemble_printed(state, configured_weights(config), posture, external, firm))
+    solution = solver(assemble_printed(state, configured_weights(config), posture, external, firm))
     if not is_usable(solution, config.max_residual):
         return held(J, M + num_firm, solution, num_refused=1)
     slack = np.concatenate([np.maximum(-solution.z[J + 6 :], 0.0), np.zeros(num_firm)])

@@ -10,7 +10,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction
-from splatctrl_cli.control.barriers import scene_margin
+from splatctrl_cli.control.barriers import SceneStepAt, rate_of, scene_margin
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
 from splatctrl_cli.control.preconditions import (
     StaticViolation,
@@ -21,7 +21,6 @@ from splatctrl_cli.control.preconditions import (
     sphere_clearance,
     static_violations,
 )
-from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController
 from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
 
@@ -126,7 +125,6 @@ class StepRecord(Protocol):
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
         """Append a step."""
-        ...
 
 
 class InMemory:
@@ -172,7 +170,12 @@ def closed_loop(
     start outside the limits or an unreachable goal, NotEvaluableError for a start in collision or outside the field.
     """
     field = field_at(task.stamp_ns)
-    q, controller = _ready(model, config, task, field, distance_to)
+    q = checked_posture(model, task.start, what="start")
+    check_within_limits(model, q, config.limit_tolerance)
+    for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):
+        check_goal(model, waypoint.T_world_goal)
+    controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
+    check_free(model, field, q, distance_to)
     controller = controller.with_field(field, balls_at(task.stamp_ns))
     by_surface: tuple[str, ...] = ()
     statics = static_violations(model, field, q, scene_margin(model, config))
@@ -182,8 +185,9 @@ def closed_loop(
     outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
-        if course.is_anchor(index):
-            q, last_velocity = course.anchor(stamp)
+        logged = course.anchor(index, stamp)
+        if logged is not None:
+            q, last_velocity = logged
             anchored.append(index)
         if field_at(stamp) is not field:
             changes.append(scene_change(model, stamp, q, field, field_at(stamp)))
@@ -227,22 +231,6 @@ def closed_loop(
     )
 
 
-def _ready(
-    model: ArmModel,
-    config: ControlConfig,
-    task: ReplayTask,
-    field: DistanceField,
-    distance_to: DistanceFunction | None,
-) -> tuple[Float64, QpIkController]:
-    q = checked_posture(model, task.start, what="start")
-    check_within_limits(model, q, config.limit_tolerance)
-    for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):
-        check_goal(model, waypoint.T_world_goal)
-    controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
-    check_free(model, field, q, distance_to)
-    return q, controller
-
-
 class _Course:
     """Goals by step: waypoints in order, or the logged motion."""
 
@@ -260,21 +248,15 @@ class _Course:
         left = config.max_time if last_ns is None else (last_ns - task.stamp_ns) * 1e-9 + config.period
         self.num_steps = max(round(left / config.period), 1)
 
-    def is_anchor(self, index: int) -> bool:
-        """True at every anchor period but the first step, while the log lasts."""
+    def anchor(self, index: int, stamp_ns: int) -> tuple[Float64, Float64] | None:
+        """Return the logged position and velocity (J,) at every anchor period but the first, while the log lasts."""
         task = self._task
         if task.anchors is None or index == 0 or task.anchor_period <= 0:
-            return False
-        every = max(round(task.anchor_period / self._config.period), 1)
-        is_logged = task.stamp_ns + round(index * self._config.period * 1e9) <= task.anchors.last_ns
-        if index % every or not is_logged:
-            return False
+            return None
+        if index % max(round(task.anchor_period / self._config.period), 1) or stamp_ns > task.anchors.last_ns:
+            return None
         self._since = index
-        return True
-
-    def anchor(self, stamp_ns: int) -> tuple[Float64, Float64]:
-        assert self._task.anchors is not None
-        return self._task.anchors.at(stamp_ns)
+        return task.anchors.at(stamp_ns)
 
     def has_stalled(self, stamp_ns: int, index: int, q: Float64) -> bool:
         """True at a standstill before the goal without a planned detour; starts one if possible.

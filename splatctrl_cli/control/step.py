@@ -16,7 +16,18 @@ from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
 from splatctrl_cli.control.qp import SOLVERS, Choice, QpSolver, Rung, descend, held, unsolved
 from splatctrl_cli.control.qp_rows import PRINTED, RowBuilder, Rows, solve_printed
-from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
+from splatctrl_cli.control.terms import (
+    BarrierTerm,
+    Cost,
+    CostTerm,
+    RowKind,
+    State,
+    configured_weights,
+    eliminated_weight,
+    reach_cost,
+    standard_costs,
+    summed,
+)
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 
@@ -95,9 +106,9 @@ class Moment:
     q: Float64
     T_world_goal: Float64
     guide: Guide | None
-    last_velocity: Float64
+    last_velocity: Float64 | None
     distance_rate: float | Float64
-    by_surface: tuple[str, ...] = ()
+    by_surface: Collection[str] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +121,10 @@ class View:
 
 
 class QpIkController:
-    """Drives a frame to a goal pose under a distance field's barrier rows (III-E)."""
+    """Drives a frame to a goal pose under a distance field's barrier rows (III-E).
+
+    row_names, row_kinds (M,): of all rows.
+    """
 
     def __init__(
         self,
@@ -130,16 +144,16 @@ class QpIkController:
         check_model(model)
         check_coverage(model, config)
         self._model, self._config, self._frame = model, config, frame
-        self._solver: QpSolver = SOLVERS[config.solver]() if solver is None else solver
+        self._solver: QpSolver = SOLVERS[config.solver] if solver is None else solver
         self._limits = JointLimits.of(model, config)
         further = [term for term in terms if isinstance(term, BarrierTerm)]
         self._builder = RowBuilder(model, config, field, self._limits.acceleration, further)
         self._limit_names = tuple(f"{joint} {side}" for side in ("highest", "lowest") for joint in model.joint_names)
-        self._row_names = self._builder.names
+        self.row_names, self.row_kinds = self._builder.names, self._builder.kinds
         costs = [term for term in terms if not isinstance(term, BarrierTerm)]
         home = np.asarray(model.middle if home is None else home, dtype=np.float64)
         self._costs: tuple[CostTerm, ...] = (*standard_costs(config, home), *costs)
-        self._reach = ReachGoal.of(config)
+        self._reach_weight = eliminated_weight(*configured_weights(config))
 
     def with_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
         """Return the controller on a newer field; see `SceneRows.in_field`."""
@@ -164,55 +178,47 @@ class QpIkController:
         by_surface: spheres that count by their link's surface; one whose row would relax joins them if its surface is
         farther. Raises InputError for a q that is not finite, NotEvaluableError where the field has no distance.
         """
-        config = self._config
-        rest = self._limits.rest(last_velocity)
-        view = self._viewed(q, T_world_goal, distance_rate, guide, last_velocity, by_surface)
-        error, state, rows = view.error, view.state, view.rows
-        costs = [term.rows(state) for term in self._costs]
+        moment = Moment(
+            stamp_ns=0,
+            q=q,
+            T_world_goal=T_world_goal,
+            guide=guide,
+            last_velocity=last_velocity,
+            distance_rate=distance_rate,
+            by_surface=by_surface,
+        )
+        return self.decide(self.view(moment))
+
+    def decide(self, view: View) -> ControlStep:
+        """Return the step of a view. Raises as `step`."""
+        config, error, state, rows = self._config, view.error, view.state, view.rows
+        rest = self._limits.rest(state.last_velocity)
+        costs = [cost(state) for cost in self._costs]
         if config.program == PRINTED:
             printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
             return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
-        costs.append(self._reach.rows(state))
+        costs.append(reach_cost(state.jacobian, state.reference, self._reach_weight))
         rows, choice, is_kept = self._descended(state, costs, rows)
         while np.any(newly := self._sticking_out(state, rows, choice)):
             state = replace(state, by_surface=state.by_surface | newly)
             rows, choice, is_kept = self._descended(state, costs, self._builder.at(state))
         scale = 1.0 if is_kept else self._kept_scale(state, choice, rows, rest)
-        by_surface = self._named(state.by_surface)
-        return replace(self._reported(error, rows, choice, rest, scale), by_surface=by_surface)
+        return replace(self._reported(error, rows, choice, rest, scale), by_surface=self._named(state.by_surface))
 
     def view(self, moment: Moment) -> View:
         """Return a step's input at a moment. Raises as `step`."""
-        return self._viewed(
-            moment.q,
-            moment.T_world_goal,
-            moment.distance_rate,
-            moment.guide,
-            moment.last_velocity,
-            moment.by_surface,
-        )
-
-    def _viewed(
-        self,
-        q: Float64,
-        T_world_goal: Float64,
-        distance_rate: float | Float64,
-        guide: Guide | None,
-        last_velocity: Float64 | None,
-        by_surface: Collection[str],
-    ) -> View:
-        q = checked_posture(self._model, q)
-        error = pose_error(self._model.frame_pose(q, self._frame), T_world_goal)
+        q = checked_posture(self._model, moment.q)
+        error = pose_error(self._model.frame_pose(q, self._frame), moment.T_world_goal)
         state = State(
             model=self._model,
             frame=self._frame,
             q=q,
-            box=self._limits.box(q, last_velocity),
-            reference=self._reference(error, guide),
-            guide=guide,
-            last_velocity=last_velocity,
-            distance_rate=distance_rate,
-            by_surface=np.array([name in by_surface for name in self._builder.scene.names]),
+            box=self._limits.box(q, moment.last_velocity),
+            reference=self._reference(error, moment.guide),
+            guide=moment.guide,
+            last_velocity=moment.last_velocity,
+            distance_rate=moment.distance_rate,
+            by_surface=np.array([name in moment.by_surface for name in self._builder.scene.names]),
         )
         return View(error=error, state=state, rows=self._builder.at(state))
 
@@ -233,16 +239,6 @@ class QpIkController:
             choice = replace(choice, slack=np.maximum(broken, 0.0))
         return self._reported(view.error, rows, choice, rest, 1.0)
 
-    @property
-    def row_names(self) -> tuple[str, ...]:
-        """Names of the rows (M,)."""
-        return self._row_names
-
-    @property
-    def row_kinds(self) -> tuple[RowKind, ...]:
-        """Kinds of the rows (M,)."""
-        return self._builder.kinds
-
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
         """Return the room that any joint velocity (J,) [rad/s] leaves at q (J,).
 
@@ -256,7 +252,7 @@ class QpIkController:
         row, limit = int(np.argmin(room)), int(np.argmin(limits))
         return VelocityMargin(
             barrier=float(room[row]),
-            barrier_row=self._row_names[row],
+            barrier_row=self.row_names[row],
             limit=float(limits[limit]),
             limit_row=self._limit_names[limit],
         )
@@ -274,7 +270,7 @@ class QpIkController:
         A sphere that would meet another surface than its row's (a corner, a second splat) adds a row. Then the ladder
         runs again: cutting planes, at most `config.max_cuts` rounds.
         """
-        num_external, max_cuts = self._builder.num_external, self._config.max_cuts
+        num_external, max_cuts = len(self._builder.scene.names), self._config.max_cuts
         for num_cuts in range(max_cuts + 1):
             choice = descend(self._solver, costs, state.box, rows.for_qp, self._config)
             if choice.rung is Rung.HOLD:
@@ -335,10 +331,10 @@ class QpIkController:
             scale=scale,
             pose_error=error,
             clearance=float(np.min(rows.external.distance)),
-            nearest=self._row_names[int(np.argmin(rows.external.distance))],
+            nearest=self.row_names[int(np.argmin(rows.external.distance))],
             self_clearance=float(np.min(rows.own.distance, initial=np.inf)),
             relaxed=tuple(
-                RowSlack(name=self._row_names[i], slack=float(slack[i]))
+                RowSlack(name=self.row_names[i], slack=float(slack[i]))
                 for i in np.flatnonzero(slack > self._config.slack_tolerance)
             ),
             interventions=self._interventions(choice, rows),
@@ -352,18 +348,18 @@ class QpIkController:
 
     def _interventions(self, choice: Choice, rows: Rows) -> tuple[Intervention, ...]:
         multipliers = np.concatenate([choice.box_multipliers, rows.spread(choice.row_multipliers)])
-        names, num_limits = (*self._limit_names, *self._row_names), len(self._limit_names)
+        names, num_limits = (*self._limit_names, *self.row_names), len(self._limit_names)
         return tuple(
             Intervention(
                 name=names[i],
-                kind=RowKind.LIMIT if i < num_limits else self._builder.kinds[i - num_limits],
+                kind=RowKind.LIMIT if i < num_limits else self.row_kinds[i - num_limits],
                 multiplier=float(multipliers[i]),
             )
             for i in np.flatnonzero(multipliers > MULTIPLIER)
         )
 
     def _named(self, rows: Bool) -> tuple[str, ...]:
-        return tuple(self._row_names[i] for i in np.flatnonzero(rows))
+        return tuple(self.row_names[i] for i in np.flatnonzero(rows))
 
 
 class Commander(Protocol):
@@ -372,11 +368,9 @@ class Commander(Protocol):
     @property
     def is_over(self) -> bool:
         """True once no step will follow; the last one was to rest."""
-        ...
 
     def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
         """Return the step at a moment."""
-        ...
 
 
 class Ours:
@@ -385,14 +379,7 @@ class Ours:
     is_over = False
 
     def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
-        return controller.step(
-            moment.q,
-            moment.T_world_goal,
-            distance_rate=moment.distance_rate,
-            guide=moment.guide,
-            last_velocity=moment.last_velocity,
-            by_surface=moment.by_surface,
-        )
+        return controller.decide(controller.view(moment))
 
 
 OURS = Ours()

@@ -1,23 +1,21 @@
 """Terms of the QP of III-E over joint velocities; the solver adds them.
 
-A further term for `QpIkController` is one class: a cost with ``rows(state) -> (H, c)``, or a `BarrierTerm` with rows
-``G v - s <= h``.
+A further term for `QpIkController` is a cost, a function of the state that gives ``(H, c)``, or a `BarrierTerm` with
+rows ``G v - s <= h``.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import cached_property
-from typing import Protocol
+from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import Guide
-from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.records import Bool, Float64, Integers
 
 Cost = tuple[Float64, Float64]
 """H (J, J) and c (J,) of a cost ``1/2 v' H v + c' v`` over joint velocities v (J,)."""
@@ -55,66 +53,32 @@ class State:
         return self.model.spheres_at(self.q)
 
 
-class CostTerm(Protocol):
-    """A cost over joint velocities."""
-
-    def rows(self, state: State) -> Cost:
-        """Return H and c."""
-        ...
+CostTerm = Callable[[State], Cost]
+"""A cost over joint velocities at a state."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReachGoal:
-    """First two terms of III-E, ``(u - J v)' W (u - J v)``: u the reference.
-
-    weight (6,): diagonal of W.
-    """
-
-    weight: Float64
-
-    @classmethod
-    def of(cls, config: ControlConfig) -> "ReachGoal":
-        """Return the term of the configured Q and R."""
-        Q, R = configured_weights(config)
-        return cls(weight=eliminated_weight(Q, R))
-
-    def rows(self, state: State) -> Cost:
-        return reach_cost(state.jacobian, state.reference, self.weight)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LeanHome:
+def lean_home(state: State, *, home: Float64, gain: float, weight: float) -> Cost:
     """Home bias of III-E, which makes a redundant arm's QP strictly convex.
 
     It leads to home (J,) [rad], or to the guide's posture, added to that posture's motion.
     """
-
-    home: Float64
-    gain: float
-    weight: float
-
-    def rows(self, state: State) -> Cost:
-        if state.guide is None:
-            return stray_cost(self.gain * (self.home - state.q), self.weight)
-        return stray_cost(self.gain * (state.guide.posture - state.q) + state.guide.velocity, self.weight)
+    if state.guide is None:
+        return stray_cost(gain * (home - state.q), weight)
+    return stray_cost(gain * (state.guide.posture - state.q) + state.guide.velocity, weight)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChangeLittle:
+def change_little(state: State, *, weight: float) -> Cost:
     """Smoothness: a cost of change from the last velocity, if known."""
-
-    weight: float
-
-    def rows(self, state: State) -> Cost:
-        if state.last_velocity is None:
-            return stray_cost(np.zeros(len(state.q)), 0.0)
-        return stray_cost(state.last_velocity, self.weight)
+    if state.last_velocity is None:
+        return stray_cost(np.zeros(len(state.q)), 0.0)
+    return stray_cost(state.last_velocity, weight)
 
 
 def standard_costs(config: ControlConfig, home: Float64) -> tuple[CostTerm, ...]:
     """Return the optional costs of III-E."""
-    lean = LeanHome(home=home, gain=config.posture_gain, weight=config.posture_weight)
-    return (lean, ChangeLittle(weight=config.smoothness_weight)) if config.smoothness_weight > 0 else (lean,)
+    lean = partial(lean_home, home=home, gain=config.posture_gain, weight=config.posture_weight)
+    smooth = partial(change_little, weight=config.smoothness_weight)
+    return (lean, smooth) if config.smoothness_weight > 0 else (lean,)
 
 
 def configured_weights(config: ControlConfig) -> tuple[Float64, Float64]:
@@ -132,7 +96,7 @@ def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float
 
 
 def reach_cost(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost:
-    """Return the cost ``(u - J v)' W (u - J v)`` of missing velocity u.
+    """Return the cost ``(u - J v)' W (u - J v)`` of missing velocity u: the first two terms of III-E.
 
     jacobian (6, J); u (6,) [m/s, rad/s], world; weight (6,): diagonal of W.
     """
@@ -170,7 +134,7 @@ class Barrier:
     Slack costs ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
     """
 
-    index: NDArray[np.integer]
+    index: Integers
     G: Float64
     h: Float64
     distance: Float64
@@ -180,7 +144,7 @@ class Barrier:
     def __len__(self) -> int:
         return len(self.h)
 
-    def select(self, rows: NDArray[np.bool_]) -> "Barrier":
+    def select(self, rows: Bool) -> "Barrier":
         """Return the rows of a mask (M,)."""
         return replace(self, index=self.index[rows], G=self.G[rows], h=self.h[rows], distance=self.distance[rows])
 
@@ -204,7 +168,7 @@ class BarrierTerm(ABC):
     kind = RowKind.LIMIT
     names: tuple[str, ...]
 
-    @property
+    @cached_property
     def margin(self) -> Float64:
         """Margins of the rows (M,) [m]."""
         return np.zeros(len(self.names))

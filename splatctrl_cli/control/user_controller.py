@@ -100,7 +100,6 @@ class Controller(Protocol):
 
     def step(self, now: ControllerInput) -> Sequence[float] | Float64:
         """Return the joint velocities (J,) [rad/s] for a period."""
-        ...
 
 
 def serve(target: str) -> None:

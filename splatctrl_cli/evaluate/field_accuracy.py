@@ -15,7 +15,7 @@ from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, Index, RgbdFrame
 from splatctrl_cli.report.field_pictures import Reliability, reliability
-from splatctrl_cli.robot.mesh_distance import MeshDistance
+from splatctrl_cli.robot.link_meshes import MeshDistance
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,27 +9,16 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, SeField, SphereField
+from splatctrl_cli.field.distance import KERNEL_OF, KERNELS, SphereField, device_field
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
-from splatctrl_cli.field.on_device import device_field
 from splatctrl_cli.field.probability import make_probability
+from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
 from splatctrl_cli.records import Bool, Float32, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid
 
-CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
-    "sdf": ("<f4", 1),
-    "gradient": ("<f4", 3),
-    "bound": ("<f4", 1),
-    "observed": ("|u1", 1),
-    "probability": ("<f4", 1),
-    "label": ("|u1", 1),
-    "hard": ("<f4", 1),
-    "se": ("<f4", 1),
-    "gpdf": ("<f4", 1),
-}
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
 
 Planes = dict[str, NDArray[np.generic]]
@@ -68,18 +57,16 @@ class Baker:
         self.channels = tuple(name for name in CHANNELS if name in channels)
         self.labels = splats.labels
         self.spheres = Spheres.of(splats.centers, splats.radii, layout.box)
-        self.exact = SphereField.over(self.spheres, threads=threads)
+        self.exact = SphereField(self.spheres, threads=threads)
         self.kernel_name = KERNEL_OF[config.distance]
         names = {self.kernel_name, *channels}
-        self.se = SeField.over(self.spheres, config, threads=threads) if "se" in names else None
-        self.gpdf = GpdfField.over(self.spheres, config, threads=threads) if "gpdf" in names else None
+        kinds = {name: kind for name, kind in KERNELS.items() if name in names}
+        self.kernels = {name: kind(self.spheres, config, threads=threads) for name, kind in kinds.items()}
         has_probability = "probability" in channels
         self.probability = make_probability(self.spheres, config, threads=threads) if has_probability else None
-        self.kernels: tuple[str, ...] = tuple(name for name in ("se", "gpdf") if name in names)
         self.counts = {f"{name}_{what}": 0 for name in self.kernels for what in ("without_value", "over_estimates")}
         self._occupancy, self._thresholds = occupancy, thresholds or OccupancyConfig()
-        fields = {name: field for name, field in (("se", self.se), ("gpdf", self.gpdf)) if field is not None}
-        self.on_device = None if device is None else device_field(self.spheres, fields, config, device)
+        self.on_device = None if device is None else device_field(self.spheres, self.kernels, config, device)
 
     def close(self) -> None:
         """Free a card's memory."""
@@ -93,18 +80,14 @@ class Baker:
         Half a cell's diagonal (hard is 1-Lipschitz), plus float32 rounding.
         """
         box = self.layout.box
-        reach = np.abs(self.spheres.points.clusters.centers[:, self.spheres.points.is_point.view(np.bool_)]).max()
+        reach = np.abs(self.spheres.clusters.centers[:, self.spheres.is_point.view(np.bool_)]).max()
         size = float(np.abs(box.upper - box.lower).max()) + float(reach)
         return HALF_DIAGONAL * self.layout.voxel + 1e-6 + 1e-6 * size
 
     def allocate(self, num_planes: int) -> Planes:
         """Arrays for the channels of `num_planes` x-planes."""
-        return {name: np.empty(self.shape_of(name, num_planes), CHANNELS[name][0]) for name in self.channels}
-
-    def shape_of(self, channel: str, num_planes: int) -> tuple[int, ...]:
-        """(num_planes, Y, Z), or (num_planes, Y, Z, 3)."""
-        shape = (num_planes, *self.layout.shape[1:])
-        return shape if CHANNELS[channel][1] == 1 else (*shape, CHANNELS[channel][1])
+        cells = (num_planes, *self.layout.shape[1:])
+        return {name: np.empty(CHANNELS[name].shape(cells), CHANNELS[name].dtype) for name in self.channels}
 
     def bake(self, first: int, last: int, out: Planes, mask: UInt8 | None = None) -> None:
         """Fill `out` with x-planes [first, last), whole blocks of 8 cells.
@@ -120,7 +103,7 @@ class Baker:
 
     def span(self, first: int, last: int, mask: UInt8 | None = None) -> GridSpan:
         """Cells of x-planes [first, last), in the spheres' frame."""
-        origin = self.layout.origin - self.spheres.points.anchor
+        origin = self.layout.origin - self.spheres.anchor
         return GridSpan(
             origin=origin, voxel=self.layout.voxel, shape=self.layout.shape, first=first, last=last, mask=mask
         )
@@ -142,7 +125,7 @@ class Baker:
             whole[... if where is None else where] = made["sdf"]
             made["probability"] = _picked(self.probability.baked(span, whole, threads=self.threads), cells)
         if entry is not None:
-            made["label"] = self.labels[self.spheres.points.source[entry]]
+            made["label"] = self.labels[self.spheres.source[entry]]
         if "observed" in self.channels:
             observed = observed_planes(self._occupancy, self.layout, self._thresholds, span.first, span.last)
             made["observed"] = _picked(observed, cells)
@@ -183,18 +166,14 @@ class Baker:
         hard = np.zeros(span.shape_of_channel, np.float32)
         gradient = np.zeros((*hard.shape, 3), np.float32) if "gradient" in self.channels else None
         entry = np.zeros(hard.shape, np.int32) if "label" in self.channels else None
-        native.bake_hard(
-            self.spheres.points.clusters, self.exact.radii, span, hard, gradient, entry, threads=self.threads
-        )
+        native.bake_hard(self.spheres.clusters, self.exact.radii, span, hard, gradient, entry, threads=self.threads)
         return hard, gradient, entry
 
     def _kernel(self, name: str, span: GridSpan) -> tuple[Float32, Float32 | None]:
         distance = np.zeros(span.shape_of_channel, np.float32)
         has_gradient = "gradient" in self.channels and name == self.kernel_name
         gradient = np.zeros((*distance.shape, 3), np.float32) if has_gradient else None
-        field = self.se if name == "se" else self.gpdf
-        assert field is not None
-        field.bake_raw(span, distance, gradient, threads=self.threads)
+        self.kernels[name].bake_raw(span, distance, gradient, threads=self.threads)
         return distance, gradient
 
     def _chosen(

@@ -6,80 +6,82 @@ A space-filling curve sorts points into clusters of 16, and these into groups of
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Offsets
-from splatctrl_cli.records import Box, Float32, Float64, UInt8
+from splatctrl_cli.records import Box, Float32, Float64, Floats, Index, UInt8
 
 _BITS = 10  # per coordinate of a Hilbert code
 _GROUPS = 8  # their number is a multiple of this
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClusteredPoints:
-    """N points as C clusters, relative to an anchor.
+class Spheres:
+    """N spheres, their centres as C clusters, relative to an anchor; radii (N,) [m].
 
-    float32 then keeps 0.1 um within a metre or two. anchor (3,) [m], world; source (16 C,): point of each entry;
+    float32 then keeps 0.1 um within a metre or two. anchor (3,) [m], world; source (16 C,): sphere of each entry;
     is_point (16 C,): 0 if spare.
     """
 
     anchor: Float64
-    source: NDArray[np.int64]
+    source: Index
     is_point: UInt8
     clusters: Clusters
+    radii: Float64
+
+    @classmethod
+    def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
+        """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
+
+        Anchor and curve follow `frame`, by default the centres' box. With one frame, centres of two sets keep order
+        and coordinates to the bit. Raises NotEvaluableError without any, InputError for a wrong shape, a value not
+        finite, or a negative radius.
+        """
+        points, radius_array = _checked(centers, radii)
+        lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
+        anchor = 0.5 * (lower + upper)
+        codes = _hilbert_codes(points, lower, float((upper - lower).max()))
+        order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], codes))
+        source = np.zeros(LANES * _padded(-(-len(points) // LANES), LANES), dtype=np.int64)
+        source[: len(order)] = order
+        relative = np.full((len(source), 3), SPARE_PLACE, dtype=np.float32)
+        relative[: len(order)] = (points - anchor)[order]
+        return cls(
+            anchor=anchor,
+            source=source,
+            is_point=(np.arange(len(source)) < len(order)).astype(np.uint8),
+            clusters=Clusters(centers=np.ascontiguousarray(relative.T), boxes=_boxes(relative, len(order))),
+            radii=radius_array,
+        )
 
     @property
     def num_points(self) -> int:
         """N."""
         return int(np.count_nonzero(self.is_point))
 
-    def relative(self, points_world: NDArray[np.floating]) -> Float32:
+    def relative(self, points_world: Floats) -> Float32:
         """Return world points (Q, 3) relative to the anchor."""
         return np.ascontiguousarray(points_world - self.anchor, dtype=np.float32)
 
-    def laid_out(self, values: NDArray[np.floating], *, spare: float) -> Float64:
+    def laid_out(self, values: Floats, *, spare: float) -> Float64:
         """Values (N,) -> (16 C,), `spare` without a point."""
         return np.where(self.is_point, np.asarray(values, dtype=np.float64)[self.source], spare)
 
-    def gathered(self, values: NDArray[np.float64]) -> Float64:
+    def gathered(self, values: Float64) -> Float64:
         """Values (16 C,) -> (N,)."""
         result = np.empty(self.num_points)
         is_point = self.is_point.view(np.bool_)
         result[self.source[is_point]] = values[is_point]
         return result
 
-    def offsets(self, values: NDArray[np.floating], *, spare: float = SPARE_OFFSET) -> Offsets:
+    def offsets(self, values: Floats, *, spare: float = SPARE_OFFSET) -> Offsets:
         """Lay out offsets (N,), with each cluster's and group's largest."""
         laid_out = self.laid_out(values, spare=spare).astype(np.float32)
         by_cluster = laid_out.reshape(-1, LANES).max(axis=1)
         by_group = np.full(_padded(len(by_cluster) // LANES, _GROUPS), spare, np.float32)
         by_group[: len(by_cluster) // LANES] = by_cluster.reshape(-1, LANES).max(axis=1)
         return Offsets(values=laid_out, maxima=np.concatenate([by_cluster, by_group]))
-
-
-def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None) -> ClusteredPoints:
-    """Cluster points (N, 3) [m], N > 0.
-
-    Anchor and curve follow `frame`, by default the points' box. With one frame, points of two sets keep order and
-    coordinates to the bit.
-    """
-    points = np.asarray(points_world, dtype=np.float64)
-    lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
-    anchor = 0.5 * (lower + upper)
-    codes = _hilbert_codes(points, lower, float((upper - lower).max()))
-    order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], codes))
-    num_clusters = _padded(-(-len(points) // LANES), LANES)
-    source = np.zeros(LANES * num_clusters, dtype=np.int64)
-    source[: len(order)] = order
-    relative = np.full((len(source), 3), SPARE_PLACE, dtype=np.float32)
-    relative[: len(order)] = (points - anchor)[order]
-    return ClusteredPoints(
-        anchor=anchor,
-        source=source,
-        is_point=(np.arange(len(source)) < len(order)).astype(np.uint8),
-        clusters=Clusters(centers=np.ascontiguousarray(relative.T), boxes=_boxes(relative, len(order))),
-    )
 
 
 def _boxes(relative: Float32, num_points: int) -> Float32:
@@ -99,7 +101,7 @@ def _padded(count: int, multiple: int) -> int:
     return -(-count // multiple) * multiple
 
 
-def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np.int64]:
+def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> Index:
     """Places (N,) along a Hilbert curve, whose neighbours are near in space.
 
     Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004).
@@ -126,25 +128,7 @@ def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np
     return codes
 
 
-@dataclass(frozen=True, kw_only=True)
-class Spheres:
-    """N spheres: clustered centres, radii (N,) [m]."""
-
-    points: ClusteredPoints
-    radii: Float64
-
-    @classmethod
-    def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
-        """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
-
-        Raises NotEvaluableError without any, InputError for a wrong shape, a value not finite, or a negative
-        radius.
-        """
-        center_array, radius_array = _checked(centers, radii)
-        return cls(points=cluster_points(center_array, frame), radii=radius_array)
-
-
-def checked_points(points: NDArray[np.floating]) -> Float64:
+def checked_points(points: Floats) -> Float64:
     """Return points as float64. Raises InputError unless (Q, 3) and finite."""
     array = shaped_points(points)
     if not np.isfinite(array).all():
@@ -152,7 +136,7 @@ def checked_points(points: NDArray[np.floating]) -> Float64:
     return array
 
 
-def shaped_points(points: NDArray[np.floating]) -> Float64:
+def shaped_points(points: Floats) -> Float64:
     """Return points as float64. Raises InputError unless (Q, 3)."""
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:

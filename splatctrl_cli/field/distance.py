@@ -1,9 +1,9 @@
-"""Distance fields over splats: exact, kernel, and the smaller. Positive outside."""
+"""Distance fields over splats, on the processor or a card: exact, kernel, and the smaller. Positive outside."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,10 +12,15 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import MARCH_STEPS, SIGNED_CARE
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
-from splatctrl_cli.field.weights import Matern12, SquaredExponential, weights_named
+from splatctrl_cli.field.grid_cells import RESOLUTION
+from splatctrl_cli.field.weights import METHODS, Kernel, Matern12, SquaredExponential, share_of_loss
 from splatctrl_cli.kernels import field as native
+from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField
+from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import GridSpan, LogSumExp
 from splatctrl_cli.records import DistanceField, Float32, Float64
+
+DEFAULT = FieldConfig()
 
 
 class SphereField:
@@ -24,64 +29,35 @@ class SphereField:
     Inside, it is minus the depth in the deepest sphere, not the distance to the union's surface.
     """
 
-    def __init__(self, centers: ArrayLike, radii: ArrayLike, *, threads: int = 1) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m]. Raises as `Spheres.of`."""
-        self._hold(Spheres.of(centers, radii), threads)
-
-    @classmethod
-    def over(cls, spheres: Spheres, *, threads: int = 1) -> "SphereField":
-        """Make the field of clustered spheres."""
-        field = cls.__new__(cls)
-        field._hold(spheres, threads)
-        return field
-
-    def _hold(self, spheres: Spheres, threads: int) -> None:
-        self.spheres = spheres
-        self.radii = spheres.points.offsets(spheres.radii)
-        self._threads = threads
+    def __init__(self, spheres: Spheres, *, threads: int = 1) -> None:
+        self.spheres, self._threads = spheres, threads
+        self.radii = spheres.offsets(spheres.radii)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient, as in `DistanceField.query`; zero gradient at a centre."""
-        local = self.spheres.points.relative(checked_points(points))
-        score, gradient, _ = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)
+        local = self.spheres.relative(checked_points(points))
+        score, gradient, _ = native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the distance."""
-        local = self.spheres.points.relative(checked_points(points))
-        entry = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)[2]
-        return self.spheres.points.source[entry]
+        local = self.spheres.relative(checked_points(points))
+        entry = native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]
+        return self.spheres.source[entry]
 
 
 class LogSumExpField(ABC):
-    """A log-sum-exp over splats."""
+    """A log-sum-exp over splats, of a kernel and weights."""
 
-    spheres: Spheres
+    kernel_type: ClassVar[type[Kernel]]
 
-    def __init__(
-        self,
-        centers: ArrayLike,
-        radii: ArrayLike,
-        length_scale: float = FieldConfig.length_scale,
-        *,
-        noise: float = FieldConfig.noise,
-        truncation: float = FieldConfig.truncation,
-        weights: str = FieldConfig.weights,
-        threads: int = 1,
-    ) -> None:
-        """centers (N, 3) [m], world; radii (N,), length_scale, truncation [m]. Raises as `Spheres.of`."""
-        config = FieldConfig(length_scale=length_scale, noise=noise, truncation=truncation, weights=weights)
-        self._hold(Spheres.of(centers, radii), config, threads)
-
-    @classmethod
-    def over(cls, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Self:
-        """Make the field of clustered spheres."""
-        field = cls.__new__(cls)
-        field._hold(spheres, config, threads)
-        return field
-
-    @abstractmethod
-    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None: ...
+    def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
+        self.spheres, self._threads = spheres, threads
+        self.kernel = self.kernel_type(config.length_scale)
+        self.weights = METHODS[config.weights](spheres, self.kernel, config.noise, threads)
+        sign = self.weights.sign
+        self.sign = None if sign is None else spheres.laid_out(sign, spare=1.0).astype(np.float32)
+        self.tolerance = config.truncation * (1.0 if sign is None else SIGNED_CARE)
 
     @abstractmethod
     def terms(self) -> LogSumExp:
@@ -91,9 +67,20 @@ class LogSumExpField(ABC):
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined."""
 
+    def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
+        """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
+        terms = self.terms()
+        bake = native.bake_matern if terms.is_matern else native.bake_gaussian
+        bake(self.spheres.clusters, terms, span, distance, gradient, threads=threads)
+
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient as in `query_raw`, or the exact ones where those are undefined."""
-        return or_exact(self.query_raw(points), self.spheres, points)
+        distance, gradient = self.query_raw(points)
+        has_none = np.isnan(distance)
+        if has_none.any():
+            exact = SphereField(self.spheres)
+            distance[has_none], gradient[has_none] = exact.query(np.asarray(points, dtype=np.float64)[has_none])
+        return distance, gradient
 
 
 class GpdfField(LogSumExpField):
@@ -104,19 +91,15 @@ class GpdfField(LogSumExpField):
     undefined where weights of either sign (cg) give no positive sum.
     """
 
-    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
-        self.spheres = spheres
-        self.kernel = Matern12(config.length_scale)
-        self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
-        tolerance = config.truncation * (1.0 if self.weights.sign is None else SIGNED_CARE)
-        self.share = self.kernel.share(tolerance)
-        offsets = spheres.radii + self.kernel.length * self.weights.log_size
+    kernel_type = Matern12
+
+    def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
+        super().__init__(spheres, config, threads=threads)
+        self.share = share_of_loss(self.kernel.length, self.tolerance)
+        self.offsets = spheres.radii + self.kernel.length * self.weights.log_size
         # Float32 keeps the differences to the micrometre: the largest offset is added at the end, in float64.
-        self._common = float(offsets.max())
-        self.offsets = offsets
-        self._offsets = spheres.points.offsets(offsets - self._common)
-        self.sign = laid_out_sign(spheres, self.weights.sign)
-        self._threads = threads
+        self._common = float(self.offsets.max())
+        self._offsets = spheres.offsets(self.offsets - self._common)
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined.
@@ -124,33 +107,27 @@ class GpdfField(LogSumExpField):
         ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this,
         normalised (`normalised`).
         """
-        points_ = self.spheres.points
         score, gradient = native.matern(
-            points_.clusters,
+            self.spheres.clusters,
             self._offsets,
             self.sign,
             self.kernel.length,
             self.share,
-            points_.relative(checked_points(points)),
+            self.spheres.relative(checked_points(points)),
             threads=self._threads,
         )
         return score.astype(np.float64) - self._common, gradient.astype(np.float64)
 
     def terms(self) -> LogSumExp:
-        points = self.spheres.points
         return LogSumExp(
             is_matern=True,
-            offsets=points.offsets(self.offsets),
-            exact=points.laid_out(self.offsets, spare=native.SPARE_OFFSET),
-            radii=points.laid_out(self.spheres.radii, spare=0.0).astype(np.float32),
+            offsets=self.spheres.offsets(self.offsets),
+            exact=self.spheres.laid_out(self.offsets, spare=native.SPARE_OFFSET),
+            radii=self.spheres.laid_out(self.spheres.radii, spare=0.0).astype(np.float32),
             sign=self.sign,
             length=self.kernel.length,
             tolerance=self.share,
         )
-
-    def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
-        native.bake_matern(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
 class SeField(LogSumExpField):
@@ -161,48 +138,43 @@ class SeField(LogSumExpField):
     surface.
     """
 
-    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
-        self.spheres = spheres
-        self.kernel = SquaredExponential(config.length_scale)
-        self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
-        self.tolerance = config.truncation * (1.0 if self.weights.sign is None else SIGNED_CARE)
+    kernel_type = SquaredExponential
+
+    def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
+        super().__init__(spheres, config, threads=threads)
         self.unit = 2.0 * self.kernel.length**2
         log_size = self.weights.log_size
         self._common = self.unit * float(log_size.max())
-        self._offsets = spheres.points.offsets(self.unit * log_size - self._common)
-        self.radii = spheres.points.offsets(spheres.radii, spare=0.0)
-        self.sign = laid_out_sign(spheres, self.weights.sign)
-        self._threads = threads
+        self._offsets = spheres.offsets(self.unit * log_size - self._common)
+        self.radii = spheres.offsets(spheres.radii, spare=0.0)
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN where L >= 0."""
-        points_ = self.spheres.points
         score, gradient = native.gaussian(
-            points_.clusters,
+            self.spheres.clusters,
             self._offsets,
             self.radii.values,
             self.sign,
             self._common,
             self.kernel.length,
             self.tolerance,
-            points_.relative(checked_points(points)),
+            self.spheres.relative(checked_points(points)),
             threads=self._threads,
         )
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def query_safe(self, points: Float64) -> tuple[Float64, Float64]:
         """Return what `SafeField` returns, in one walk."""
-        points_ = self.spheres.points
         asked = shaped_points(points)
         found = native.safe(
-            points_.clusters,
+            self.spheres.clusters,
             self._offsets,
             self.radii,
             self.sign,
             self._common,
             self.kernel.length,
             self.tolerance,
-            points_.anchor,
+            self.spheres.anchor,
             asked,
             threads=self._threads,
         )
@@ -211,20 +183,16 @@ class SeField(LogSumExpField):
         return found
 
     def terms(self) -> LogSumExp:
-        points, log_size = self.spheres.points, self.weights.log_size
+        log_size = self.weights.log_size
         return LogSumExp(
             is_matern=False,
-            offsets=points.offsets(self.unit * log_size),
-            exact=points.laid_out(log_size, spare=native.SPARE_OFFSET),
+            offsets=self.spheres.offsets(self.unit * log_size),
+            exact=self.spheres.laid_out(log_size, spare=native.SPARE_OFFSET),
             radii=self.radii.values,
             sign=self.sign,
             length=self.kernel.length,
             tolerance=self.tolerance,
         )
-
-    def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """See `GpdfField.bake_raw`."""
-        native.bake_gaussian(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
 class SafeField:
@@ -249,56 +217,23 @@ class SafeField:
         return np.where(is_less, smooth, distance), np.where(is_less[:, None], smooth_gradient, gradient)
 
 
-def or_exact(raw: tuple[Float64, Float64], spheres: Spheres, points: Float64) -> tuple[Float64, Float64]:
-    """Replace NaN distances (Q,) and their gradients (Q, 3) by exact ones."""
-    distance, gradient = raw
-    has_none = np.isnan(distance)
-    if has_none.any():
-        exact = SphereField.over(spheres)
-        distance[has_none], gradient[has_none] = exact.query(np.asarray(points, dtype=np.float64)[has_none])
-    return distance, gradient
-
-
-def laid_out_sign(spheres: Spheres, sign: Float32 | None) -> Float32 | None:
-    """Lay out signs (N,) as (16 C,); None stays None."""
-    return None if sign is None else spheres.points.laid_out(sign, spare=1.0).astype(np.float32)
-
-
 def normalised(gradient: Float64) -> Float64:
     """Unit gradients (Q, 3), eq. 11 with its sign corrected; 0 stays 0."""
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
 
 
-KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "hard": None}
-_Make = Callable[[Spheres, FieldConfig, int], DistanceField]
-
-
-def _safe(spheres: Spheres, config: FieldConfig, threads: int) -> DistanceField:
-    return SafeField(SphereField.over(spheres, threads=threads), SeField.over(spheres, config, threads=threads))
-
-
-def _safe_gpdf(spheres: Spheres, config: FieldConfig, threads: int) -> DistanceField:
-    return SafeField(SphereField.over(spheres, threads=threads), GpdfField.over(spheres, config, threads=threads))
-
-
-DISTANCES: Mapping[str, _Make] = {
-    "safe": _safe,
-    "safe_gpdf": _safe_gpdf,
-    "hard": lambda spheres, config, threads: SphereField.over(spheres, threads=threads),
-    "se": lambda spheres, config, threads: SeField.over(spheres, config, threads=threads),
-    "gpdf": lambda spheres, config, threads: GpdfField.over(spheres, config, threads=threads),
-}
+KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "hard": None, "se": "se", "gpdf": "gpdf"}  # of `config.distance`
+KERNELS: Mapping[str, type[LogSumExpField]] = {"se": SeField, "gpdf": GpdfField}
 
 
 def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> DistanceField:
     """Make the field that ``config.distance`` names."""
-    return DISTANCES[config.distance](spheres, config, threads)
-
-
-def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> DistanceField:
-    """Make the field that ``config.distance`` names, over spheres (N, 3), (N,) [m]. Raises as `Spheres.of`."""
-    return field_over(Spheres.of(centers, radii), config, threads=threads)
+    name = KERNEL_OF[config.distance]
+    if name is None:
+        return SphereField(spheres, threads=threads)
+    kernel = KERNELS[name](spheres, config, threads=threads)
+    return kernel if config.distance == name else SafeField(SphereField(spheres, threads=threads), kernel)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,3 +269,56 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
         walked += np.where(direction.any(axis=1), length, 0.0)  # without a slope there is nowhere to go
         rest, gradient = field.query(hit)
     return March(distance=walked + rest, hit=hit, rest=rest)
+
+
+class OnDevice:
+    """The field that ``config.distance`` names, on a device."""
+
+    def __init__(self, spheres: Spheres, config: FieldConfig, device: Memory, *, threads: int = 1) -> None:
+        """The processor makes the weights. Raises OutOfMemory."""
+        self.spheres, kernel = spheres, KERNEL_OF[config.distance]
+        kernels = {} if kernel is None else {kernel: KERNELS[kernel](spheres, config, threads=threads)}
+        self.field = device_field(spheres, kernels, config, device)
+
+    @classmethod
+    def of(cls, centers: ArrayLike, radii: ArrayLike, config: FieldConfig, device: Memory) -> Self:
+        """Make the field over (N, 3), (N,) [m]. Raises as `Spheres.of`."""
+        return cls(Spheres.of(centers, radii), config, device)
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """Distance and gradient, as in `DistanceField.query`."""
+        if not len(points):
+            return np.zeros(0), np.zeros((0, 3))
+        found = self._asked(points, "gradient")
+        assert found.gradient is not None
+        return found.distance.astype(np.float64), found.gradient.astype(np.float64)
+
+    def distance(self, points: Float64) -> Float64:
+        """points (Q, 3) [m] -> distance (Q,) [m]."""
+        return self._asked(points).distance.astype(np.float64) if len(points) else np.zeros(0)
+
+    def nearest(self, points: Float64) -> NDArray[np.int64]:
+        """points (Q, 3) [m] -> index (Q,) of the sphere that gives the exact distance."""
+        if not len(points):
+            return np.zeros(0, np.int64)
+        found = self._asked(points, "entry")
+        assert found.entry is not None
+        return self.spheres.source[found.entry]
+
+    def _asked(self, points: Float64, *wanted: str) -> Answers:
+        return self.field.query(checked_points(points), self.spheres.anchor, wanted)
+
+    def close(self) -> None:
+        """Free the device's memory."""
+        self.field.close()
+
+
+def device_field(
+    spheres: Spheres, kernels: Mapping[str, LogSumExpField], config: FieldConfig, device: Memory
+) -> DeviceField:
+    """Put the exact distance and `kernels` on a device, for ``config.distance``."""
+    chosen = KERNEL_OF[config.distance]
+    choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
+    terms = {name: field.terms() for name, field in kernels.items()}
+    radii = spheres.offsets(spheres.radii)
+    return DeviceField(device, spheres.clusters, radii, terms, choice)

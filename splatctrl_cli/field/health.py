@@ -1,13 +1,13 @@
 """Checks that splats are dense and thick enough for a distance field."""
 
 from collections.abc import Collection, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config.fixed import MAX_RADIUS_SPREAD, ROUGH_LENGTH
+from splatctrl_cli.records import Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,14 +26,8 @@ class FieldHealth:
     planar_zero_level: float
     warnings: tuple[str, ...]
 
-    def as_dict(self) -> dict[str, object]:
-        """Return plain values for a header."""
-        return asdict(self)
 
-
-def field_health(
-    centers: NDArray[np.floating], radii: NDArray[np.floating], length: float, *, kernels: Collection[str]
-) -> FieldHealth:
+def field_health(centers: Floats, radii: Floats, length: float, *, kernels: Collection[str]) -> FieldHealth:
     """Health of splats (N, 3), (N,) [m] for kernels (se, gpdf) of this length scale [m]."""
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
@@ -71,9 +65,7 @@ def _warnings(
         )
 
 
-def _set_warnings(
-    centers: NDArray[np.floating], radii: NDArray[np.floating], length: float, *, has_kernel: bool
-) -> Iterable[str]:
+def _set_warnings(centers: Floats, radii: Floats, length: float, *, has_kernel: bool) -> Iterable[str]:
     extent = float(np.ptp(centers.astype(np.float64), axis=0).max())
     if len(centers) > 1 and extent == 0.0:
         yield f"all {len(centers)} splats stand at one place: the field is that of the largest; check the file"
@@ -92,7 +84,7 @@ def _set_warnings(
         )
 
 
-def median_spacing(centers: NDArray[np.floating]) -> float:
+def median_spacing(centers: Floats) -> float:
     """Median distance from a splat (N, 3) [m] to the nearest other one; 0 for fewer than two."""
     if len(centers) < 2:
         return 0.0

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.field.baker import Baker, Planes
-from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.kernels.field import BLOCK, GridSpan
+from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Float64, SplatSet, UInt8
 
 
@@ -33,40 +32,22 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
     Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
     culling bounds. Weights are compared too, as neighbours' weights change; `observed` is not.
     """
-    shape = blocks_of(new.layout)
+    shape = tuple(-(-cells // BLOCK) for cells in new.layout.shape)
     num_blocks = int(np.prod(shape))
     reason = _reason_for_all(old, new)
     if reason:
         return Changes(mask=None, num_blocks=num_blocks, reason=reason)
     mask = np.zeros(shape, np.uint8)
-    span = whole_span(new)
-    for changed, baker in zip(_changed((before, after), (old, new), with_weights=False), (old, new), strict=True):
-        _touch(baker.spheres.points.clusters, baker.exact.radii, changed, None, span, mask, baker.threads)
-    if new.se is not None:
-        for changed, baker in zip(_changed((before, after), (old, new), with_weights=True), (old, new), strict=True):
-            assert baker.se is not None
-            offsets = baker.spheres.points.offsets(baker.se.unit * baker.se.weights.log_size)
-            length = baker.se.kernel.length
-            _touch(baker.spheres.points.clusters, offsets, changed, length, span, mask, baker.threads)
+    span = new.span(0, new.layout.shape[0])
+    for with_weights in (False, True) if "se" in new.kernels else (False,):
+        both = _changed((before, after), (old, new), with_weights=with_weights)
+        for changed, baker in zip(both, (old, new), strict=True):
+            se = baker.kernels["se"] if with_weights else None
+            offsets, length = (baker.exact.radii, None) if se is None else (se.terms().offsets, se.kernel.length)
+            if changed.any():
+                clusters = baker.spheres.clusters
+                native.touched_blocks(clusters, offsets, changed, length, span, mask, threads=baker.threads)
     return Changes(mask=mask, num_blocks=num_blocks)
-
-
-def blocks_of(layout: GridLayout) -> tuple[int, int, int]:
-    """Blocks along x, y and z."""
-    x, y, z = (-(-cells // BLOCK) for cells in layout.shape)
-    return (x, y, z)
-
-
-def whole_span(baker: Baker) -> GridSpan:
-    """All cells of a baker's grid, in its spheres' frame."""
-    layout = baker.layout
-    return GridSpan(
-        origin=layout.origin - baker.spheres.points.anchor,
-        voxel=layout.voxel,
-        shape=layout.shape,
-        first=0,
-        last=layout.shape[0],
-    )
 
 
 def counts_after(
@@ -88,7 +69,7 @@ def counts_after(
 
 
 def _reason_for_all(old: Baker, new: Baker) -> str:
-    if new.gpdf is not None:
+    if "gpdf" in new.kernels:
         return "every splat reaches every cell of gpdf"
     if new.probability is not None and new.config.probability == "paper":
         return "every splat reaches every cell of the paper's probability"
@@ -97,19 +78,6 @@ def _reason_for_all(old: Baker, new: Baker) -> str:
     if "bound" in new.channels and old.bound_margin != new.bound_margin:
         return "the farthest splat moved, and bound's margin with it"
     return ""
-
-
-def _touch(
-    clusters: native.Clusters,
-    offsets: native.Offsets,
-    changed: UInt8,
-    length: float | None,
-    span: GridSpan,
-    mask: UInt8,
-    threads: int,
-) -> None:
-    if changed.any():
-        native.touched_blocks(clusters, offsets, changed, length, span, mask, threads=threads)
 
 
 def _changed(
@@ -121,8 +89,8 @@ def _changed(
     here, there = np.split(kinds, [len(rows[0])])
     laid_out = []
     for own, other, baker in ((here, there, bakers[0]), (there, here, bakers[1])):
-        changed = np.zeros(len(baker.spheres.points.source), np.uint8)
-        changed[np.flatnonzero(baker.spheres.points.is_point)] = ~np.isin(own, other)
+        changed = np.zeros(len(baker.spheres.source), np.uint8)
+        changed[np.flatnonzero(baker.spheres.is_point)] = ~np.isin(own, other)
         laid_out.append(changed)
     return laid_out[0], laid_out[1]
 
@@ -132,14 +100,14 @@ def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.v
 
     A rank separates splats of one centre: their order can decide the last bit.
     """
-    order = baker.spheres.points.source[baker.spheres.points.is_point.view(np.bool_)]
+    order = baker.spheres.source[baker.spheres.is_point.view(np.bool_)]
     centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0
     values: list[NDArray[np.floating | np.integer]] = [*centers.T, splats.radii[order], splats.labels[order]]
     if with_weights:
-        assert baker.se is not None
-        values.append(baker.se.weights.log_size[order])
-        if baker.se.weights.sign is not None:
-            values.append(baker.se.weights.sign[order])
+        weights = baker.kernels["se"].weights
+        values.append(weights.log_size[order])
+        if weights.sign is not None:
+            values.append(weights.sign[order])
     table = np.stack([*values, _ranks(centers)], axis=1, dtype=np.float64)
     return table.view(np.dtype((np.void, table.strides[0]))).ravel()
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.special import log_ndtr, ndtr
@@ -12,26 +11,10 @@ from splatctrl_cli.config.fixed import CERTAIN_OCCUPANCY, LEAST_VARIANCE, VARIAN
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points
 from splatctrl_cli.field.distance import GpdfField
-from splatctrl_cli.field.weights import Matern12
+from splatctrl_cli.field.weights import share_of_loss
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import GridSpan
 from splatctrl_cli.records import Float32, Float64
-
-
-class CollisionProbability(Protocol):
-    """A form of the collision probability."""
-
-    def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
-        """Probability (X, Y, Z) at the cells of `span`; sdf: chosen distance [m]."""
-        ...
-
-    def at(self, points: Float64, sdf: Float64) -> Float64:
-        """Probability (Q,) at points (Q, 3) [m]; sdf (Q,): chosen distance [m]."""
-        ...
-
-    def described(self) -> dict[str, object]:
-        """Return its meaning and numbers, for a header."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,12 +32,15 @@ class CalibratedProbability:
         return np.asarray(ndtr((self.mean - clearance) / self.sigma))
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
+        """Probability (Q,) at points (Q, 3) [m]; sdf (Q,): chosen distance [m]."""
         return self.of(sdf)
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
+        """Probability (X, Y, Z) at the cells of `span`; sdf: chosen distance [m]."""
         return self.of(sdf.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:
+        """Return its meaning and numbers, for a header."""
         return {"meaning": "Phi((mean - sdf) / sigma)", "sigma": self.sigma, "mean": self.mean}
 
 
@@ -72,34 +58,30 @@ class PaperProbability:
                 "field.probability = paper: expected field.weights = rowsum or voxel, got cg",
                 remedy="set field.probability = calibrated, or other weights",
             )
-        self._gpdf = GpdfField.over(spheres, config, threads=threads)
+        self._gpdf = GpdfField(spheres, config, threads=threads)
         # k^2 is a Matern kernel too, of half the length: sum_i w_i k^2 = exp(-2 g / l), g the field of that kernel.
-        self._half = Matern12(0.5 * self._gpdf.kernel.length)
-        self._share = self._half.share(0.5 * config.truncation)
-        self._offsets = self._half.length * self._gpdf.weights.log_size
+        self._half = 0.5 * self._gpdf.kernel.length
+        self._share = share_of_loss(self._half, 0.5 * config.truncation)
+        self._offsets = self._half * self._gpdf.weights.log_size
         self._threads = threads
 
-    def of(self, points: Float64) -> Float64:
-        """Probability (Q,) at points (Q, 3) [m]."""
-        places = self._gpdf.spheres.points
+    def at(self, points: Float64, sdf: Float64) -> Float64:
+        """Probability (Q,) at points (Q, 3) [m], whatever the sdf."""
+        places = self._gpdf.spheres
         half, _ = native.matern(
             places.clusters,
             places.offsets(self._offsets),
             None,
-            self._half.length,
+            self._half,
             self._share,
             places.relative(checked_points(points)),
             threads=self._threads,
         )
         return self._combined(self._gpdf.query_raw(points)[0], half.astype(np.float64))
 
-    def at(self, points: Float64, sdf: Float64) -> Float64:
-        """Probability (Q,), whatever the sdf."""
-        return self.of(points)
-
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
         """Probability (X, Y, Z), whatever the sdf."""
-        places = self._gpdf.spheres.points
+        places = self._gpdf.spheres
         gpdf, half = np.zeros_like(sdf), np.zeros_like(sdf)
         self._gpdf.bake_raw(span, gpdf, None, threads=threads)
         terms = replace(
@@ -107,7 +89,7 @@ class PaperProbability:
             offsets=places.offsets(self._offsets),
             exact=places.laid_out(self._offsets, spare=native.SPARE_OFFSET),
             sign=None,
-            length=self._half.length,
+            length=self._half,
             tolerance=self._share,
         )
         native.bake_matern(places.clusters, terms, span, half, threads=threads)
@@ -117,7 +99,7 @@ class PaperProbability:
         return {"meaning": "eq. 13 and 14 with lumped weights: a score", "variance_divisor": VARIANCE_DIVISOR}
 
     def _combined(self, gpdf: Float64, half: Float64) -> Float64:
-        explained = np.exp(np.minimum(-half / self._half.length, 0.0))  # the sum never exceeds 1 but by rounding
+        explained = np.exp(np.minimum(-half / self._half, 0.0))  # the sum never exceeds 1 but by rounding
         occupancy = np.exp(np.minimum(-gpdf / self._gpdf.kernel.length, CERTAIN_OCCUPANCY))
         return probability_of_occupancy(occupancy, explained)
 
@@ -131,6 +113,7 @@ def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
     return np.asarray(np.exp(log_ndtr((occupancy - 1.0) / deviation) - log_ndtr(occupancy / deviation)))
 
 
+CollisionProbability = CalibratedProbability | PaperProbability
 _Make = Callable[[Spheres, FieldConfig, int], CollisionProbability]
 PROBABILITIES: Mapping[str, _Make] = {
     "calibrated": lambda spheres, config, threads: CalibratedProbability(sigma=config.error, mean=config.error_mean),

@@ -1,15 +1,16 @@
 """Statistics of a baked grid."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import NEAR_ONE
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.field.grid_cells import RESOLUTION
-from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.field.distance import KERNELS
+from splatctrl_cli.field.grid_cells import RESOLUTION, exact_channel
 from splatctrl_cli.records import DistanceGrid, Float32
 from splatctrl_cli.voxels import VoxelState
 
@@ -71,93 +72,65 @@ class GridStatistics:
 
 def grid_statistics(grid: DistanceGrid) -> GridStatistics:
     """Statistics of a grid, by a few planes, as channels may be memory maps."""
-    totals = _Totals()
+    sums, most = dict[str, Any](), dict[str, float]()
     for part in _parts(grid):
-        totals.add(part)
-    return totals.statistics()
+        counted, largest = _measured(part)
+        sums |= {name: value + sums.get(name, 0) for name, value in counted.items()}
+        most |= {name: max(value, most.get(name, -np.inf)) for name, value in largest.items()}
+    num, num_lengths = sums["cells"], 0 if "lengths" not in sums else int(sums["lengths"].sum())
+    return GridStatistics(
+        num_cells=num,
+        num_blank=sums["blank"],
+        num_inside=sums["inside"],
+        lowest=-most["lowest"] if "lowest" in most else None,
+        highest=most.get("highest"),
+        observed={state.name.lower(): int(sums["states"][state]) for state in VoxelState}
+        if "states" in sums
+        else None,
+        hard_share=sums["hard"] / num if "hard" in sums else None,
+        excess={
+            name: Excess(count=sums[name], share=sums[name] / num, largest=max(most[name], 0.0))
+            for name in KERNELS
+            if name in sums
+        },
+        gradient=None
+        if not num_lengths
+        else GradientLengths(
+            histogram=tuple(int(count) for count in sums["lengths"]),
+            bin_width=BIN,
+            largest=most["length"],
+            mean=sums["length"] / num_lengths,
+            share_near_one=sums["near_one"] / num_lengths,
+        ),
+    )
 
 
-class _Totals:
-    def __init__(self) -> None:
-        self.num_cells = self.num_blank = self.num_inside = self.num_hard = 0
-        self.lowest, self.highest = np.inf, -np.inf
-        self.states: NDArray[np.int64] | None = None
-        self.has_exact = False
-        self.excess: dict[str, tuple[int, float]] = {}
-        self.lengths: NDArray[np.int64] | None = None
-        self.longest = self.length_sum = 0.0
-        self.num_near_one = 0
-
-    def add(self, part: DistanceGrid) -> None:
-        sdf = part.channels["sdf"]
-        known = sdf[np.isfinite(sdf)]
-        self.num_cells += sdf.size
-        self.num_blank += sdf.size - known.size
-        self.num_inside += int(np.count_nonzero(known <= 0))
-        if known.size:
-            self.lowest, self.highest = min(self.lowest, float(known.min())), max(self.highest, float(known.max()))
-        if "observed" in part.channels:
-            counts = np.bincount(part.channels["observed"].ravel(), minlength=len(VoxelState))
-            self.states = counts if self.states is None else self.states + counts
-        self._add_exact(part)
-        if "gradient" in part.channels:
-            self._add_gradient(_floats(part, "gradient"))
-
-    def _add_exact(self, part: DistanceGrid) -> None:
-        if part.header.get("unknown") == "obstacle" and "hard" not in part.channels:
-            return  # bound is then of unknown space, too
-        try:
-            exact = exact_channel(part)
-        except InputError:  # the grid has no exact distance
-            return
-        self.has_exact = True
-        self.num_hard += int(np.count_nonzero(np.abs(_floats(part, "sdf") - exact) <= RESOLUTION))
-        for name in ("se", "gpdf"):
-            if name in part.channels:
-                over = _floats(part, name) - exact
-                count, largest = self.excess.get(name, (0, 0.0))
-                self.excess[name] = (
-                    count + int(np.count_nonzero(over > RESOLUTION)),
-                    max(largest, float(over.max())),
-                )
-
-    def _add_gradient(self, gradient: Float32) -> None:
+def _measured(part: DistanceGrid) -> tuple[dict[str, Any], dict[str, float]]:
+    """Counts and sums of some planes, and their largest values; lowest: negative."""
+    channels, sdf = part.channels, _floats(part, "sdf")
+    known = sdf[np.isfinite(sdf)]
+    inside = int(np.count_nonzero(known <= 0))
+    sums: dict[str, Any] = {"cells": sdf.size, "blank": sdf.size - known.size, "inside": inside}
+    most = {"lowest": -float(known.min()), "highest": float(known.max())} if known.size else {}
+    if "observed" in channels:
+        sums["states"] = np.bincount(channels["observed"].ravel(), minlength=len(VoxelState))
+    if "gradient" in channels:
+        gradient = _floats(part, "gradient")
         lengths = np.sqrt(np.einsum("...i,...i->...", gradient, gradient)).ravel()
         lengths = lengths[np.isfinite(lengths)]
         bins = np.minimum((lengths / BIN + 0.5).astype(np.int64), NUM_BINS - 1)
-        counts = np.bincount(bins, minlength=NUM_BINS)
-        self.lengths = counts if self.lengths is None else self.lengths + counts
-        self.longest = max(self.longest, float(lengths.max(initial=0.0)))
-        self.length_sum += float(lengths.sum(dtype=np.float64))
-        self.num_near_one += int(np.count_nonzero(np.abs(lengths - 1.0) <= NEAR_ONE))
-
-    def statistics(self) -> GridStatistics:
-        is_known = self.num_blank < self.num_cells
-        num_lengths = 0 if self.lengths is None else int(self.lengths.sum())
-        return GridStatistics(
-            num_cells=self.num_cells,
-            num_blank=self.num_blank,
-            num_inside=self.num_inside,
-            lowest=self.lowest if is_known else None,
-            highest=self.highest if is_known else None,
-            observed=None
-            if self.states is None
-            else {state.name.lower(): int(self.states[state]) for state in VoxelState},
-            hard_share=self.num_hard / self.num_cells if self.has_exact else None,
-            excess={
-                name: Excess(count=count, share=count / self.num_cells, largest=largest)
-                for name, (count, largest) in self.excess.items()
-            },
-            gradient=None
-            if self.lengths is None or not num_lengths
-            else GradientLengths(
-                histogram=tuple(int(count) for count in self.lengths),
-                bin_width=BIN,
-                largest=self.longest,
-                mean=self.length_sum / num_lengths,
-                share_near_one=self.num_near_one / num_lengths,
-            ),
-        )
+        sums |= {"lengths": np.bincount(bins, minlength=NUM_BINS), "length": float(lengths.sum(dtype=np.float64))}
+        sums["near_one"] = int(np.count_nonzero(np.abs(lengths - 1.0) <= NEAR_ONE))
+        most["length"] = float(lengths.max(initial=0.0))
+    if part.header.get("unknown") == "obstacle" and "hard" not in channels:
+        return sums, most  # bound is then of unknown space, too
+    with suppress(InputError):  # the grid has no exact distance
+        exact = exact_channel(part)
+        sums["hard"] = int(np.count_nonzero(np.abs(sdf - exact) <= RESOLUTION))
+        for name in (name for name in KERNELS if name in channels):
+            over = _floats(part, name) - exact
+            sums[name], most[name] = int(np.count_nonzero(over > RESOLUTION)), float(over.max())
+    return sums, most
 
 
 def _floats(part: DistanceGrid, channel: str) -> Float32:

@@ -1,19 +1,83 @@
-"""Bakes of a grid, whole or in slabs of x-planes to save memory."""
+"""Bakes of a grid, whole or in slabs of x-planes to save memory, and their header."""
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker, Planes
+from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker, Planes
 from splatctrl_cli.field.grid_cells import GridLayout, check_memory, check_room, observed_planes
-from splatctrl_cli.field.header import field_header
-from splatctrl_cli.field.unknown import BOUND, DEFAULT_LABELS, Cubes, apply_unknown, blank, field_splats
+from splatctrl_cli.field.health import field_health
+from splatctrl_cli.field.unknown import BOUND, DEFAULT_LABELS, Cubes, blank, field_splats, label_counts
+from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Label, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
+
+MEANING = {
+    "safe": "min(se, hard)",
+    "safe_gpdf": "min(gpdf, hard)",
+    "hard": "exact distance to the splats' spheres",
+    "se": "squared-exponential field; hard where it has no value",
+    "gpdf": "Matern-1/2 field of the paper; hard where it has no value",
+}
+
+
+def field_header(
+    splats: SplatSet,
+    chosen: SplatSet,
+    labels: Collection[Label],
+    baker: Baker,
+    *,
+    has_occupancy: bool,
+    num_unrepresented: int = 0,
+) -> dict[str, object]:
+    """Header of `baker`'s bake of `chosen`: labelled `splats`, then `num_unrepresented` balls."""
+    config = baker.config
+    header: dict[str, object] = {
+        "format": "splatctrl distance grid",
+        "version": 2,
+        "sign": "positive outside",
+        "frame": "world",
+        "units": "m",
+        "origin": "centre of cell (0, 0, 0)",
+        "distance": config.distance,
+        "sdf": MEANING[config.distance],
+        "gradient": "of sdf, not normalised",
+        "bound": "no point of the cell is nearer to a splat's sphere; bound + bound_margin is hard at its centre",
+        "bound_margin": baker.bound_margin,
+        "kernel": {None: "none", "se": "squared exponential", "gpdf": "matern 1/2"}[baker.kernel_name],
+        "length_scale": config.length_scale,
+        "noise": config.noise,
+        "weights": config.weights,
+        "truncation_bound": config.truncation,
+        "kernel_counts": dict(baker.counts),
+        "unknown": config.unknown,
+        "observed": "from the occupancy grid" if has_occupancy else "no occupancy grid: all never seen",
+        "inside": "a shell: cells deep inside a closed object read positive; take the sign there from observed",
+        "labels": sorted(label.name.lower() for label in labels),
+        "splats_given": label_counts(splats),
+        "splats_used": label_counts(chosen.select(np.arange(len(chosen)) < len(chosen) - num_unrepresented)),
+        "unrepresented_voxels": num_unrepresented,
+        "radius": {
+            "min": float(chosen.radii.min()),
+            "median": float(np.median(chosen.radii)),
+            "mean": float(chosen.radii.mean(dtype=np.float64)),
+            "max": float(chosen.radii.max()),
+        },
+        "health": asdict(field_health(chosen.centers, chosen.radii, config.length_scale, kernels=baker.kernels)),
+    }
+    if baker.probability is not None:
+        header |= {"probability": config.probability, "probability_numbers": baker.probability.described()}
+    solved = {
+        name: {"num_iterations": field.weights.num_iterations, "residual": field.weights.residual}
+        for name, field in baker.kernels.items()
+        if field.weights.num_iterations is not None
+    }
+    return header | ({"weights_solved": solved} if solved else {})
+
 
 SLAB_BYTES = 48 << 20  # per slab's channels, or one block's planes if larger
 _CUBES = 64  # bytes per cell of the whole grid, to find the nearest never-seen one
@@ -32,7 +96,8 @@ class Kept:
 
 def bytes_per_cell(channels: Collection[str]) -> int:
     """Bytes of the channels."""
-    return sum(np.dtype(CHANNELS[name][0]).itemsize * CHANNELS[name][1] for name in channels if name in CHANNELS)
+    kinds = [CHANNELS[name] for name in channels if name in CHANNELS]
+    return sum(np.dtype(kind.dtype).itemsize * kind.components for kind in kinds)
 
 
 def slabs(layout: GridLayout, channels: Collection[str], begin: int = 0) -> Iterator[tuple[int, int]]:
@@ -54,7 +119,11 @@ def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
 
 
 class UnknownSpace:
-    """`apply_unknown` for slabs, from never-seen cells found before the bake.
+    """Never-seen space in slabs, treated by the policy ``nan`` or ``obstacle``; its cells are found before the bake.
+
+    ``nan``: no sdf, gradient or probability there. ``obstacle``: solid cubes of probability 1; sdf, gradient and
+    bound are of the nearer of splats and cubes. Cells that only the robot swept are known
+    (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
 
     num_never_seen and num_changed count the cells treated so far.
     """
@@ -141,8 +210,10 @@ def bake(
     baker = Baker(
         chosen, layout, config, channels=channels, occupancy=occupancy, thresholds=thresholds, threads=threads
     )
-    arrays = baker.allocate(layout.shape[0])
-    baker.bake(0, layout.shape[0], arrays)
+    planes = baked_planes(baker, 0, layout.shape[0])
     header = field_header(splats, chosen, labels, baker, has_occupancy=occupancy is not None)
-    grid = DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=arrays, header=header)
-    return apply_unknown(grid, config.unknown)
+    if config.unknown != "free":
+        unknown = UnknownSpace(layout, config, occupancy, thresholds or OccupancyConfig())
+        planes = unknown.apply(planes, 0, layout.shape[0], baker.bound_margin)
+        header |= unknown.header()
+    return DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header=header)

@@ -4,15 +4,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_cdt, distance_transform_edt
 
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.config.ranges import check
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL
-from splatctrl_cli.records import Bool, DistanceGrid, Float32, Index, Label, SplatSet
-from splatctrl_cli.voxels import Balls, VoxelState
+from splatctrl_cli.records import Bool, Float32, Index, Label, SplatSet, Values
+from splatctrl_cli.voxels import Balls
 
 DEFAULT_LABELS = frozenset({Label.OBJECT, Label.HUMAN})
 NO_SPLAT = -1
@@ -90,49 +87,10 @@ BOUND = (
     "bound + bound_margin is the lesser of hard and the distance to never-seen cells at its centre"
 )
 
-Channels = dict[str, NDArray[np.generic]]
+Channels = dict[str, Values]
 
 
-def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
-    """Grid with never-seen cells treated by `policy`, and its header updated.
-
-    ``free``: distances from splats alone. ``nan``: no sdf, gradient or probability there. ``obstacle``: solid cubes
-    of probability 1; sdf, gradient and bound are of the nearer of splats and cubes. Cells that only the robot swept
-    are known (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
-
-    Raises UsageError for another policy, InputError without `observed`, NotEvaluableError if nothing was seen.
-    """
-    declared = FieldConfig.declared["unknown"]
-    check(declared.holds(policy), "field.unknown", declared.expected, policy)
-    header = {**grid.header, "unknown": policy}
-    if policy == "free":
-        return replace(grid, header=header)
-    if "observed" not in grid.channels:
-        raise InputError(
-            "distance grid: no channel 'observed', which field.unknown needs", remedy="bake it with that channel"
-        )
-    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
-    if is_unknown.all():
-        raise NotEvaluableError(
-            f"field.unknown = {policy}: expected a cell that some camera saw, got none of {is_unknown.size}",
-            remedy="bake a scene with an occupancy grid, check --box, or set field.unknown = free",
-        )
-    num_unknown = int(np.count_nonzero(is_unknown))
-    if policy == "nan":
-        channels, num_changed = blank(grid.channels, is_unknown), num_unknown
-    else:
-        margin = grid.header.get("bound_margin")
-        if not isinstance(margin, float):
-            raise InputError("distance grid: header: expected a bound_margin, got none", remedy="bake it again")
-        header["bound"] = BOUND
-        channels, num_changed = dict(grid.channels), 0
-        if num_unknown:
-            channels, num_changed = Cubes.of(is_unknown, grid.voxel).joined(grid.channels, margin)
-    header["unknown_cells"] = {"never_seen": num_unknown, "changed": num_changed}
-    return replace(grid, channels=channels, header=header)
-
-
-def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Channels:
+def blank(channels: Mapping[str, Values], is_unknown: Bool) -> Channels:
     """Set distance, gradient, probability (X, Y, Z) to NaN where unknown."""
     blanked = dict(channels)
     for name in BLANKED:
@@ -184,7 +142,7 @@ class Cubes:
             away=self.away[first:last],
         )
 
-    def joined(self, channels: Mapping[str, NDArray[np.generic]], bound_margin: float) -> tuple[Channels, int]:
+    def joined(self, channels: Mapping[str, Values], bound_margin: float) -> tuple[Channels, int]:
         """Channels of the nearer of field and cubes, and the number of changed cells."""
         joined = dict(channels)
         is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))

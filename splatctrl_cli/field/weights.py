@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from splatctrl_cli.config.fixed import (
     VOXELS_PER_LENGTH,
 )
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.field.clusters import ClusteredPoints, Spheres
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.grid_cells import available_memory
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Float32, Float64, Index
@@ -55,7 +54,8 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
     transformed = _transformed_kernel(sampled)
     alone = np.ones(len(centers), np.bool_)
     for first, near, own in meetings:
-        density = _convolved(_spread(cells[near] - first, share[near]), transformed)
+        mass = _spread(cells[near] - first, share[near])
+        density = irfftn(rfftn(mass) * transformed, s=mass.shape)  # circular: what wraps stays within reach of faces
         result[own] += _read(density, cells[own] - first, share[own])
         alone[own] = False
     result[alone] = 1.0
@@ -108,11 +108,6 @@ def _transformed_kernel(sampled: Float64) -> NDArray[np.complex128]:
     return np.asarray(rfftn(np.roll(padded, -(size // 2), axis=(0, 1, 2))))
 
 
-def _convolved(mass: Float64, transformed: NDArray[np.complex128]) -> Float64:
-    """Convolve circularly: what wraps stays within `reach` of faces."""
-    return np.asarray(irfftn(rfftn(mass) * transformed, s=mass.shape))
-
-
 def _corners(cells: Index, share: Float64) -> list[tuple[Index, Float64]]:
     return [
         (cells + np.array(step), np.asarray(np.prod(np.where(step, share, 1.0 - share), axis=1)))
@@ -136,20 +131,13 @@ def _read(density: Float64, cells: Index, share: Float64) -> Float64:
 BYTES_PER_PAIR = 44  # of the matrix and its pairs; 40 were measured
 
 
-@dataclass(frozen=True, kw_only=True)
-class Solution:
-    """M of eq. 12 (N,) as ``scaled exp(log_scale)``; residual: the largest, relative to its group's largest y."""
-
-    scaled: Float64
-    log_scale: Float64
-    num_iterations: int
-    residual: float
-
-
 def solve_process(
     centers: Float64, log_values: Float64, length: float, kernel: KernelValue, noise: float
-) -> Solution:
+) -> tuple[Float64, Float64, int, float]:
     """``(K(P, P) + noise I)^-1 y`` (eq. 8, 12) for centres (N, 3) [m], y = exp(log_values) (N,).
+
+    It is ``scaled exp(log_scale)`` (N,); with the number of iterations, and the largest residual, relative to its
+    group's largest y.
 
     The kernel is cut off at 8 l. Groups that it does not join are scaled by their largest y, as Matern's ``e^(r /
     l)`` overflows. Raises UsageError for too little memory or too wide a spread of y, NotEvaluableError without
@@ -169,7 +157,7 @@ def solve_process(
         )
     tolerance = max(CG_TOLERANCE * float(np.exp(-spread)), CG_FLOOR)
     scaled, num_iterations, residual = conjugate_gradients(matrix, np.exp(log_values - largest[group]), tolerance)
-    return Solution(scaled=scaled, log_scale=largest[group], num_iterations=num_iterations, residual=residual)
+    return scaled, largest[group], num_iterations, residual
 
 
 def conjugate_gradients(matrix: "csr_array", values: Float64, tolerance: float) -> tuple[Float64, int, float]:
@@ -224,21 +212,6 @@ def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: 
     return csr_array(upper + upper.T + (1.0 + noise) * eye_array(len(centers), format="csr"))
 
 
-class Kernel(Protocol):
-    """A stationary kernel k(d) of length scale l [m] with k(0) = 1."""
-
-    @property
-    def length(self) -> float: ...
-
-    def value(self, distance: Float64) -> Float64:
-        """k(d) for distances of any shape [m]."""
-        ...
-
-    def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
-        """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
-        ...
-
-
 @dataclass(frozen=True)
 class Matern12:
     """``k(d) = exp(-d / l)``, the paper's kernel: its inverse is ``r(o) = -l log o``."""
@@ -246,14 +219,8 @@ class Matern12:
     length: float
 
     def value(self, distance: Float64) -> Float64:
+        """k(d) for distances of any shape [m]."""
         return np.asarray(np.exp(-distance / self.length))
-
-    def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
-        return _log_row_sums(points, self.length, is_matern=True, threads=threads)
-
-    def share(self, tolerance: float) -> float:
-        """Share of the sum whose loss raises the distance by t [m], ``1 - exp(-t / l)``; at most 0.01."""
-        return min(-float(np.expm1(-tolerance / self.length)), KERNEL_MAX_SHARE)
 
 
 @dataclass(frozen=True)
@@ -263,15 +230,24 @@ class SquaredExponential:
     length: float
 
     def value(self, distance: Float64) -> Float64:
+        """k(d) for distances of any shape [m]."""
         return np.asarray(np.exp(-0.5 * (distance / self.length) ** 2))
 
-    def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
-        return _log_row_sums(points, self.length, is_matern=False, threads=threads)
+
+Kernel = Matern12 | SquaredExponential
+"""A stationary kernel k(d) of length scale l [m] with k(0) = 1."""
 
 
-def _log_row_sums(points: ClusteredPoints, length: float, *, is_matern: bool, threads: int) -> Float64:
-    sums = native.row_sums(points.clusters, points.is_point, length, is_matern=is_matern, threads=threads)
-    return np.asarray(np.log(points.gathered(sums)))
+def share_of_loss(length: float, tolerance: float) -> float:
+    """Share of Matern's sum whose loss raises the distance by t [m], ``1 - exp(-t / l)``; at most 0.01."""
+    return min(-float(np.expm1(-tolerance / length)), KERNEL_MAX_SHARE)
+
+
+def log_row_sums(kernel: Kernel, spheres: Spheres, *, threads: int = 0) -> Float64:
+    """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
+    is_matern = isinstance(kernel, Matern12)
+    sums = native.row_sums(spheres.clusters, spheres.is_point, kernel.length, is_matern=is_matern, threads=threads)
+    return np.asarray(np.log(spheres.gathered(sums)))
 
 
 NO_LOG = -1e4  # for a weight of zero: negligible, and finite
@@ -296,7 +272,7 @@ def row_sum_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
 
     M of eq. 12 is ``w_i k_d(-r_i)``.
     """
-    return _lumped(kernel.log_row_sums(spheres.points, threads=threads), noise)
+    return _lumped(log_row_sums(kernel, spheres, threads=threads), noise)
 
 
 def voxel_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
@@ -311,24 +287,21 @@ def process_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
     radius's sign.
     """
     log_values = spheres.radii / kernel.length if isinstance(kernel, Matern12) else np.zeros(len(spheres.radii))
-    solution = solve_process(_centers(spheres), log_values, kernel.length, kernel.value, noise)
-    is_zero = solution.scaled == 0.0
-    size = np.log(np.abs(np.where(is_zero, 1.0, solution.scaled)))
+    scaled, log_scale, num_iterations, residual = solve_process(
+        _centers(spheres), log_values, kernel.length, kernel.value, noise
+    )
+    is_zero = scaled == 0.0
+    size = np.log(np.abs(np.where(is_zero, 1.0, scaled)))
     return Weights(
-        log_size=np.where(is_zero, NO_LOG, size + solution.log_scale - log_values),
-        sign=np.where(solution.scaled < 0.0, -1.0, 1.0).astype(np.float32),
-        num_iterations=solution.num_iterations,
-        residual=solution.residual,
+        log_size=np.where(is_zero, NO_LOG, size + log_scale - log_values),
+        sign=np.where(scaled < 0.0, -1.0, 1.0).astype(np.float32),
+        num_iterations=num_iterations,
+        residual=residual,
     )
 
 
 Method = Callable[[Spheres, Kernel, float, int], Weights]
 METHODS: Mapping[str, Method] = {"rowsum": row_sum_weights, "voxel": voxel_weights, "cg": process_weights}
-
-
-def weights_named(name: str, spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """Weights of a configured method."""
-    return METHODS[name](spheres, kernel, noise, threads)
 
 
 def _lumped(log_sums: Float64, noise: float) -> Weights:
@@ -337,5 +310,4 @@ def _lumped(log_sums: Float64, noise: float) -> Weights:
 
 
 def _centers(spheres: Spheres) -> Float64:
-    points = spheres.points
-    return np.stack([points.gathered(axis.astype(np.float64)) for axis in points.clusters.centers], axis=1)
+    return np.stack([spheres.gathered(axis.astype(np.float64)) for axis in spheres.clusters.centers], axis=1)

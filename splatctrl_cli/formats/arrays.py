@@ -10,7 +10,7 @@ import zipfile
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from math import prod
@@ -18,13 +18,12 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, ranges
 from splatctrl_cli.formats.unpacking import PIECE
 from splatctrl_cli.libraries import of_extra
-from splatctrl_cli.records import Stamps
+from splatctrl_cli.records import Array, Stamps, Values
 
 DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a place in it lies before its start
     *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError),
@@ -38,10 +37,10 @@ class Pieces:
 
     dtype: str
     shape: tuple[int, ...]
-    make: Callable[[], Iterable[NDArray[np.generic]]]
+    make: Callable[[], Iterable[Values]]
 
 
-def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, level: int = 6) -> None:
+def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) -> None:
     """Write as `np.savez_compressed`, at zlib's `level` (0: stored), one array at a time."""
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
@@ -57,7 +56,7 @@ def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, lev
                     np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
 
 
-def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, NDArray[np.generic]]:
+def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, Values]:
     """Read the arrays `names` (default: all) of a ``.npz``, at most `most` bytes together.
 
     Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or another size than
@@ -105,7 +104,7 @@ def check_numbers(dtype: np.dtype[Any]) -> None:
         raise ValueError("objects, expected numbers")
 
 
-def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> NDArray[np.generic]:
+def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> Values:
     shape, is_fortran, dtype = npy_head(member)
     check_numbers(dtype)
     size = prod(shape) * dtype.itemsize
@@ -120,11 +119,11 @@ def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> ND
         at += len(piece)
     if at < size or member.read(1):  # reading to the end is what checks the sum
         raise ValueError(f"{name}expected {size} bytes, got {'more' if at == size else at}")
-    values: NDArray[np.generic] = np.frombuffer(content, dtype) if size else np.zeros(0, dtype)
+    values: Values = np.frombuffer(content, dtype) if size else np.zeros(0, dtype)
     return values.reshape(shape, order="F" if is_fortran else "C")
 
 
-def npy_of(data: bytes) -> NDArray[np.generic]:
+def npy_of(data: bytes) -> Values:
     """The array of ``.npy`` bytes. Raises ValueError for objects, or another number of bytes than announced.
 
     `np.load` would allocate what the header announces.
@@ -149,7 +148,7 @@ class ArrayFile(ABC):
         """Shape and dtype, None if missing. Raises InputError if unreadable."""
 
     @abstractmethod
-    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+    def _blocks(self, name: str) -> Iterator[Array]:
         """Yield about `BLOCK` rows at a time. Raises InputError if unreadable."""
 
     def columns(self, names: Sequence[str]) -> Rows:
@@ -214,9 +213,14 @@ class ArrayFile(ABC):
             remedy=f"arrays there: {', '.join(self.names)}",
         )
 
-    def _unreadable(self, kind: str, error: Exception) -> InputError:
-        said = " ".join(str(error).split()) or type(error).__name__
-        return InputError(f"{self.path}: cannot be read as {kind}: {said}", remedy="check the file")
+    @contextmanager
+    def _read_as(self, kind: str, *faults: type[Exception]) -> Iterator[None]:
+        """Turn `faults` into InputError."""
+        try:
+            yield
+        except faults as error:
+            said = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{self.path}: cannot be read as {kind}: {said}", remedy="check the file") from None
 
 
 _MOST_BY_COLUMNS = 1 << 28  # bytes, as they are in memory at once
@@ -227,46 +231,38 @@ class NpzFile(ArrayFile):
     def __init__(self, path: Path) -> None:
         """Raises InputError for another kind of file."""
         super().__init__(path)
-        try:
-            with zipfile.ZipFile(path) as archive:
-                self.names = [name.removesuffix(".npy") for name in archive.namelist()]
-        except _DAMAGE as error:
-            raise self._unreadable("NPZ", error) from None
+        with self._read_as("NPZ", *_DAMAGE), zipfile.ZipFile(path) as archive:
+            self.names = [name.removesuffix(".npy") for name in archive.namelist()]
 
     def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
         if name not in self.names:
             return None
-        with ExitStack() as stack:
-            shape, dtype, _, _ = self._opened(stack, name)
+        with self._opened(name) as (shape, dtype, _, _):
             return shape, dtype
 
-    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+    def _blocks(self, name: str) -> Iterator[Array]:
         """Yield the rows; an array stored by columns is read at once."""
-        with ExitStack() as stack:
-            shape, dtype, is_by_columns, stream = self._opened(stack, name)
-            try:
-                if is_by_columns:
-                    if prod(shape) * dtype.itemsize > _MOST_BY_COLUMNS:
-                        raise ValueError(f"{name}: over {_MOST_BY_COLUMNS} bytes by columns, expected rows")
-                    whole = np.frombuffer(_read(stream, prod(shape) * dtype.itemsize), dtype).reshape(
-                        shape, order="F"
-                    )
-                    yield from (whole[first : first + BLOCK] for first in range(0, shape[0], BLOCK))
-                    return
-                row = prod(shape[1:]) * dtype.itemsize
-                for first in range(0, shape[0], BLOCK):
-                    num = min(BLOCK, shape[0] - first)
-                    yield np.frombuffer(_read(stream, num * row), dtype).reshape(num, *shape[1:])
-            except _DAMAGE as error:
-                raise self._unreadable("NPZ", error) from None
+        with self._opened(name) as (shape, dtype, is_by_columns, stream):
+            if is_by_columns:
+                if prod(shape) * dtype.itemsize > _MOST_BY_COLUMNS:
+                    raise ValueError(f"{name}: over {_MOST_BY_COLUMNS} bytes by columns, expected rows")
+                whole = np.frombuffer(_read(stream, prod(shape) * dtype.itemsize), dtype).reshape(shape, order="F")
+                yield from (whole[first : first + BLOCK] for first in range(0, shape[0], BLOCK))
+                return
+            row = prod(shape[1:]) * dtype.itemsize
+            for first in range(0, shape[0], BLOCK):
+                num = min(BLOCK, shape[0] - first)
+                yield np.frombuffer(_read(stream, num * row), dtype).reshape(num, *shape[1:])
 
-    def _opened(self, stack: ExitStack, name: str) -> tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]:
-        try:
-            stream = stack.enter_context(stack.enter_context(zipfile.ZipFile(self.path)).open(f"{name}.npy"))
+    @contextmanager
+    def _opened(self, name: str) -> Iterator[tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]]:
+        with (
+            self._read_as("NPZ", *_DAMAGE),
+            zipfile.ZipFile(self.path) as archive,
+            archive.open(f"{name}.npy") as stream,
+        ):
             shape, is_by_columns, dtype = npy_head(stream)
-        except _DAMAGE as error:
-            raise self._unreadable("NPZ", error) from None
-        return shape, dtype, is_by_columns and len(shape) > 1, stream
+            yield shape, dtype, is_by_columns and len(shape) > 1, stream
 
 
 def _read(stream: IO[bytes], num: int) -> bytes:
@@ -299,7 +295,7 @@ class Hdf5File(ArrayFile):
                 raise InputError(f"{self.path}: {name}: ragged: its rows differ in length", remedy=_RAGGED)
             return array.shape, array.dtype
 
-    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+    def _blocks(self, name: str) -> Iterator[Array]:
         with self._opened() as file:
             array = file[name]
             for first in range(0, array.shape[0], BLOCK):
@@ -307,11 +303,9 @@ class Hdf5File(ArrayFile):
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        try:
-            with self._h5py.File(self.path, "r") as file:
-                yield file
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise self._unreadable("HDF5", error) from None
+        faults = (OSError, RuntimeError, KeyError, ValueError)
+        with self._read_as("HDF5", *faults), self._h5py.File(self.path, "r") as file:
+            yield file
 
 
 class ParquetFile(ArrayFile):
@@ -341,7 +335,7 @@ class ParquetFile(ArrayFile):
         block = next(self._blocks(name), None)
         return ((0,), np.dtype(np.float64)) if block is None else ((self._num, *block.shape[1:]), block.dtype)
 
-    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+    def _blocks(self, name: str) -> Iterator[Array]:
         shape: tuple[int, ...] | None = None
         names = [name] if self._only is None else list(dict.fromkeys([name, self._only[0]]))
         with self._opened() as file:
@@ -355,7 +349,7 @@ class ParquetFile(ArrayFile):
                 if len(values):
                     yield values
 
-    def _values(self, column: Any, name: str) -> NDArray[Any]:
+    def _values(self, column: Any, name: str) -> Array:
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
         if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:
@@ -368,8 +362,6 @@ class ParquetFile(ArrayFile):
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        try:
-            with self._parquet.ParquetFile(self.path) as file:
-                yield file
-        except (OSError, ValueError, KeyError, self._arrow.ArrowException) as error:
-            raise self._unreadable("Parquet", error) from None
+        faults = (OSError, ValueError, KeyError, self._arrow.ArrowException)
+        with self._read_as("Parquet", *faults), self._parquet.ParquetFile(self.path) as file:
+            yield file

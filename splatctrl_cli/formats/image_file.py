@@ -8,15 +8,13 @@ import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.unpacking import read_bytes
-from splatctrl_cli.records import Float32
+from splatctrl_cli.records import Array, Float32
 
 JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 TAIL = 64  # bytes in which the closing mark of a file stands; some encoders pad
@@ -103,7 +101,7 @@ def _png_head(data: bytes) -> ImageHead | None:
     return None
 
 
-def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
+def decode_file(data: bytes, *, color: bool) -> Array | None:
     """Decode a JPEG, PNG, WebP, ..., ignoring its orientation tag; None if invalid or truncated.
 
     color: 8-bit RGB; else as OpenCV has it, in BGR. OpenCV alone would fill a cut JPEG with grey.

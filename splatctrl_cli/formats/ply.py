@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.ranges import MAX_PLACE
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.unpacking import read_bytes
-from splatctrl_cli.records import Float64, PointCloud
+from splatctrl_cli.records import Array, Float64, PointCloud
 
 SCALARS = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
@@ -29,14 +28,11 @@ class PlyFile:
     """An element's rows, a structured array, and the header's comments."""
 
     path: Path
-    rows: NDArray[Any]
+    rows: Array
     comments: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.rows)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.names
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,7 +124,7 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
         )
 
 
-def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> None:
+def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
     """Write `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
 
     Some readers want the vertex count in line three, so comments follow the properties; some stop outside ASCII,
@@ -147,7 +143,7 @@ def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> 
 
 def _read_binary(
     path: Path, content: bytes, form: str, elements: Sequence[_Element], length: int, wanted: _Element
-) -> NDArray[Any]:
+) -> Array:
     byte_order, start, end = BYTE_ORDERS[form], 0, length
     dtype = wanted.dtype(path, byte_order)
     for found in elements:
@@ -163,7 +159,7 @@ def _read_binary(
 
 def _read_ascii(
     path: Path, content: bytes, form: str, elements: Sequence[_Element], length: int, wanted: _Element
-) -> NDArray[Any]:
+) -> Array:
     lines = [line.split() for line in content[length:].split(b"\n") if line.strip()]
     expected = sum(found.count for found in elements if found.properties)
     if len(lines) != expected:
@@ -239,7 +235,7 @@ def read_positions(path: Path) -> Float64:
 
 def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
     ply = read_table(path, "vertex", ())
-    missing = [name for name in names if name not in ply]
+    missing = [name for name in names if name not in ply.names]
     if missing:
         raise InputError(f"{path}: no {what}: missing properties {' '.join(missing)}")
     if not len(ply):

@@ -17,6 +17,7 @@ Float64 = NDArray[np.float64]
 Int16 = NDArray[np.int16]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
+Floats = NDArray[np.floating]
 UInt8 = NDArray[np.uint8]
 
 

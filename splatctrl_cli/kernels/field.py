@@ -5,11 +5,11 @@ wants an origin near the data.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import Float32, Float64, Int32, UInt8, native, num_threads
+from splatctrl_cli.kernels import Float32, Float64, Int32, Int64, UInt8, native, num_threads
 
 LANES = 16
 BLOCK = 8  # cells of a block along each axis
@@ -17,8 +17,7 @@ SPARE_OFFSET = -1e30  # of a spare entry: too far away to be nearest
 SPARE_PLACE = 1e15
 
 
-@dataclass(frozen=True, kw_only=True)
-class Clusters:
+class Clusters(NamedTuple):
     """Spheres in boxed clusters of 16; C is a multiple of 16, G of 8, spare ones far away.
 
     centers (3, 16 C) [m]; boxes (6, C + G) [m], lower then upper corner, clusters then groups.
@@ -27,14 +26,8 @@ class Clusters:
     centers: Float32
     boxes: Float32
 
-    @property
-    def arrays(self) -> tuple[Float32, Float32]:
-        """Arguments of the kernels."""
-        return self.centers, self.boxes
 
-
-@dataclass(frozen=True, kw_only=True)
-class Offsets:
+class Offsets(NamedTuple):
     """values (16 C,): o of ``|x - p| - o`` [m], or b of ``|x - p|^2 - b`` [m^2]; spare -1e30.
 
     maxima (C + G,): the largest of clusters, then groups.
@@ -42,11 +35,6 @@ class Offsets:
 
     values: Float32
     maxima: Float32
-
-    @property
-    def arrays(self) -> tuple[Float32, Float32]:
-        """Arguments of the kernels."""
-        return self.values, self.maxima
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +58,7 @@ class GridSpan:
         return (self.last - self.first, self.shape[1], self.shape[2])
 
     @property
-    def arrays(self) -> tuple[Float64, float, NDArray[np.int64], UInt8 | None]:
+    def arrays(self) -> tuple[Float64, float, Int64, UInt8 | None]:
         """Arguments of the kernels."""
         sizes = np.array([*self.shape, self.first, self.last], dtype=np.int64)
         return self.origin, self.voxel, sizes, self.mask
@@ -99,7 +87,7 @@ def nearest(
     """``min_i |x - p_i| - r_i`` (Q,), its gradient (Q, 3), 0 at a centre, its entry (Q,)."""
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     entry = np.empty(len(points), np.int32)
-    native.field_nearest(*spheres.arrays, *radii.arrays, points, num_threads(threads), score, gradient, entry)
+    native.field_nearest(*spheres, *radii, points, num_threads(threads), score, gradient, entry)
     return score, gradient, entry
 
 
@@ -119,9 +107,7 @@ def matern(
     the result rises by at most ``-l log(1 - truncation)``. NaN where the sum is not positive.
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
-    native.field_matern(
-        *spheres.arrays, *offsets.arrays, sign, length, truncation, points, num_threads(threads), score, gradient
-    )
+    native.field_matern(*spheres, *offsets, sign, length, truncation, points, num_threads(threads), score, gradient)
     return score, gradient
 
 
@@ -145,8 +131,8 @@ def gaussian(
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     native.field_gaussian(
-        *spheres.arrays,
-        *offsets.arrays,
+        *spheres,
+        *offsets,
         radii,
         sign,
         common,
@@ -179,9 +165,9 @@ def safe(
     """
     score, gradient = np.empty(len(points)), np.empty((len(points), 3))
     is_finite = native.field_safe(
-        *spheres.arrays,
-        *offsets.arrays,
-        *radii.arrays,
+        *spheres,
+        *offsets,
+        *radii,
         sign,
         common,
         length,
@@ -201,7 +187,7 @@ def row_sums(spheres: Clusters, has_sphere: UInt8, length: float, *, is_matern: 
     Terms are rounded to 2^-24 and added as integers: order changes no bit.
     """
     total = np.empty(len(has_sphere))
-    native.field_density(spheres.centers, spheres.boxes, has_sphere, is_matern, length, num_threads(threads), total)
+    native.field_density(*spheres, has_sphere, is_matern, length, num_threads(threads), total)
     return total
 
 
@@ -216,9 +202,7 @@ def bake_hard(
     threads: int = 0,
 ) -> None:
     """Write `nearest` at the cells of `span`; gradient is (X, Y, Z, 3)."""
-    native.field_bake_hard(
-        *spheres.arrays, *radii.arrays, *span.arrays, num_threads(threads), distance, gradient, entry
-    )
+    native.field_bake_hard(*spheres, *radii, *span.arrays, num_threads(threads), distance, gradient, entry)
 
 
 def bake_gaussian(
@@ -232,8 +216,8 @@ def bake_gaussian(
 ) -> None:
     """Write `gaussian` at the cells of `span`; exact: ``log |w_i|``, offsets: ``2 l^2 log |w_i|``."""
     native.field_bake_gaussian(
-        *spheres.arrays,
-        *terms.offsets.arrays,
+        *spheres,
+        *terms.offsets,
         terms.exact,
         terms.radii,
         terms.sign,
@@ -257,8 +241,8 @@ def bake_matern(
 ) -> None:
     """Write `matern` at the cells of `span`; exact: offsets in float64."""
     native.field_bake_matern(
-        *spheres.arrays,
-        *terms.offsets.arrays,
+        *spheres,
+        *terms.offsets,
         terms.exact,
         terms.sign,
         terms.length,
@@ -285,8 +269,8 @@ def touched_blocks(
     They matter to `bake_hard` if `length` is None (offsets: radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
     """
     native.field_touched(
-        *spheres.arrays,
-        *offsets.arrays,
+        *spheres,
+        *offsets,
         changed,
         0.0 if length is None else length,
         *span.arrays[:3],

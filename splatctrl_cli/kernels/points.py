@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import Bool, Float32, Float64, Int64, native
+from splatctrl_cli.kernels import Bool, Float32, Float64, Floats, Int32, Int64, native
 
 
 def back_projected(camera: Float64, depth: Float32, chosen: Bool | None = None, num_threads: int = 1) -> Float64:
@@ -63,7 +62,7 @@ class Cubes:
     def __len__(self) -> int:
         return len(self._native)
 
-    def members(self) -> tuple[NDArray[np.int32], Int64]:
+    def members(self) -> tuple[Int32, Int64]:
         """Return the cube (N,) of each point, and the first point (K,) of each cube."""
         of_point, first = np.empty(len(self._points), np.int32), np.empty(len(self), np.int64)
         self._native.members(of_point, first, self._num_threads)
@@ -90,14 +89,14 @@ class SplatTree:
         self._num_threads = num_threads
         self._native: Any = native.SplatTree(np.ascontiguousarray(centers), np.ascontiguousarray(radii))
 
-    def are_further(self, points: NDArray[np.floating], gap: float) -> Bool:
+    def are_further(self, points: Floats, gap: float) -> Bool:
         """Points (K, 3) further than `gap` [m] from each of the eight balls with the nearest centres."""
         out = np.empty(len(points), np.uint8)
         self._native.are_further(np.ascontiguousarray(points, np.float64), gap, out, self._num_threads)
         return out.view(bool)
 
 
-def solid_distance(points: NDArray[np.floating], solids: Float64, num_threads: int = 1) -> Float64:
+def solid_distance(points: Floats, solids: Float64, num_threads: int = 1) -> Float64:
     """Signed distance (N,) [m] of points (N, 3) to solids (P, 16) of `SurfaceScene`.
 
     Negative inside; infinite without any.

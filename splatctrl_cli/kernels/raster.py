@@ -1,6 +1,8 @@
-"""Splat rasteriser, image loss and optimiser: typed wrappers.
+"""Splat rasteriser, image loss and optimiser; anisotropic Gaussians: typed wrappers.
 
-Shapes: N splats, (H, W) pixels. `planes` (5, H, W): red, green, blue, depth [m], accumulated opacity.
+Shapes: N splats or Gaussians, (H, W) pixels. `planes` (5, H, W): red, green, blue, depth [m], accumulated opacity.
+`parameters` of Gaussians (N, 59): centre (3) [m], log scales (3), wxyz quaternion (4, any length but zero), logit
+opacity, 16 spherical-harmonic coefficients each of red, green, blue.
 """
 
 from dataclasses import astuple, dataclass
@@ -29,26 +31,30 @@ def empty_planes(height: int, width: int) -> Float32:
     return memory[first : first + size].reshape(5, height, width)
 
 
-class Rasteriser:
-    """Renders and differentiates a view; keeps its buffers."""
+class PreparedView:
+    """Renders a prepared view; keeps its buffers."""
 
     def __init__(self, num_threads: int) -> None:
         self.num_threads = num_threads
         self.native: Any = native.Rasteriser()
-        self._inputs: tuple[Float32, ...] = ()
+        self._inputs: tuple[Float32, ...] = ()  # the kernel keeps pointers to them until the next `prepare`
         self._shape = (0, 0)
-
-    def prepare(self, camera: Float64, centers: Float32, radii: Float32, opacities: Float32, colors: Float32) -> None:
-        """Project (eq. 1), sort and bin splats for a `pack_camera` camera."""
-        self._inputs = (centers, radii, opacities, colors)  # the kernel keeps pointers until the next call
-        self._shape = (int(camera[5]), int(camera[4]))
-        self.native.prepare(camera, centers, radii, opacities, colors, self.num_threads)
 
     def forward(self, out: Float32 | None = None) -> Float32:
         """Planes (5, H, W) (eq. 2 and 3)."""
         planes = empty_planes(*self._shape) if out is None else out
         self.native.forward(planes, self.num_threads)
         return planes
+
+
+class Rasteriser(PreparedView):
+    """Renders and differentiates a view of splats."""
+
+    def prepare(self, camera: Float64, centers: Float32, radii: Float32, opacities: Float32, colors: Float32) -> None:
+        """Project (eq. 1), sort and bin splats for a `pack_camera` camera."""
+        self._inputs = (centers, radii, opacities, colors)
+        self._shape = (int(camera[5]), int(camera[4]))
+        self.native.prepare(camera, centers, radii, opacities, colors, self.num_threads)
 
     def backward(self, planes: Float32, plane_gradients: Float32, out: Float32 | None = None) -> Float32:
         """Gradients (N, 10): u, v, conic a, b, c, depth, opacity, red, green, blue."""
@@ -178,3 +184,17 @@ def unpack_parameters(parameters: Float32, num_threads: int) -> tuple[Float32, F
     radii, opacities = np.empty(count, np.float32), np.empty(count, np.float32)
     native.unpack_parameters(parameters, centers, radii, colors, opacities, num_threads)
     return centers, radii, colors, opacities
+
+
+NUM_PARAMETERS = 59
+CENTER, LOG_SCALE, QUAT, LOGIT, HARMONICS = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 59)
+
+
+class GaussianRasteriser(PreparedView):
+    """Renders a view of Gaussians."""
+
+    def prepare(self, camera: Float64, parameters: Float32, degree: int = 3) -> None:
+        """Project, colour (harmonics to `degree`), sort and bin for a `pack_camera` camera."""
+        colors = np.empty((len(parameters), 3), np.float32)
+        self._inputs, self._shape = (colors,), (int(camera[5]), int(camera[4]))
+        native.prepare_gaussians(self.native, camera, parameters, degree, colors, self.num_threads)

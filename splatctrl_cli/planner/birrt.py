@@ -5,7 +5,7 @@ edge free, also of shortcuts. J joints, G goals, W waypoints.
 """
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -49,20 +49,13 @@ class Plan:
         return self.outcome is PlanOutcome.SOLVED
 
 
-@dataclass
 class _Tree:
     """Nodes q (size, J) and parent indices, -1 for a root."""
 
-    roots: Float64
-    q: Float64 = field(init=False)
-    squares: Float64 = field(init=False)
-    parent: Index = field(init=False)
-    size: int = 0
-
-    def __post_init__(self) -> None:
-        self.q, self.squares = np.empty((256, self.roots.shape[1])), np.empty(256)
-        self.parent = np.empty(256, dtype=np.int64)
-        self.add(self.roots, np.full(len(self.roots), -1))
+    def __init__(self, roots: Float64) -> None:
+        self.q, self.squares, self.size = np.empty((256, roots.shape[1])), np.empty(256), 0
+        self.parent: Index = np.empty(256, dtype=np.int64)
+        self.add(roots, np.full(len(roots), -1))
 
     def add(self, q: Float64, parent: Index) -> Index:
         while self.size + len(q) > len(self.q):

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import SHORTEST_EDGE, STILL_ROW
 from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.kernels.joint_edges import EdgeRoom
+from splatctrl_cli.kernels.chain import EdgeRoom
 from splatctrl_cli.planner.solid_scene import Solids
-from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +31,6 @@ class HasDistance(Protocol):
 
     def distance(self, points: Float64) -> Float64:
         """Return signed distance (Q,) [m] at points (Q, 3) [m], world."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +45,8 @@ class Clearance:
     model: ArmModel
     scene: HasDistance
     taken: Float64
-    moving: NDArray[np.intp]
-    pairs: NDArray[np.integer]
+    moving: Integers
+    pairs: Integers
     levers: Float64
     names: tuple[str, ...]
     compiled: EdgeRoom | None = None
@@ -135,7 +133,7 @@ class Clearance:
         return self.names[int(np.argmin(row))], float(np.min(row))
 
 
-def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
+def _apart(centers: Float64, pairs: Integers) -> Float64:
     """Distances of pairs by ``|a|^2 + |b|^2 - 2 a b``, good to 1e-8 m."""
     B, S = centers.shape[:2]
     squares = np.einsum("bsk,bsk->bs", centers, centers)
@@ -146,7 +144,7 @@ def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
     return np.asarray(np.sqrt(np.maximum(chosen, 0.0, out=chosen), out=chosen))
 
 
-def _between(levers: Float64, pairs: NDArray[np.integer]) -> Float64:
+def _between(levers: Float64, pairs: Integers) -> Float64:
     """Bounds (P, J) on how fast two spheres approach; a joint that moves both moves neither against the other."""
     a, b = levers[pairs[:, 0]], levers[pairs[:, 1]]
     moves_both: Bool = (a > 0) & (b > 0)

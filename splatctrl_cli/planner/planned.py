@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
-from splatctrl_cli.config.fixed import FRAME_SPACING
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import scene_margin
-from splatctrl_cli.control.goals import Detour, PlanDetour, pose_error
+from splatctrl_cli.control.goals import Detour, PlanDetour, TimedPath, pose_error
 from splatctrl_cli.control.replay import ReplayTask
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.planner.birrt import Plan, PlanOutcome, plan
@@ -32,38 +30,6 @@ def resampled(waypoints: Float64, spacing: float) -> Float64:
     return np.concatenate(rows)
 
 
-@dataclass(frozen=True, kw_only=True)
-class TimedPath:
-    """A timed path (W, J), at rest at each waypoint to keep straight edges.
-
-    start_time (W,) [s]; top_speed, acceleration (W - 1,): trapezoids of the share of each edge, per s and s^2.
-    """
-
-    waypoints: Float64
-    start_time: Float64
-    top_speed: Float64
-    acceleration: Float64
-
-    @property
-    def duration(self) -> float:
-        """Seconds from start to end."""
-        return float(self.start_time[-1])
-
-    def at(self, time: NDArray[np.floating] | float) -> tuple[Float64, Float64]:
-        """Return position and velocity (K, J) at times (K,) [s]; at rest outside the path."""
-        clock = np.clip(np.atleast_1d(np.asarray(time, dtype=np.float64)), 0.0, self.duration)
-        edge = np.clip(np.searchsorted(self.start_time, clock, side="right") - 1, 0, len(self.top_speed) - 1)
-        speed, gain = self.top_speed[edge], self.acceleration[edge]
-        since, left = clock - self.start_time[edge], self.start_time[edge + 1] - clock
-        ramp = speed / gain
-        is_late = left < ramp
-        share = np.where(since < ramp, gain * since**2 / 2, speed * (since - ramp / 2))
-        share = np.where(is_late & (left <= since), 1.0 - gain * left**2 / 2, share)
-        rate = np.minimum(speed, gain * np.minimum(since, left))
-        motion = self.waypoints[edge + 1] - self.waypoints[edge]
-        return self.waypoints[edge] + share[:, None] * motion, rate[:, None] * motion
-
-
 def effector_rates(
     model: ArmModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
@@ -73,7 +39,7 @@ def effector_rates(
     """
     rates = np.full(len(waypoints) - 1, np.inf)
     for edge, ends in enumerate(pairwise(waypoints)):
-        for q in resampled(np.array(ends), FRAME_SPACING):
+        for q in resampled(np.array(ends), fixed.FRAME_SPACING):
             twist = model.frame_jacobian(q, frame) @ (ends[1] - ends[0])
             for part, limit in ((twist[:3], max_linear), (twist[3:], max_angular)):
                 speed = float(np.linalg.norm(part))

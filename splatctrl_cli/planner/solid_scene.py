@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import invert_transform, pose_at
+from splatctrl_cli.kernels.points import solid_distance
+from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE, CYLINDER
 from splatctrl_cli.records import Float64
 
 STEP = 1e-6  # [m] of the differences that give a gradient
@@ -52,39 +54,26 @@ class Solids:
     """
 
     solids: Sequence[Solid]
-    _balls: tuple[Float64, Float64] = field(init=False, repr=False)
-    _boxes: tuple[Float64, Float64, Float64] = field(init=False, repr=False)
-    _rods: tuple[Float64, Float64, Float64] = field(init=False, repr=False)
+    _packed: Float64 = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for index, solid in enumerate(self.solids):
             if not min(_sizes(solid)) > 0:
                 raise InputError(f"solid {index}: expected sizes above 0 m, got {_sizes(solid)}")
-        balls = [s for s in self.solids if isinstance(s, Ball)]
-        boxes = [s for s in self.solids if isinstance(s, Cuboid)]
-        rods = [s for s in self.solids if isinstance(s, Rod)]
-        centers = np.array([s.center for s in balls], dtype=np.float64).reshape(-1, 3)
-        object.__setattr__(self, "_balls", (centers, np.array([s.radius for s in balls], dtype=np.float64)))
-        half = np.array([s.size for s in boxes], dtype=np.float64).reshape(-1, 3).T / 2
-        object.__setattr__(self, "_boxes", (*_into([s.T_world_shape for s in boxes]), half))
-        shape = np.array([_core(s) for s in rods], dtype=np.float64)
-        object.__setattr__(self, "_rods", (*_into([s.T_world_shape for s in rods]), shape.reshape(-1, 3).T))
+        object.__setattr__(self, "_packed", np.array([_packed(solid) for solid in self.solids]).reshape(-1, 16))
 
     def rows(self) -> tuple[Float64, Float64, Float64]:
-        """Return balls (., 4), boxes (., 15), rods (., 15) for `kernels.joint_edges.EdgeRoom`."""
-        centers, radii = self._balls
-        return np.column_stack([centers, radii]), _placed_rows(*self._boxes), _placed_rows(*self._rods)
+        """Return balls (., 4), boxes (., 15), rods (., 15) for `kernels.chain.EdgeRoom`."""
+        balls, boxes, cylinders, capsules = (
+            self._packed[self._packed[:, 0] == kind, 1:] for kind in (BALL, BOX, CYLINDER, CAPSULE)
+        )
+        # A capsule is a line padded by its radius, a cylinder has no padding.
+        rods = np.concatenate([cylinders, capsules[:, [*range(12), 14, 13, 12]]])
+        return np.column_stack([-balls[:, 9:12], balls[:, 12]]), boxes, rods
 
     def distance(self, points: Float64) -> Float64:
         """Return signed distances (Q,) at points (Q, 3), inf without solids."""
-        least = np.full(len(points), np.inf)
-        if len(self._balls[0]):
-            least = np.minimum(least, np.min(_to_balls(points, *self._balls), axis=0))
-        if len(self._boxes[0]):
-            least = np.minimum(least, np.min(_to_boxes(points, *self._boxes), axis=0))
-        if len(self._rods[0]):
-            least = np.minimum(least, np.min(_to_rods(points, *self._rods), axis=0))
-        return least
+        return solid_distance(points, self._packed)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Return distance (Q,) and central-difference gradient (Q, 3)."""
@@ -93,44 +82,17 @@ class Solids:
         return self.distance(points), np.stack(gradient, axis=1)
 
 
-def _to_balls(points: Float64, centers: Float64, radii: Float64) -> Float64:
-    return np.asarray(np.linalg.norm(points - centers[:, None], axis=2) - radii[:, None])
-
-
-def _to_boxes(points: Float64, turn: Float64, shift: Float64, half: Float64) -> Float64:
-    """(P, Q): distance outside, minus the way to the nearest face inside."""
-    out = np.abs(_local(points, turn, shift)) - half[:, :, None]
-    inside = np.minimum(np.max(out, axis=0), 0.0)
-    np.maximum(out, 0.0, out=out)
-    return np.asarray(np.sqrt(np.einsum("kpq,kpq->pq", out, out)) + inside)
-
-
-def _to_rods(points: Float64, turn: Float64, shift: Float64, shape: Float64) -> Float64:
-    """(P, Q): as for a box, in the half plane through the axis."""
-    x, y, z = _local(points, turn, shift)
-    across = np.sqrt(x * x + y * y) - shape[0][:, None]
-    along = np.abs(z) - shape[1][:, None]
-    inside = np.minimum(np.maximum(across, along), 0.0)
-    return np.asarray(np.hypot(np.maximum(across, 0.0), np.maximum(along, 0.0)) + inside - shape[2][:, None])
-
-
-def _local(points: Float64, turn: Float64, shift: Float64) -> Float64:
-    return np.asarray((turn @ points.T).reshape(3, -1, len(points)) + shift[:, :, None])
-
-
-def _into(placements: Sequence[Float64]) -> tuple[Float64, Float64]:
-    maps = np.array([invert_transform(T) for T in placements]).reshape(-1, 4, 4)
-    return np.ascontiguousarray(np.swapaxes(maps[:, :3, :3], 0, 1)).reshape(-1, 3), maps[:, :3, 3].T
-
-
-def _placed_rows(turn: Float64, shift: Float64, shape: Float64) -> Float64:
-    rotations = np.swapaxes(turn.reshape(3, -1, 3), 0, 1).reshape(-1, 9)
-    return np.ascontiguousarray(np.column_stack([rotations, shift.T, shape.T]))
-
-
-def _core(rod: Rod) -> tuple[float, float, float]:
-    """Cylinder radius, half length, distance of the surface outside it."""
-    return (0.0, rod.length / 2, rod.radius) if rod.is_round else (rod.radius, rod.length / 2, 0.0)
+def _packed(solid: Solid) -> Float64:
+    """A solid's row (16,) of `kernels.points.solid_distance`."""
+    if isinstance(solid, Ball):
+        kind, T, sizes = BALL, pose_at(solid.center), np.array([solid.radius, 0.0, 0.0])
+    elif isinstance(solid, Cuboid):
+        kind, T, sizes = BOX, solid.T_world_shape, solid.size / 2
+    else:
+        kind, T = CAPSULE if solid.is_round else CYLINDER, solid.T_world_shape
+        sizes = np.array([solid.radius, solid.length / 2, 0.0])
+    into = invert_transform(T)
+    return np.concatenate([[kind], into[:3, :3].ravel(), into[:3, 3], sizes])
 
 
 def _sizes(solid: Solid) -> tuple[float, ...]:

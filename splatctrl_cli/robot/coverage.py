@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 from splatctrl_cli.config.fixed import COVERED_EDGE, DEFICIT_GAP
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import face_normals, invert_transform, transform_points
-from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.records import Bool, Float64, Index, SphereSet
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 from splatctrl_cli.robot.urdf import UrdfFile
 
@@ -230,7 +230,7 @@ def _of_link(
     parts: Sequence[Solid],
     centers: Float64,
     radii: Float64,
-    indices: "np.ndarray[tuple[int], np.dtype[np.int64]]",
+    indices: Index,
     own: Bool,
     resolution: float,
 ) -> LinkCoverage:
@@ -257,7 +257,7 @@ def _of_link(
         deficit=max(deficits, key=lambda deficit: deficit.proven) if deficits else None,
         protrusion=float(sticking[worst]),
         worst_sphere=int(indices[own][worst]) if own.any() else -1,
-        is_closed=all(part.is_closed for part in parts),
+        is_closed=all(part.surface.is_closed for part in parts),
     )
 
 
@@ -292,7 +292,7 @@ def _phi(points: Float64, centers: Float64, radii: Float64) -> Float64:
     return np.concatenate([(cdist(points[p], centers) - radii).min(axis=1) for p in _chunks(points, len(radii))])
 
 
-def _longest_edges(triangles: Float64) -> tuple[Float64, "np.ndarray[tuple[int], np.dtype[np.int64]]"]:
+def _longest_edges(triangles: Float64) -> tuple[Float64, Index]:
     length = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2)
     return length.max(axis=1), length.argmax(axis=1)
 

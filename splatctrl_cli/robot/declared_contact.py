@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Bool, Box
+from splatctrl_cli.records import Bool, Box, Floats
 
 REMEDY = "see splatctrl help declare for the keys of a declaration"
 
@@ -23,10 +22,6 @@ class Carried:
     box: Box
     start: float
     end: float
-
-    def is_active(self, time_s: float) -> bool:
-        """True while carried."""
-        return self.start <= time_s <= self.end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,10 +38,6 @@ class ExpectedContact:
     reason: str
     is_learned: bool = False
 
-    def covers(self, link: str, point_world: NDArray[np.floating], time_s: float) -> bool:
-        """True for a link's contact at point (3,) [m] and time."""
-        return link == self.link and self.start <= time_s <= self.end and bool(self.box.contains(point_world))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Declarations:
@@ -62,22 +53,22 @@ class Declarations:
 
     def carried_at(self, time_s: float) -> list[tuple[str, Box]]:
         """Return links and boxes carried at a time, in their frames."""
-        return [(entry.link, entry.box) for entry in self.carried if entry.is_active(time_s)]
+        return [(entry.link, entry.box) for entry in self.carried if entry.start <= time_s <= entry.end]
 
-    def is_carried(self, link: str, points_link: NDArray[np.floating], time_s: float) -> Bool:
+    def is_carried(self, link: str, points_link: Floats, time_s: float) -> Bool:
         """True (N,) for points (N, 3) [m], link frame, in a carried box; counts uses."""
         inside = np.zeros(len(points_link), bool)
         for index, entry in enumerate(self.carried):
-            if entry.link == link and entry.is_active(time_s):
+            if entry.link == link and entry.start <= time_s <= entry.end:
                 its = entry.box.contains(points_link)
                 self.used("carried", index, int(its.sum()))
                 inside |= its
         return inside
 
-    def expects(self, link: str, point_world: NDArray[np.floating], time_s: float) -> ExpectedContact | None:
+    def expects(self, link: str, point_world: Floats, time_s: float) -> ExpectedContact | None:
         """Return the first entry for a contact at a point (3,) [m]; counts its use."""
         for index, entry in enumerate(self.expected_contact):
-            if entry.covers(link, point_world, time_s):
+            if link == entry.link and entry.start <= time_s <= entry.end and entry.box.contains(point_world):
                 self.used("expected_contact", index, 1)
                 return entry
         return None

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
-from splatctrl_cli.records import Bool, Box, Float64, Index, SphereSet
+from splatctrl_cli.records import Bool, Box, Float64, Floats, Index, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import (
@@ -34,11 +33,11 @@ from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 class RobotModel:
     """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
-    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: links
-    that `frame_pose` knows; left_out: links of the sphere file missing from the URDF; bare_links: URDF links with a
-    body but no sphere; coverage: None if not measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a
-    surface point of the sphere's rigid body may lie outside all spheres, NaN if unknown; held: locked fingers and
-    their values.
+    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); middle (J,): of the limits, 0 without;
+    base_position (3,) [m]; sphere_set in link frames; frame_names: links that `frame_pose` knows; left_out: links of
+    the sphere file missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None if not
+    measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a surface point of the sphere's rigid body may
+    lie outside all spheres, NaN if unknown; held: locked fingers and their values.
     """
 
     def __init__(
@@ -54,9 +53,9 @@ class RobotModel:
         held: Mapping[str, float] | None = None,
     ) -> None:
         self._model = model
-        self._data = model.createData()
         self.urdf = urdf
         self.T_world_base = T_world_base
+        self.base_position: Float64 = np.array(T_world_base[:3, 3])
         self.joint_names: tuple[str, ...] = tuple(str(name) for name in model.names)[1:]
         self.sphere_set = spheres
         self.left_out = tuple(left_out)
@@ -77,6 +76,9 @@ class RobotModel:
         rows = [joint.idx_q for joint in model.joints][1:]
         self.lower: Float64 = np.where(self._is_wrapped, -np.inf, model.lowerPositionLimit[rows])
         self.upper: Float64 = np.where(self._is_wrapped, np.inf, model.upperPositionLimit[rows])
+        limited = np.isfinite(self.lower) & np.isfinite(self.upper)
+        lower, upper = np.where(limited, self.lower, 0), np.where(limited, self.upper, 0)
+        self.middle: Float64 = np.where(limited, (lower + upper) / 2, 0.0)
         self.velocity_limit: Float64 = np.array(model.velocityLimit, dtype=np.float64)
         self._frames = {
             str(frame.name): index
@@ -111,7 +113,7 @@ class RobotModel:
         model = _without(model, file.with_followers(locked or {}), file.path)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
-            return cls(file, model, spheres_of(file), T, (), are_links_renamed=False, packages=packages)
+            spheres = spheres_of(file)
         asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
         sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
         is_renamed = are_links_renamed(asked, file)
@@ -250,17 +252,6 @@ class RobotModel:
         reach = self.reach()
         return Box(lower=self.base_position - reach, upper=self.base_position + reach)
 
-    @property
-    def base_position(self) -> Float64:
-        """Root link's origin (3,) [m], world."""
-        return np.array(self.T_world_base[:3, 3])
-
-    @property
-    def middle(self) -> Float64:
-        """Posture (J,) in the middle of the limits; 0 for an unlimited joint."""
-        limited = np.isfinite(self.lower) & np.isfinite(self.upper)
-        return np.where(limited, (np.where(limited, self.lower, 0) + np.where(limited, self.upper, 0)) / 2, 0.0)
-
     def sphere_centers(self, q: Float64) -> Float64:
         """Return centres (S, 3) at q (J,)."""
         return np.asarray(self.chain.centers(self._checked(q)[None])[0])
@@ -271,10 +262,6 @@ class RobotModel:
         if postures.ndim != 2 or postures.shape[1] != self.num_joints:
             raise InputError(f"joint positions: expected shape (T, {self.num_joints}), got {postures.shape}")
         return self.chain.centers(postures, threads=threads)
-
-    def sphere_jacobians(self, q: Float64) -> Float64:
-        """Return d centre / d q (S, 3, J) at q (J,)."""
-        return self.chain.jacobians(self._checked(q))[1]
 
     def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
         """Return centres (S, 3) and Jacobians (S, 3, J) at q (J,)."""
@@ -287,8 +274,8 @@ class RobotModel:
     def surface_gaps(
         self,
         positions: Float64,
-        centers: NDArray[np.floating],
-        radii: NDArray[np.floating],
+        centers: Floats,
+        radii: Floats,
         links: Collection[str] | None = None,
     ) -> dict[str, Float64]:
         """Return the signed gap (T,) [m] of each meshed link to the nearest ball.
@@ -383,10 +370,11 @@ class RobotModel:
 
     def _as_chain(self) -> Chain:
         placement = np.array([self.T_world_base, *(p.homogeneous for p in list(self._model.jointPlacements)[1:])])
-        pinocchio.computeJointJacobians(self._model, self._data, self._configuration(self.middle))
+        data = self._model.createData()
+        pinocchio.computeJointJacobians(self._model, data, self._configuration(self.middle))
         kind, axis = [REVOLUTE], [np.array([0.0, 0.0, 1.0])]
         for body in range(1, self.num_joints + 1):
-            local = pinocchio.getJointJacobian(self._model, self._data, body, pinocchio.ReferenceFrame.LOCAL)
+            local = pinocchio.getJointJacobian(self._model, data, body, pinocchio.ReferenceFrame.LOCAL)
             column = np.asarray(local).reshape(6, -1)[:, body - 1]
             linear, angular = column[:3], column[3:]
             is_turn = bool(np.linalg.norm(angular) > 0.5)
@@ -412,7 +400,7 @@ class RobotModel:
     def _moved(self) -> Bool:
         """Spheres on the base, or centred on their only axes, never move."""
         postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
-        gain = [np.abs(self.sphere_jacobians(q)).max(axis=(1, 2)) for q in postures]
+        gain = [np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures]
         return np.asarray(np.max(gain, axis=0) > 1e-9)
 
     def _lever_arms(self) -> Float64:

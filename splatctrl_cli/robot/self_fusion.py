@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
 from splatctrl_cli.config.fixed import MASK_SIGMAS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, invert_transform, project, strided_lens, transform_points
+from splatctrl_cli.kernels import Int16
 from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, RgbdFrame, spread
 from splatctrl_cli.robot.self_intervals import (
     LEAST_CELLS,
@@ -126,7 +126,7 @@ class _View:
     T_camera_world: Float64
     T_world_link: Float64
     depth: Float32
-    links: NDArray[np.int16]
+    links: Int16
     points_world: Float64
 
 

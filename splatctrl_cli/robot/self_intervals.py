@@ -5,13 +5,11 @@ K configurations in order of time, N cells.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from splatctrl_cli.records import Bool, Float32, Float64, Index, Stamps
+from splatctrl_cli.records import Array, Bool, Float32, Float64, Index, Stamps
 from splatctrl_cli.robot.self_model import ALWAYS
 
 VOXEL = 0.004  # [m]
@@ -122,17 +120,15 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
         sides = [gone[: run[0]]] * bool(start > 0) + [gone[run[1] + 1 :]] * bool(end < num - 1)
         is_gone = min(side.max() for side in sides) >= GONE
         if is_gone and np.bincount(pieces[pieces > 0]).max(initial=0) >= LEAST_CELLS:
-            found.append(_interval(int(before[its].max()), *run, int(after[its].min()), stamps))
+            free_before, free_after = int(before[its].max()), int(after[its].min())
+            interval = Interval(
+                first=run[0],
+                last=run[1],
+                start_ns=ALWAYS[0] if free_before < 0 else int(stamps[free_before] + stamps[run[0]]) // 2,
+                end_ns=ALWAYS[1] if free_after == num else int(stamps[run[1]] + stamps[free_after]) // 2,
+            )
+            found.append(interval)
     return found
-
-
-def _interval(before: int, first: int, last: int, after: int, stamps: Stamps) -> Interval:
-    return Interval(
-        first=first,
-        last=last,
-        start_ns=ALWAYS[0] if before < 0 else int(stamps[before] + stamps[first]) // 2,
-        end_ns=ALWAYS[1] if after == len(stamps) else int(stamps[last] + stamps[after]) // 2,
-    )
 
 
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
@@ -153,7 +149,7 @@ def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence
     return np.where(is_robot[chosen, np.arange(len(chosen))], chosen, -1)
 
 
-def spread_cells(mask: Bool, values: NDArray[Any], rest: float) -> Float32:
+def spread_cells(mask: Bool, values: Array, rest: float) -> Float32:
     """Return a grid (X, Y, Z) of values (N,) in the mask and `rest` elsewhere."""
     grid = np.full(mask.shape, np.float32(rest))
     grid[mask] = values

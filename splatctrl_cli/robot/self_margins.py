@@ -49,7 +49,7 @@ class LinkSurface:
         self.triangles.addVertices(self.vertices)
         self.triangles.addTriangles(faces)
         self.triangles.endModel()
-        self._closed = [solid for solid in solids if solid.is_closed]
+        self._closed = [solid for solid in solids if solid.surface.is_closed]
         self._boxes = [(s.surface.vertices.min(axis=0), s.surface.vertices.max(axis=0)) for s in self._closed]
         self._depths: list[Depth] = []
 
@@ -113,9 +113,13 @@ class SelfSurfaces:
         """model: with coverage of these solids; recorded: logged postures (R, J)."""
         self._model, self._solids = model, solids
         self._surfaces: dict[str, LinkSurface] = {}  # built when a pair is first near
-        leaders = {link: leader for link, (leader, _) in model.urdf.rigid_bodies().items()}
-        self._spheres = _SphereBodies(model, leaders)
+        self._leaders = leaders = {link: leader for link, (leader, _) in model.urdf.rigid_bodies().items()}
         links = model.sphere_set.links
+        names, owner = np.unique([leaders[link] for link in links], return_inverse=True)
+        self._body = {str(name): number for number, name in enumerate(names)}
+        self._order = np.argsort(owner, kind="stable")  # of the spheres, by rigid body
+        self._starts = np.searchsorted(owner[self._order], np.arange(len(names)))
+        self._reach = (model.sphere_set.radii + model.sphere_deficit)[self._order]
         solid_bodies = {leaders[link] for link in solids}
         self._bare = np.array(
             [(a, b) for a, b in model.self_pairs() if not {leaders[links[a]], leaders[links[b]]} <= solid_bodies],
@@ -132,12 +136,23 @@ class SelfSurfaces:
 
         centers: (T, S, 3). Links' gaps are exact below `enough` [m], else lower bounds above it.
         """
-        gaps = self._spheres.bounds(self.pairs, centers)
+        gaps = self._bounds(self.pairs, centers)
         for state, pair in np.argwhere(gaps < enough):
             gaps[state, pair] = self.gap(q[state], self.pairs[pair])
         (a, b), radii = self._bare.T, self._model.sphere_set.radii
         bare = np.linalg.norm(centers[:, a] - centers[:, b], axis=2) - radii[a] - radii[b]
         return np.concatenate([gaps, bare], axis=1)
+
+    def _bounds(self, pairs: Sequence[LinkNames], centers: Float64) -> Float64:
+        """Gaps (T, K) [m] of rigid bodies' spheres, grown by the uncovered surface."""
+        bodies = np.array([[self._body.get(self._leaders[link], -1) for link in pair] for pair in pairs])
+        found = np.full((len(centers), len(pairs)), -np.inf)
+        known = np.flatnonzero((bodies.reshape(-1, 2) >= 0).all(axis=1))
+        for state, points in enumerate(centers[:, self._order] if len(known) else ()):
+            gap = cdist(points, points) - self._reach[:, None] - self._reach
+            least = np.minimum.reduceat(np.minimum.reduceat(gap, self._starts, axis=0), self._starts, axis=1)
+            found[state, known] = least[bodies[known, 0], bodies[known, 1]]
+        return found
 
     def number_of(self, pair: LinkNames) -> int | None:
         """Return two links' index in `pairs`, in either order; None if absent."""
@@ -147,7 +162,7 @@ class SelfSurfaces:
         """Return one pair's gaps (T,) [m], as `gaps`; None for no such pair."""
         if self.number_of(pair) is None:
             return None
-        gaps = self._spheres.bounds([pair], centers)[:, 0]
+        gaps = self._bounds([pair], centers)[:, 0]
         for state in np.flatnonzero(gaps < enough):
             gaps[state] = self.gap(q[state], pair)
         return gaps
@@ -166,34 +181,12 @@ class SelfSurfaces:
         postures = random_postures(self._model, SELF_TOUCHING, seed=0)
         if recorded is not None:
             postures = np.concatenate([recorded, postures])
-        bounds = self._spheres.bounds(pairs, self._model.sphere_centers_batch(postures)).max(axis=0)
+        bounds = self._bounds(pairs, self._model.sphere_centers_batch(postures)).max(axis=0)
         return tuple(
             pair
             for pair, bound in zip(pairs, bounds, strict=True)
             if bound <= 0 and all(self.gap(q, pair) <= 0 for q in postures)
         )
-
-
-class _SphereBodies:
-    """Spheres by rigid body, grown by its uncovered surface."""
-
-    def __init__(self, model: RobotModel, leaders: Mapping[str, str]) -> None:
-        self._leaders = leaders
-        names, owner = np.unique([leaders[link] for link in model.sphere_set.links], return_inverse=True)
-        self._number = {str(name): number for number, name in enumerate(names)}
-        self._order = np.argsort(owner, kind="stable")
-        self._starts = np.searchsorted(owner[self._order], np.arange(len(names)))
-        self._reach = (model.sphere_set.radii + model.sphere_deficit)[self._order]
-
-    def bounds(self, pairs: Sequence[LinkNames], centers: Float64) -> Float64:
-        bodies = np.array([[self._number.get(self._leaders[link], -1) for link in pair] for pair in pairs])
-        found = np.full((len(centers), len(pairs)), -np.inf)
-        known = np.flatnonzero((bodies.reshape(-1, 2) >= 0).all(axis=1))
-        for state, points in enumerate(centers[:, self._order] if len(known) else ()):
-            gap = cdist(points, points) - self._reach[:, None] - self._reach
-            least = np.minimum.reduceat(np.minimum.reduceat(gap, self._starts, axis=0), self._starts, axis=1)
-            found[state, known] = least[bodies[known, 0], bodies[known, 1]]
-        return found
 
 
 @dataclass(frozen=True, kw_only=True)

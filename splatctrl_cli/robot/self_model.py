@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Float32, Float64
+from splatctrl_cli.records import Array, Float32, Float64, UInt8
 from splatctrl_cli.robot.coverage import areas
 from splatctrl_cli.robot.surface import RobotSurface
 
@@ -33,7 +32,7 @@ class LearnedLink:
     origin: Float64
     voxel: float
     distance: Float32
-    configurations: NDArray[np.uint8]
+    configurations: UInt8
     triangles: Float64
     outside_95: float
     outside_most: float
@@ -99,7 +98,7 @@ class SelfModel:
         """Return stamps [ns], in order, at which `held_at` may change."""
         return sorted({stamp for part in self.held for stamp in (part.start_ns, part.end_ns)} - set(ALWAYS))
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, Array]:
         """Return all of it by name, for a file."""
         keys = [f"{part.link} {number}" for number, part in enumerate(self.learned)]
         rows = zip(keys, self.learned, strict=True)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
+from splatctrl_cli.kernels import Int16
 from splatctrl_cli.kernels.points import solid_distance
 from splatctrl_cli.kernels.surface_image import (
     BALL,
@@ -20,14 +20,14 @@ from splatctrl_cli.kernels.surface_image import (
     SurfaceImage,
     SurfaceMesh,
     SurfaceScene,
+    TriangleTree,
+    better,
     render_surface,
 )
-from splatctrl_cli.kernels.triangles import TriangleTree, better
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Intrinsics, SphereSet
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Floats, Intrinsics, SphereSet
 from splatctrl_cli.robot.link_meshes import mesh_path, placed
 from splatctrl_cli.robot.urdf import Shape, UrdfFile, visual_urdf
 
-Int16 = NDArray[np.int16]
 KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
 
 
@@ -218,11 +218,11 @@ class RobotSurface:
     def distance(
         self,
         T_world_link: Float64,
-        points_world: NDArray[np.floating],
+        points_world: Floats,
         *,
         without: Sequence[str] = (),
-        within: NDArray[np.floating] | float = np.inf,
-        enough: NDArray[np.floating] | float = -np.inf,
+        within: Floats | float = np.inf,
+        enough: Floats | float = -np.inf,
         outside: Bool | None = None,
         num_threads: int = 1,
     ) -> Float64:
@@ -251,9 +251,7 @@ class RobotSurface:
         still = np.tile(np.eye(4), (len(self.links), 1, 1))
         return self.distance(still, points, without=[name for name in self.links if name != link], outside=outside)
 
-    def gaps(
-        self, link: str, T_world_link: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
-    ) -> Float64:
+    def gaps(self, link: str, T_world_link: Float64, centers: Floats, radii: Floats) -> Float64:
         """Return a link's signed gap (T,) [m] to the nearest ball; infinite without balls.
 
         Carried boxes count. Balls (N, 3), (N,) [m]; T_world_link (T, 4, 4).
@@ -268,7 +266,7 @@ class RobotSurface:
             found.append(np.array([gap.min(initial=np.inf) for gap in away]))
         return np.asarray(np.min(found, axis=0))
 
-    def _solids(self, T_solid: NDArray[np.floating]) -> Float64:
+    def _solids(self, T_solid: Floats) -> Float64:
         return np.column_stack([self.kinds, T_solid[:, :3, :3].reshape(-1, 9), T_solid[:, :3, 3], self.sizes])
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from splatctrl_cli.kernels import num_threads
-from splatctrl_cli.kernels.gaussians import (
+from splatctrl_cli.kernels.raster import (
     CENTER,
     HARMONICS,
     LOG_SCALE,

@@ -52,24 +52,29 @@ class RecordingOptions:
     color_rays: int = 4
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.duration_s <= 600:
-            raise UsageError(f"--duration: expected 0.5 to 600 s, got {self.duration_s:g}")
-        if not 0 < self.fps <= 60 or self.duration_s * self.fps < 3:
-            raise UsageError(f"--fps: expected up to 60 and at least three frames in all, got {self.fps:g}")
-        for option, value in (("--width", self.width), ("--height", self.height)):
-            if not 16 <= value <= 4096:
-                raise UsageError(f"{option}: expected 16 to 4096 px, got {value}")
-        if self.noise not in NOISES:
-            raise UsageError(f"--noise: expected one of {', '.join(NOISES)}, got {self.noise}")
-        if self.is_free and self.with_person:
-            raise UsageError("--free: expected no --person, who walks about the table")
-        if len(self.visitor) != 3 or not 0.001 <= self.visitor[2] <= 1 or max(map(abs, self.visitor[:2])) > 5:
-            given = ",".join(f"{value:g}" for value in self.visitor)
-            raise UsageError(f"--visitor: expected X,Y within 5 m and RADIUS from 0.001 to 1 m, got {given}")
-        if self.visitor != tabletop.VISITOR and (self.with_person or self.is_free):
-            raise UsageError("--visitor: expected no --person or --free")
-        if self.seed < 0:
-            raise UsageError(f"--seed: expected 0 or more, got {self.seed}")
+        given, place = ",".join(f"{value:g}" for value in self.visitor), self.visitor
+        is_placed = len(place) == 3 and 0.001 <= place[2] <= 1 and max(map(abs, place[:2])) <= 5
+        num_frames = self.duration_s * self.fps
+        rules = (
+            (0.5 <= self.duration_s <= 600, f"--duration: expected 0.5 to 600 s, got {self.duration_s:g}"),
+            (
+                0 < self.fps <= 60 and num_frames >= 3,
+                f"--fps: expected up to 60 and at least three frames in all, got {self.fps:g}",
+            ),
+            (16 <= self.width <= 4096, f"--width: expected 16 to 4096 px, got {self.width}"),
+            (16 <= self.height <= 4096, f"--height: expected 16 to 4096 px, got {self.height}"),
+            (self.noise in NOISES, f"--noise: expected one of {', '.join(NOISES)}, got {self.noise}"),
+            (not (self.is_free and self.with_person), "--free: expected no --person, who walks about the table"),
+            (is_placed, f"--visitor: expected X,Y within 5 m and RADIUS from 0.001 to 1 m, got {given}"),
+            (
+                place == tabletop.VISITOR or not (self.with_person or self.is_free),
+                "--visitor: expected no --person or --free",
+            ),
+            (self.seed >= 0, f"--seed: expected 0 or more, got {self.seed}"),
+        )
+        for is_kept, message in rules:
+            if not is_kept:
+                raise UsageError(message)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,11 +4,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.kernels.surface_image import SurfaceMesh, SurfaceScene, render_surface
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, Index, Integers, Intrinsics, UInt8
 from splatctrl_cli.simulate.primitives import Primitive, Texture, hit, normals
 
 # Offsets of the rays of a pixel from its centre [px]: the centre (depth) first, then four for colour.
@@ -37,7 +36,7 @@ class Meshes:
 
     links: tuple[str, ...]
     triangles: Float64
-    owners: NDArray[np.integer]
+    owners: Integers
     textures: tuple[Texture, ...]
     T_world_link: Float64
 
@@ -95,7 +94,7 @@ class Renderer:
                 points_world = origin + depth[mine][:, None] * self._directions[mine]
                 color[mine] = shaded(primitive, points_world)
 
-    def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> NDArray[np.int64]:
+    def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> Index:
         """Lower `depth` (K, H, W); index of the nearest primitive, or -1."""
         origin = self.camera.T_world_camera[:3, 3]
         owner = np.full(depth.shape, -1)
@@ -108,9 +107,7 @@ class Renderer:
             owner[window][is_nearer] = index
         return owner
 
-    def _nearest_faces(
-        self, meshes: Meshes | None, depth: Float64
-    ) -> Iterator[tuple[int, Bool, NDArray[np.integer]]]:
+    def _nearest_faces(self, meshes: Meshes | None, depth: Float64) -> Iterator[tuple[int, Bool, Integers]]:
         """Lower `depth` (K, H, W); per ray, pixels of nearer triangles, and their numbers."""
         if meshes is None:
             return
@@ -133,9 +130,7 @@ class Renderer:
                 depth[ray][mine] = seen.depth[mine]
                 yield ray, mine, first + seen.link[mine].astype(np.int64)
 
-    def _shaded_faces(
-        self, meshes: Meshes | None, depth: Float64, directions: Float64, faces: NDArray[np.integer]
-    ) -> Float64:
+    def _shaded_faces(self, meshes: Meshes | None, depth: Float64, directions: Float64, faces: Integers) -> Float64:
         """RGB (R, 3) at depths (R,) along directions (R, 3), on triangles (R,)."""
         assert meshes is not None
         points_world = self.camera.T_world_camera[:3, 3] + depth[:, None] * directions

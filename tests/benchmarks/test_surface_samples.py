@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh, thin
-from splatctrl_cli.robot.mesh_distance import MeshDistance
+from splatctrl_cli.robot.link_meshes import MeshDistance
 from tests.robot.test_mesh_distance import box_distance, box_mesh
 
 SIZE = (0.3, 0.2, 0.1)

@@ -13,8 +13,8 @@ from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.grid_field import exact_channel
-from splatctrl_cli.formats.grid import grid_formats
+from splatctrl_cli.field.grid_cells import exact_channel
+from splatctrl_cli.formats.grid import grid_format, grid_formats
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.formats.splat.splats import FORMATS, write_ply
@@ -150,12 +150,12 @@ def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) 
 
 
 def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
-    assert tuple(distance.DISTANCES) == words(FieldConfig, "distance")
+    assert tuple(distance.KERNEL_OF) == words(FieldConfig, "distance")
     assert tuple(weights.METHODS) == words(FieldConfig, "weights")
     assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
     assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
     assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
-    assert tuple(FORMATS) == scene_options.SPLAT_FORMATS and tuple(baker.CHANNELS) == scene_options.CHANNELS
+    assert tuple(FORMATS) == scene_options.SPLAT_FORMATS and tuple(grid_format.CHANNELS) == scene_options.CHANNELS
     assert scene_options.CHANNELS[:4] == baker.DEFAULT_CHANNELS
 
 
@@ -193,7 +193,7 @@ def test_the_field_that_is_updated_is_not_replaced(tmp_path: Path, splats: Path)
 def test_resume_goes_on_with_what_is_left(tmp_path: Path, splats: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = ["sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--formats", "npz"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("splatctrl_cli.field.header.label_counts", interrupt)
+        patch.setattr("splatctrl_cli.field.slabs.label_counts", interrupt)
         stopped = splatctrl(*given)
     assert stopped.returncode == 130
     assert f"field.partial is kept; continue it with: splatctrl sdf-bake --resume {splats} " in stopped.stderr

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
+from splatctrl_cli.control.audit import Between, Reach, between_states, clearances
 from splatctrl_cli.records import DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.control.fakes import Balls, Nowhere, PlanarArm, sample_arm

@@ -10,11 +10,10 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import BRAKING_SHARE
-from splatctrl_cli.control.barriers import scene_margin
+from splatctrl_cli.control.barriers import SceneStep, distance_rate, scene_margin
 from splatctrl_cli.control.limits import JointLimits, box_rows
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.qp_rows import RowBuilder, Rows, assemble_printed
-from splatctrl_cli.control.scene_field import SceneStep, distance_rate
 from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.control.terms import RowKind, State, stray_cost
 from splatctrl_cli.errors import InputError
@@ -90,7 +89,7 @@ def test_what_is_left_of_a_row_is_its_promise_along_any_velocity(arm: RobotModel
     for q in postures(arm, 4):
         velocity = random.uniform(-1.0, 1.0, arm.num_joints)
         ahead, behind = builder.distances(q + STEP * velocity), builder.distances(q - STEP * velocity)
-        margin = np.where(np.arange(len(ahead)) < builder.num_external, CONFIG.margin, CONFIG.self_margin)
+        margin = np.where(np.arange(len(ahead)) < len(builder.scene.names), CONFIG.margin, CONFIG.self_margin)
         promise = 10.0 * (builder.distances(q) - margin) + (ahead - behind) / (2 * STEP)
         np.testing.assert_allclose(builder.room(state_at(arm, q), velocity), promise, atol=1e-7)
 

@@ -9,10 +9,9 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.fixed_parts import FixedParts
-from splatctrl_cli.control.preconditions import check_free, static_violations
+from splatctrl_cli.control.barriers import PeopleGrown, SceneStep, distance_rate, guarded
+from splatctrl_cli.control.preconditions import FixedParts, check_free, static_violations
 from splatctrl_cli.control.replay import ReplayTask, SceneChange, closed_loop
-from splatctrl_cli.control.scene_field import PeopleGrown, SceneStep, distance_rate, guarded
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, Float64, SphereSet

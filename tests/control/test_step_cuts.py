@@ -14,6 +14,7 @@ from splatctrl_cli.control.qp_rows import RowBuilder
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.terms import State
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm, far_away, num_on_rung, sample_arm, scene_of
@@ -103,7 +104,7 @@ def test_an_arm_inside_a_shell_of_balls_gets_out(plain_arm: Path) -> None:
     turn, height = np.meshgrid(np.arange(0.0, 2 * np.pi, 0.5), np.arange(-0.12, 0.12, 0.03), indexing="ij")
     shell = np.stack([0.06 * np.cos(turn), 0.06 * np.sin(turn), height], axis=-1).reshape(-1, 3)
     around_hand = shell + arm.frame_pose(q, "hand")[:3, 3] + np.array([0.05, 0.03, 0.0])
-    cylinder = SphereField(around_hand.astype(np.float32), np.full(len(shell), 0.02, np.float32))
+    cylinder = SphereField(Spheres.of(around_hand.astype(np.float32), np.full(len(shell), 0.02, np.float32)))
     task = ReplayTask(start=q, T_world_goal=T_world_goal, frame="hand")
     trace = closed_loop(arm, CONFIG, task, lambda t: cylinder if t >= 50_000_000 else far_away())
     clearance = np.array([step.clearance for step in trace.steps])

@@ -9,13 +9,14 @@ from numpy.typing import ArrayLike
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field import weights as weights_module
-from splatctrl_cli.field.distance import DISTANCES, GpdfField, make_field
+from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, field_over
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.field.unknown import apply_unknown
 from splatctrl_cli.field.weights import METHODS
 from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, queries, splat_set
 from tests.reference import field as reference
+from tests.reference.unknown import apply_unknown
 
 LENGTHS = [10.0**exponent for exponent in range(-10, 3)]
 CENTERS, RADII = cloud(80)
@@ -26,7 +27,7 @@ SCENES = {
     "mixed radii": (CENTERS, np.geomspace(0.001, 0.3, 80).astype(np.float32).astype(np.float64)),
     "one place": (np.zeros((4, 3)), np.full(4, 0.02)),
 }
-KERNELS = [name for name in DISTANCES if name != "hard"]
+KERNELS = [name for name in KERNEL_OF if name != "hard"]
 
 
 @pytest.mark.parametrize("weights", METHODS)
@@ -46,7 +47,7 @@ def test_every_length_scale_gives_finite_distances_or_is_refused_in_words(
     for length in LENGTHS:
         config = FieldConfig(distance=distance, weights=weights, length_scale=length, noise=1e-3)
         try:
-            found, gradient = make_field(centers, radii, config).query(points)
+            found, gradient = field_over(Spheres.of(centers, radii), config).query(points)
         except (UsageError, NotEvaluableError) as error:
             assert weights == "cg", (length, error)  # what is lumped can always be made
             assert "field.weights" in str(error)
@@ -62,7 +63,7 @@ def test_every_length_scale_gives_finite_distances_or_is_refused_in_words(
     assert num_refused < len(LENGTHS) - 6
 
 
-@pytest.mark.parametrize("distance", DISTANCES)
+@pytest.mark.parametrize("distance", KERNEL_OF)
 def test_bad_splats_are_refused_by_every_field(distance: str) -> None:
     centers, radii = cloud(10)
     odd_center, odd_radius = centers.copy(), radii.copy()
@@ -75,7 +76,7 @@ def test_bad_splats_are_refused_by_every_field(distance: str) -> None:
         (centers[:0], radii[:0], "got none"),
     ):
         with pytest.raises((InputError, NotEvaluableError), match=words):
-            make_field(place, size, FieldConfig(distance=distance))
+            field_over(Spheres.of(place, size), FieldConfig(distance=distance))
 
 
 @pytest.mark.parametrize(
@@ -88,7 +89,7 @@ def test_bad_splats_are_refused_by_every_field(distance: str) -> None:
 )
 def test_bad_queries_are_named(distance: str, points: ArrayLike, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        make_field(*cloud(10), FieldConfig(distance=distance)).query(np.array(points))
+        field_over(Spheres.of(*cloud(10)), FieldConfig(distance=distance)).query(np.array(points))
 
 
 @pytest.mark.parametrize(
@@ -101,7 +102,7 @@ def test_bad_queries_are_named(distance: str, points: ArrayLike, words: str) -> 
 )
 def test_bad_settings_are_named(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        GpdfField(*cloud(10), **settings)
+        GpdfField(Spheres.of(*cloud(10)), FieldConfig(**settings))
     with pytest.raises(UsageError, match=words):
         FieldConfig(**settings)
 

@@ -12,17 +12,18 @@ from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.field import grid_cells as layout_module
 from splatctrl_cli.field import slabs as slabs_module
 from splatctrl_cli.field.baker import Baker
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box
 from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import UnknownSpace, bake, baked_planes, bytes_per_cell, check_slab_memory, slabs
-from splatctrl_cli.field.unknown import apply_unknown
 from splatctrl_cli.formats.grid.npz_grid import write_npz
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import SWEPT, OccupancyGrid
 from tests.field.scenes import cloud, splat_set
 from tests.plain import plain_grid
 from tests.reference import field as reference
+from tests.reference.unknown import apply_unknown
 
 BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]))
 CONFIG = FieldConfig(voxel=0.03)
@@ -66,7 +67,9 @@ def test_merged_spheres_and_parabolas_keep_to_the_truncation(length: float, voxe
     config = replace(CONFIG, voxel=voxel, length_scale=length, distance="gpdf")
     grid = bake(splat_set(centers, radii), box, config, channels=("sdf", "gradient"))
     cells = np.random.default_rng(0).integers(0, grid.channels["sdf"].shape, (3000, 3))
-    exact, gradient = GpdfField(centers, radii, length, truncation=1e-8).query(grid.origin + voxel * cells)
+    exact, gradient = GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=length, truncation=1e-8)).query(
+        grid.origin + voxel * cells
+    )
     error = grid.channels["sdf"][tuple(cells.T)] - exact
     assert np.abs(error).max() < config.truncation
     assert np.abs(error).max() > 1e-6  # they are taken: float32 alone does better
@@ -81,7 +84,10 @@ def test_baked_gradient_is_that_of_the_smaller_distance(distance: str, kind: typ
     grid = bake(splat_set(centers, radii), BOX, config, channels=("sdf", "gradient", "hard", kernel))
     points, gradient = cell_centers(grid), grid.channels["gradient"].reshape(-1, 3)
     is_exact = (grid.channels["hard"] <= grid.channels[kernel]).ravel()
-    exact, smooth = SphereField(centers, radii), kind(centers, radii, CONFIG.length_scale, truncation=1e-6)
+    exact, smooth = (
+        SphereField(Spheres.of(centers, radii)),
+        kind(Spheres.of(centers, radii), FieldConfig(length_scale=CONFIG.length_scale, truncation=1e-6)),
+    )
     assert is_exact.any()
     assert (~is_exact).any()
     np.testing.assert_allclose(gradient[~is_exact], smooth.query(points[~is_exact])[1], atol=2e-3)
@@ -194,7 +200,7 @@ def test_cells_are_counted_where_a_kernel_field_alone_over_estimates_or_has_no_v
     points, hard = cell_centers(grid), grid.channels["hard"].ravel()
     counts = {}
     for name, kind in (("se", SeField), ("gpdf", GpdfField)):
-        alone = kind(centers, radii, 0.1).query_raw(points)[0]
+        alone = kind(Spheres.of(centers, radii), FieldConfig(length_scale=0.1)).query_raw(points)[0]
         counts[f"{name}_without_value"] = np.isnan(alone).sum()
         counts[f"{name}_over_estimates"] = (alone > hard + 2e-6).sum()
     baked = grid.header["kernel_counts"]

@@ -20,9 +20,9 @@ from benchmarks.surfaces import (
 )
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
-from splatctrl_cli.field.grid_cells import LOSS, check_loss
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import LOSS, GridField, check_loss
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid, Float64
 from tests.field.scenes import plane, splat_set
@@ -128,8 +128,11 @@ def test_safe_reads_no_clearance_that_a_lone_splat_takes(case: LoneSplat) -> Non
     centers, radii = lone_splat(case.wall, wall_spacing=case.spacing, radius=case.radius)
     points = before_the_splat(case.radius)
     hard = exact_distance(points, centers, radii)
-    exact = SphereField(centers, radii)
-    for kernel in (SeField(centers, radii, case.length), GpdfField(centers, radii, case.length)):
+    exact = SphereField(Spheres.of(centers, radii))
+    for kernel in (
+        SeField(Spheres.of(centers, radii), FieldConfig(length_scale=case.length)),
+        GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=case.length)),
+    ):
         alone = kernel.query(points)[0]
         assert (alone - hard).max() > 2e-3  # the kernel alone reads clearance that is not there
         safe = SafeField(exact, kernel).query(points)[0]
@@ -170,7 +173,7 @@ def test_balls_inside_a_solid_read_no_less_than_the_distance_to_it(shape: Shape)
     np.testing.assert_allclose(shape.signed(points), truth, atol=0)
     assert truth.min() >= BAND[0]
     assert truth.max() < BAND[1]
-    hard = SphereField(*splats_on(shape, 0.02, is_inset=True, seed=0)).query(points)[0]
+    hard = SphereField(Spheres.of(*splats_on(shape, 0.02, is_inset=True, seed=0))).query(points)[0]
     assert (hard - truth).min() > -2.1e-4  # the tolerance of inscribed balls
     assert (hard - truth).max() < 0.02
 
@@ -186,5 +189,5 @@ def test_over_a_plane_the_gaussian_kernel_has_no_bias() -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.01, 0.01, (NUM_NEAR, 2)), rng.uniform(0.01, 0.2, NUM_NEAR)])
     for radius in (0.0, 0.005):
-        distance = SeField(*plane(radius, 0.01, 0.45)).query(points)[0]
+        distance = SeField(Spheres.of(*plane(radius, 0.01, 0.45))).query(points)[0]
         np.testing.assert_allclose(distance, points[:, 2] - radius, atol=5e-5 + 1e-6)  # the truncation, and float32

@@ -8,13 +8,14 @@ import pytest
 from benchmarks.stability import PRINTED, table_rows
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import (
-    DISTANCES,
+    KERNEL_OF,
     GpdfField,
     SafeField,
     SeField,
     SphereField,
-    make_field,
+    field_over,
     march,
     normalised,
 )
@@ -29,7 +30,8 @@ TRUNCATION_BOUND = FieldConfig.truncation + 1e-6  # [m], and float32
 
 def fields(centers: np.ndarray, radii: np.ndarray) -> list[DistanceField]:
     """Every field of the configuration."""
-    return [make_field(centers, radii, FieldConfig(distance=name, length_scale=LENGTH)) for name in DISTANCES]
+    spheres = Spheres.of(centers, radii)
+    return [field_over(spheres, FieldConfig(distance=name, length_scale=LENGTH)) for name in KERNEL_OF]
 
 
 def test_an_isolated_sphere_is_as_far_as_it_is_and_the_gradient_points_away() -> None:
@@ -43,13 +45,13 @@ def test_an_isolated_sphere_is_as_far_as_it_is_and_the_gradient_points_away() ->
 
 def test_hard_is_the_least_distance_to_a_sphere() -> None:
     centers, radii = cloud()
-    distance, _ = SphereField(centers, radii).query(queries())
+    distance, _ = SphereField(Spheres.of(centers, radii)).query(queries())
     np.testing.assert_allclose(distance, reference.hard(queries(), centers, radii), atol=2e-7)
 
 
 def test_gpdf_is_the_log_sum_exp_of_the_paper() -> None:
     centers, radii = cloud()
-    distance, gradient = GpdfField(centers, radii, LENGTH).query(queries())
+    distance, gradient = GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH)).query(queries())
     np.testing.assert_allclose(
         distance, reference.gpdf(queries(), centers, radii, LENGTH, NOISE), atol=TRUNCATION_BOUND
     )
@@ -61,7 +63,12 @@ def test_gpdf_errs_upwards_and_by_no_more_than_its_truncation() -> None:
     centers, radii = cloud()
     expected = reference.gpdf(queries(), centers, radii, LENGTH, NOISE)
     for truncation in (2e-4, 2e-5, 2e-6):
-        error = GpdfField(centers, radii, LENGTH, truncation=truncation).query(queries())[0] - expected
+        error = (
+            GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, truncation=truncation)).query(
+                queries()
+            )[0]
+            - expected
+        )
         assert error.min() > -3e-7 and error.max() < truncation + 3e-7
 
 
@@ -72,7 +79,9 @@ def test_se_is_the_gaussian_log_sum_exp_with_the_mean_radius_and_errs_upwards(le
     has_value = ~np.isnan(expected)
     far = has_value & (np.nan_to_num(expected) > 0.02)  # nearer, the root's slope grows without limit
     for truncation in (1e-6, 2e-5, 2e-4, 2e-3):
-        distance, gradient = SeField(centers, radii, length, truncation=truncation).query_raw(queries())
+        distance, gradient = SeField(
+            Spheres.of(centers, radii), FieldConfig(length_scale=length, truncation=truncation)
+        ).query_raw(queries())
         error = (distance - expected)[has_value]
         assert error.min() > -1.5e-6 and error.max() < truncation + 1.5e-6
         if truncation == 1e-6:
@@ -83,17 +92,19 @@ def test_se_is_the_gaussian_log_sum_exp_with_the_mean_radius_and_errs_upwards(le
 def test_fields_without_a_value_fall_back_to_the_exact_one() -> None:
     centers, radii = cloud()
     points = centers[:200] + 1e-3
-    field = SeField(centers, radii, 0.1)
+    field = SeField(Spheres.of(centers, radii), FieldConfig(length_scale=0.1))
     has_none = np.isnan(field.query_raw(points)[0])
     assert has_none.any()
-    for got, exact in zip(field.query(points), SphereField(centers, radii).query(points), strict=True):
+    for got, exact in zip(field.query(points), SphereField(Spheres.of(centers, radii)).query(points), strict=True):
         np.testing.assert_array_equal(got[has_none], exact[has_none])
 
 
 def test_log_domain_agrees_with_the_printed_form_where_that_is_finite() -> None:
     centers, radii = cloud(100)
     literal = reference.gpdf_as_printed(queries(), centers, radii, 0.1, NOISE)
-    np.testing.assert_allclose(GpdfField(centers, radii, 0.1).query(queries())[0], literal, atol=1.1e-4)
+    np.testing.assert_allclose(
+        GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=0.1)).query(queries())[0], literal, atol=1.1e-4
+    )
 
 
 def test_planar_zero_level_is_where_the_planar_field_is_zero() -> None:
@@ -106,14 +117,21 @@ def test_safe_field_never_exceeds_the_exact_distance() -> None:
     wall = plane(spacing=0.004, half=0.2)[0] - [0.0, 0.0, 0.02]
     centers = np.concatenate([[[0.0, 0.0, 0.05]], wall])  # one splat before it: row sums over-estimate its clearance
     radii, points = np.full(len(centers), 0.003), queries(400, extent=0.15)
-    hard, kernel = SphereField(centers, radii).query(points)[0], GpdfField(centers, radii, LENGTH).query(points)[0]
-    safe, gradient = make_field(centers, radii, FieldConfig(distance="safe_gpdf")).query(points)
+    hard, kernel = (
+        SphereField(Spheres.of(centers, radii)).query(points)[0],
+        GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH)).query(points)[0],
+    )
+    safe, gradient = field_over(Spheres.of(centers, radii), FieldConfig(distance="safe_gpdf")).query(points)
     assert (kernel > hard + 1e-3).any()
     assert (safe <= hard).all()
     np.testing.assert_array_equal(safe, np.minimum(hard, kernel))
     is_exact = hard < kernel
-    np.testing.assert_array_equal(gradient[is_exact], SphereField(centers, radii).query(points)[1][is_exact])
-    np.testing.assert_array_equal(gradient[~is_exact], GpdfField(centers, radii).query(points)[1][~is_exact])
+    np.testing.assert_array_equal(
+        gradient[is_exact], SphereField(Spheres.of(centers, radii)).query(points)[1][is_exact]
+    )
+    np.testing.assert_array_equal(
+        gradient[~is_exact], GpdfField(Spheres.of(centers, radii)).query(points)[1][~is_exact]
+    )
 
 
 @pytest.mark.parametrize("weights", ["rowsum", "cg"])
@@ -124,11 +142,11 @@ def test_safe_in_one_walk_is_the_smaller_of_two_queries(largest: float, weights:
     config = FieldConfig(weights=weights)
     points = np.concatenate([queries(500), queries(200, extent=3.0)])
     for num in (700, 100):
-        exact = SphereField(centers[:num], radii[:num]).query(points)
-        smooth = SeField(centers[:num], radii[:num], weights=weights).query_raw(points)
+        exact = SphereField(Spheres.of(centers[:num], radii[:num])).query(points)
+        smooth = SeField(Spheres.of(centers[:num], radii[:num]), FieldConfig(weights=weights)).query_raw(points)
         is_smooth = smooth[0] < exact[0]
         assert largest > 0.1 or (is_smooth.any() and not is_smooth.all())
-        distance, gradient = make_field(centers[:num], radii[:num], config).query(points)
+        distance, gradient = field_over(Spheres.of(centers[:num], radii[:num]), config).query(points)
         np.testing.assert_array_equal(distance, np.where(is_smooth, smooth[0], exact[0]))
         np.testing.assert_array_equal(gradient, np.where(is_smooth[:, None], smooth[1], exact[1]))
 
@@ -145,7 +163,7 @@ def test_one_point_or_none_or_many_can_be_asked() -> None:
 def test_threads_do_not_change_a_bit() -> None:
     centers, radii = cloud(3000)
     for kind in (SphereField, GpdfField):
-        one, three = kind(centers, radii, threads=1), kind(centers, radii, threads=3)
+        one, three = kind(Spheres.of(centers, radii), threads=1), kind(Spheres.of(centers, radii), threads=3)
         for a, b in zip(one.query(queries(1000)), three.query(queries(1000)), strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -157,7 +175,9 @@ def test_normalised_gradients_have_length_one_or_none() -> None:
 
 def test_of_equal_distances_the_exact_one_wins() -> None:
     place, radius = np.zeros((1, 3)), np.zeros(1)
-    safe = SafeField(SphereField(place, radius), GpdfField(place, radius, noise=0.0))
+    safe = SafeField(
+        SphereField(Spheres.of(place, radius)), GpdfField(Spheres.of(place, radius), FieldConfig(noise=0.0))
+    )
     distance, gradient = safe.query(np.array([[1.0, 0, 0]]))
     assert (distance[0], gradient[0, 0]) == (1.0, 1.0)
 
@@ -166,7 +186,7 @@ def test_the_nearest_sphere_is_the_one_that_gives_the_distance() -> None:
     random = np.random.default_rng(5)
     centers, radii = random.uniform(-1, 1, (300, 3)), random.uniform(0.0, 0.3, 300)
     points = random.uniform(-2, 2, (50, 3))
-    nearest = SphereField(centers, radii).nearest(points)
+    nearest = SphereField(Spheres.of(centers, radii)).nearest(points)
     gaps = np.linalg.norm(points[:, None] - centers, axis=2) - radii
     np.testing.assert_allclose(gaps[np.arange(50), nearest], gaps.min(axis=1), atol=1e-6)
 
@@ -176,7 +196,7 @@ def test_no_slope_of_the_gaussian_field_exceeds_its_bound_and_some_exceed_one(se
     random = np.random.default_rng(seed)
     centers = np.concatenate([random.uniform(-0.1, 0.1, (150, 3)), random.normal(size=(50, 3)) * 0.02])
     radii = random.uniform(0.001, 0.02, 200)
-    field = SeField(centers, radii, LENGTH)
+    field = SeField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH))
     points = np.concatenate([random.uniform(-0.25, 0.25, (800, 3)), centers + random.normal(size=(200, 3)) * 0.02])
     distance, gradient = field.query_raw(points)
     there = ~np.isnan(distance)
@@ -214,7 +234,10 @@ def test_the_log_domain_is_finite_and_right_where_printed_forms_have_the_papers_
 
 def test_marching_converges_to_the_level_set_before_a_plane() -> None:
     centers, radii = plane(0.005)
-    field, exact = GpdfField(centers, radii, LENGTH), SphereField(centers, radii)
+    field, exact = (
+        GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH)),
+        SphereField(Spheres.of(centers, radii)),
+    )
     points = np.array([[0.0, 0.0, z] for z in (0.04, 0.08, 0.15)])
     plain = points[:, 2] - planar_zero_level(0.005, LENGTH)
     error = [np.abs(field.query(points)[0] - plain).max()]
@@ -233,7 +256,12 @@ def test_marching_is_the_walk_that_the_reference_takes() -> None:
     centers, radii = cloud(300)
     points = queries(30)
     outside = points[reference.hard(points, centers, radii) > 0.02]
-    found = march(GpdfField(centers, radii, LENGTH, truncation=1e-8), SphereField(centers, radii), outside, steps=4)
+    found = march(
+        GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, truncation=1e-8)),
+        SphereField(Spheres.of(centers, radii)),
+        outside,
+        steps=4,
+    )
     walked, hit = reference.march(outside, centers, radii, LENGTH, 1e-6, steps=4)
     np.testing.assert_allclose(found.distance, walked, atol=2e-5)
     np.testing.assert_allclose(found.hit, hit, atol=1e-4)
@@ -243,7 +271,10 @@ def test_no_step_goes_through_a_sphere() -> None:
     wall, _ = plane(0.0, 0.004)
     centers = np.concatenate([[[0.0, 0.0, 0.08]], wall])  # one splat before a wall: row sums over-estimate there
     radii = np.full(len(centers), 0.003)
-    field, exact = GpdfField(centers, radii, LENGTH), SphereField(centers, radii)
+    field, exact = (
+        GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH)),
+        SphereField(Spheres.of(centers, radii)),
+    )
     points = np.array([0.0, 0.0, 0.08]) + 0.05 * np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 0.95], [1.0, 0.0, 0.1]])
     assert (field.query(points)[0] > exact.query(points)[0] + 1e-3).any()
     before = points
@@ -255,14 +286,19 @@ def test_no_step_goes_through_a_sphere() -> None:
 
 
 def test_points_behind_the_level_set_or_without_a_slope_stay_where_they_are() -> None:
-    field, exact = GpdfField(*plane(0.01), LENGTH), SphereField(*plane(0.01))
+    field, exact = (
+        GpdfField(Spheres.of(*plane(0.01)), FieldConfig(length_scale=LENGTH)),
+        SphereField(Spheres.of(*plane(0.01))),
+    )
     points = np.array([[0.0, 0.0, 0.002], [0.001, 0.0, -0.015]])
     found = march(field, exact, points)
     np.testing.assert_array_equal(found.hit, points)
     np.testing.assert_array_equal(found.distance, field.query(points)[0])
     assert (found.distance < 0).all()
     two = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]), np.zeros(2)
-    found = march(GpdfField(*two, LENGTH), SphereField(*two), np.zeros((1, 3)))
+    found = march(
+        GpdfField(Spheres.of(*two), FieldConfig(length_scale=LENGTH)), SphereField(Spheres.of(*two)), np.zeros((1, 3))
+    )
     np.testing.assert_allclose(found.hit, 0.0, atol=1e-9)
     assert found.distance[0] == pytest.approx(found.rest[0])
     with pytest.raises(UsageError, match="expected at least 1 step, got 0"):

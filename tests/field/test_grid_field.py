@@ -3,8 +3,9 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid
 from tests.field.scenes import cloud, queries, splat_set
@@ -29,7 +30,7 @@ def test_gradient_is_that_of_the_interpolant(grid: DistanceGrid) -> None:
     points = queries(200, extent=0.6)  # some outside the grid
     node = (points - grid.origin) / grid.voxel
     points = points[np.abs(node - np.round(node)).min(axis=1) > 1e-3]  # the interpolant has kinks between cells
-    assert 20 < np.count_nonzero(field.contains(points)) < len(points)
+    assert 20 < np.count_nonzero(field.box.contains(points)) < len(points)
     for axis in range(3):
         shift = step * np.eye(3)[axis]
         slope = (field.query(points + shift)[0] - field.query(points - shift)[0]) / (2 * step)
@@ -38,17 +39,17 @@ def test_gradient_is_that_of_the_interpolant(grid: DistanceGrid) -> None:
 
 def test_outside_the_grid_the_distance_is_a_lower_bound(grid: DistanceGrid) -> None:
     outside = queries(500, extent=1.0)
-    outside = outside[~GridField(grid).contains(outside)]
-    hard, _ = SphereField(*cloud()).query(outside)
+    outside = outside[~GridField(grid).box.contains(outside)]
+    hard, _ = SphereField(Spheres.of(*cloud())).query(outside)
     np.testing.assert_array_less(GridField(grid, "sdf").query(outside)[0], hard)
 
 
 def test_certified_distance_never_exceeds_the_exact_one(grid: DistanceGrid) -> None:
     points = queries(3000, extent=0.6)
-    hard, _ = SphereField(*cloud()).query(points)
+    hard, _ = SphereField(Spheres.of(*cloud())).query(points)
     certified = GridField(grid).certified(points)
     assert (certified <= hard).all()
-    inside = GridField(grid).contains(points)
+    inside = GridField(grid).box.contains(points)
     assert (certified[inside] > hard[inside] - np.sqrt(3) * grid.voxel).all()
     interpolated, _ = GridField(grid, "hard").query(points)
     assert (interpolated > hard).any()  # which is why it is needed

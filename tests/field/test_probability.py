@@ -4,7 +4,7 @@ import pytest
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import make_field
+from splatctrl_cli.field.distance import field_over
 from splatctrl_cli.field.probability import (
     CalibratedProbability,
     PaperProbability,
@@ -23,7 +23,7 @@ BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]
 def test_the_papers_probability_is_that_of_its_equations() -> None:
     centers, radii = cloud()
     points = np.concatenate([queries(), centers[:50] + 0.004])
-    probability = PaperProbability(Spheres.of(centers, radii), FieldConfig(truncation=1e-7)).of(points)
+    probability = PaperProbability(Spheres.of(centers, radii), FieldConfig(truncation=1e-7)).at(points, np.zeros(0))
     occupancy = np.exp(-reference.gpdf(points, centers, radii, LENGTH, NOISE) / LENGTH)
     variance = 1 - reference.explained(points, centers, LENGTH, NOISE)
     np.testing.assert_allclose(probability, reference.collision_probability(occupancy, variance), atol=2e-4)
@@ -33,7 +33,9 @@ def test_variance_falls_to_three_quarters_on_a_dense_plane_and_far_away_a_score_
     centers, radii = plane(half=0.12)
     on_plane = np.array([[0.001, 0.002, 0.0]])
     assert 1 - reference.explained(on_plane, centers, LENGTH, NOISE)[0] == pytest.approx(0.75, abs=0.01)
-    found = PaperProbability(Spheres.of(centers, radii), FieldConfig()).of(np.array([[0.0, 0.0, 5.0], *on_plane]))
+    found = PaperProbability(Spheres.of(centers, radii), FieldConfig()).at(
+        np.array([[0.0, 0.0, 5.0], *on_plane]), np.zeros(0)
+    )
     assert found[0] == pytest.approx(0.0027, abs=1e-4)  # Phi(-3) / Phi(0): dividing by 9 leaves a floor
     assert found[1] == pytest.approx(0.5, abs=0.06)  # on the surface, where it should say so and the mean is right
 
@@ -44,7 +46,7 @@ def test_probability_grows_towards_the_splats_and_never_leaves_its_range() -> No
     for length in (1e-10, 1e-6, 1e-3, 0.02, 1.0, 100.0):
         config = FieldConfig(length_scale=length)
         points = np.concatenate([centers[:20], queries(100), 40.0 + queries(5)])
-        found = PaperProbability(Spheres.of(centers, radii), config).of(points)
+        found = PaperProbability(Spheres.of(centers, radii), config).at(points, np.zeros(0))
         assert np.isfinite(found).all()
         assert ((found >= 0) & (found <= 1)).all()
         if length < 0.1:
@@ -73,9 +75,9 @@ def test_the_baked_channel_is_the_probability_at_the_cell_centres(form: str) -> 
     values = grid.channels["probability"]
     points = grid.origin + grid.voxel * np.argwhere(np.ones(values.shape, bool))
     if form == "paper":
-        expected = PaperProbability(Spheres.of(centers, radii), config).of(points)
+        expected = PaperProbability(Spheres.of(centers, radii), config).at(points, np.zeros(0))
     else:
-        found = make_field(centers, radii, config).query(points)[0]
+        found = field_over(Spheres.of(centers, radii), config).query(points)[0]
         expected = CalibratedProbability(sigma=config.error, mean=config.error_mean).of(found)
     np.testing.assert_allclose(values.ravel(), expected, atol=5e-3)  # 2e-5 m of truncation over 2 mm
     assert values.max() > 0.3

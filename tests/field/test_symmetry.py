@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
 from splatctrl_cli.records import DistanceField, Float64
 from tests.field.scenes import cloud, queries
@@ -26,18 +28,24 @@ Make = Callable[[Float64, Float64, float], DistanceField]
 
 
 def gpdf(centers: Float64, radii: Float64, scale: float, **more: Any) -> GpdfField:
-    return GpdfField(centers, radii, LENGTH * scale, truncation=TRUNCATION * scale, **more)
+    return GpdfField(
+        Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH * scale, truncation=TRUNCATION * scale, **more)
+    )
 
 
 def se(centers: Float64, radii: Float64, scale: float, **more: Any) -> SeField:
-    return SeField(centers, radii, LENGTH * scale, truncation=TRUNCATION * scale, **more)
+    return SeField(
+        Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH * scale, truncation=TRUNCATION * scale, **more)
+    )
 
 
 FIELDS: dict[str, Make] = {
-    "hard": lambda centers, radii, scale: SphereField(centers, radii),
+    "hard": lambda centers, radii, scale: SphereField(Spheres.of(centers, radii)),
     "gpdf": gpdf,
     "se": se,
-    "safe": lambda centers, radii, scale: SafeField(SphereField(centers, radii), se(centers, radii, scale)),
+    "safe": lambda centers, radii, scale: SafeField(
+        SphereField(Spheres.of(centers, radii)), se(centers, radii, scale)
+    ),
     "gpdf of the full process": partial(gpdf, noise=CG_NOISE, weights="cg"),
     "se of the full process": partial(se, noise=CG_NOISE, weights="cg"),
 }
@@ -54,7 +62,7 @@ def smooth_points(margin: float) -> Float64:
     points = queries(1500)
     each = np.sort(reference.distances(points, centers) - radii, axis=1)
     is_single = (each[:, 0] > 0.01) & (each[:, 1] - each[:, 0] > 2 * margin)
-    kernel = SeField(centers, radii, LENGTH, truncation=TRUNCATION)
+    kernel = SeField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, truncation=TRUNCATION))
     has_value = np.isfinite(kernel.query_raw(points)[0])
     is_apart = np.abs(kernel.query(points)[0] - each[:, 0]) > 2 * margin
     return points[is_single & has_value & is_apart]

@@ -5,13 +5,15 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.field.unknown import Cubes, apply_unknown
+from splatctrl_cli.field.unknown import Cubes
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 from tests.field.scenes import cloud, queries, splat_set
+from tests.reference.unknown import apply_unknown
 
 BOX = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.4))
 CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label")
@@ -104,7 +106,7 @@ def test_the_bound_certifies_splats_and_never_seen_cells(
     grid: DistanceGrid, is_unknown: Bool, solid: DistanceGrid
 ) -> None:
     points = queries(1500, extent=0.4)
-    hard, _ = SphereField(*cloud()).query(points)
+    hard, _ = SphereField(Spheres.of(*cloud())).query(points)
     cubes = cube_distance(points, cell_centers(grid, is_unknown), grid.voxel)
     certified = GridField(solid).certified(points)
     assert (certified <= np.minimum(hard, cubes)).all()

@@ -2,18 +2,20 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
+from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import VOXELS_PER_LENGTH
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.field import weights as weights_module
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField
 from splatctrl_cli.field.weights import (
+    METHODS,
     Matern12,
     SquaredExponential,
     conjugate_gradients,
+    log_row_sums,
     solve_process,
     voxel_row_sums,
-    weights_named,
 )
 from splatctrl_cli.geometry import rotation_from_quat
 from tests.field.scenes import cloud, queries
@@ -36,7 +38,7 @@ def test_voxel_density_is_spread_convolved_and_read_back(monkeypatch: pytest.Mon
 def test_voxel_density_is_near_the_exact_one_across_blocks(kernel: Matern12 | SquaredExponential) -> None:
     centers, radii = cloud(3000)
     centers *= 2.0  # 1.2 m: blocks of 0.63 m
-    exact = np.exp(kernel.log_row_sums(Spheres.of(centers, radii).points))
+    exact = np.exp(log_row_sums(kernel, Spheres.of(centers, radii)))
     sums = voxel_row_sums(centers, LENGTH, kernel.value)
     error = LENGTH * np.log(sums / exact)  # of the distance, were the splat alone in being near [m]
     assert np.sqrt(np.mean(error**2)) < 3e-4
@@ -55,7 +57,8 @@ def test_voxel_weights_give_nearly_the_field_of_the_row_sums() -> None:
     centers, radii = cloud()
     for kind in (GpdfField, SeField):
         exact, voxel = (
-            kind(centers, radii, LENGTH, weights=name).query(queries())[0] for name in ("rowsum", "voxel")
+            kind(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, weights=name)).query(queries())[0]
+            for name in ("rowsum", "voxel")
         )
         assert np.abs(voxel - exact).max() < 1e-3
         assert np.abs(voxel - exact).max() > 0
@@ -66,13 +69,13 @@ def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
     centers, radii = cloud(400)
     kernel = Matern12(LENGTH) if is_matern else SquaredExponential(LENGTH)
     log_values = radii / LENGTH if is_matern else np.zeros(400)
-    solution = solve_process(centers, log_values, LENGTH, kernel.value, NOISE)
+    scaled, log_scale, _, residual = solve_process(centers, log_values, LENGTH, kernel.value, NOISE)
     dense = reference.process_weights(kernel.value(reference.distances(centers, centers)), np.exp(log_values), NOISE)
     # The dense kernel is not cut off at 8 l, where a Matern kernel is 3e-4.
-    np.testing.assert_allclose(solution.scaled * np.exp(solution.log_scale), dense, atol=3e-3)
+    np.testing.assert_allclose(scaled * np.exp(log_scale), dense, atol=3e-3)
     assert (dense < 0).any()
-    assert solution.residual < 1e-6
-    weights = weights_named("cg", Spheres.of(centers, radii), kernel, NOISE, 1)
+    assert residual < 1e-6
+    weights = METHODS["cg"](Spheres.of(centers, radii), kernel, NOISE, 1)
     assert weights.num_iterations
     size = np.exp(weights.log_size + log_values)
     np.testing.assert_allclose(weights.sign * size, dense, atol=3e-3)
@@ -80,10 +83,14 @@ def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
 
 def test_field_of_the_full_process_is_that_of_the_dense_one() -> None:
     centers, radii = cloud(500)
-    distance = GpdfField(centers, radii, LENGTH, weights="cg").query_raw(queries())[0]
+    distance = GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, weights="cg")).query_raw(
+        queries()
+    )[0]
     expected = reference.process_gpdf(queries(), centers, radii, LENGTH, NOISE)
     np.testing.assert_allclose(distance, expected, atol=2e-4)  # of the cut-off at 8 l
-    se = SeField(centers, radii, LENGTH, noise=1e-2, weights="cg").query_raw(queries())[0]
+    se = SeField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, noise=1e-2, weights="cg")).query_raw(
+        queries()
+    )[0]
     has_value = ~np.isnan(se)  # where signed terms all but cancel the field may say that it has none
     assert has_value.mean() > 0.98
     expected = reference.process_se(queries(), centers, radii, LENGTH, 1e-2)
@@ -93,7 +100,10 @@ def test_field_of_the_full_process_is_that_of_the_dense_one() -> None:
 def test_weights_of_either_sign_are_cut_off_later_than_sums_that_cannot_cancel() -> None:
     centers, radii = cloud(600)
     coarse, fine = (
-        GpdfField(centers, radii, 0.05, weights="cg", noise=1e-2, truncation=truncation).query_raw(queries(2000))[0]
+        GpdfField(
+            Spheres.of(centers, radii),
+            FieldConfig(length_scale=0.05, weights="cg", noise=1e-2, truncation=truncation),
+        ).query_raw(queries(2000))[0]
         for truncation in (1e-2, 1e-6)
     )
     np.testing.assert_allclose(coarse, fine, atol=1e-6)
@@ -102,7 +112,10 @@ def test_weights_of_either_sign_are_cut_off_later_than_sums_that_cannot_cancel()
 def test_the_full_process_is_zero_on_each_sphere_where_lumping_is_not() -> None:
     centers, radii = cloud(500)
     occupied = {
-        name: GpdfField(centers, radii, LENGTH, weights=name, truncation=1e-7).query(centers)[0] + radii
+        name: GpdfField(
+            Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, weights=name, truncation=1e-7)
+        ).query(centers)[0]
+        + radii
         for name in ("cg", "rowsum")
     }
     assert np.abs(occupied["cg"]).max() < 2e-4  # eq. 8 interpolates; the matrix is cut off at 8 l, the field is not
@@ -113,7 +126,9 @@ def test_groups_of_splats_far_apart_do_not_drown_each_other() -> None:
     centers = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.001, 0.0, 0.0]])
     radii = np.array([0.5, 0.001, 0.002])
     length = 1e-3  # e^(0.5 / l) is beyond float64
-    distance = GpdfField(centers, radii, length, weights="cg").query(np.array([[2.2, 0.0, 0.0], [0.0, 0.9, 0.0]]))[0]
+    distance = GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=length, weights="cg")).query(
+        np.array([[2.2, 0.0, 0.0], [0.0, 0.9, 0.0]])
+    )[0]
     np.testing.assert_allclose(distance, [0.197, 0.4], atol=1e-5)
 
 
@@ -139,7 +154,7 @@ def test_what_cannot_be_solved_is_refused_in_words(
     for name, value in change.items():
         monkeypatch.setattr(weights_module, name, value)
     with pytest.raises((UsageError, NotEvaluableError), match=words):
-        kind(centers, radii, length, weights=weights)
+        kind(Spheres.of(centers, radii), FieldConfig(length_scale=length, weights=weights))
 
 
 def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
@@ -150,7 +165,7 @@ def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
 def test_coinciding_splats_share_their_weight() -> None:
     centers, radii = np.zeros((3, 3)), np.full(3, 0.01)
     for weights in ("rowsum", "voxel", "cg"):
-        field = GpdfField(centers, radii, LENGTH, weights=weights, noise=1e-3)
+        field = GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, weights=weights, noise=1e-3))
         distance = field.query(np.array([[0.1, 0.0, 0.0]]))[0][0]
         assert distance == pytest.approx(0.09, abs=5e-3 if weights == "voxel" else 1e-4), weights
 
@@ -162,13 +177,22 @@ def test_weights_follow_the_splats_and_their_scale_and_not_their_order(
 ) -> None:
     centers, radii = cloud(400)
     points = queries(100)
-    distance = kind(centers, radii, LENGTH, noise=1e-2, weights=weights).query(points)[0]
+    distance = kind(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, noise=1e-2, weights=weights)).query(
+        points
+    )[0]
     order = np.random.default_rng(3).permutation(400)
-    shuffled = kind(centers[order], radii[order], LENGTH, noise=1e-2, weights=weights)
+    shuffled = kind(
+        Spheres.of(centers[order], radii[order]), FieldConfig(length_scale=LENGTH, noise=1e-2, weights=weights)
+    )
     np.testing.assert_allclose(shuffled.query(points)[0], distance, atol=2e-5)
-    scaled = kind(8 * centers, 8 * radii, 8 * LENGTH, noise=1e-2, weights=weights, truncation=8 * 2e-5)
+    scaled = kind(
+        Spheres.of(8 * centers, 8 * radii),
+        FieldConfig(length_scale=8 * LENGTH, noise=1e-2, weights=weights, truncation=8 * 2e-5),
+    )
     np.testing.assert_allclose(scaled.query(8 * points)[0], 8 * distance, atol=4e-5)
     rotation, shift = rotation_from_quat([0.1, -0.5, 0.3, 0.8]), np.array([0.7, -1.1, 0.4])
-    moved = kind(centers @ rotation.T + shift, radii, LENGTH, noise=1e-2, weights=weights)
+    moved = kind(
+        Spheres.of(centers @ rotation.T + shift, radii), FieldConfig(length_scale=LENGTH, noise=1e-2, weights=weights)
+    )
     turned = moved.query(points @ rotation.T + shift)[0]
     np.testing.assert_allclose(turned, distance, atol=1e-3 if weights == "voxel" else 5e-5)  # a grid has axes

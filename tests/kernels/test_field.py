@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.field.clusters import cluster_points
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels import native as module
 from splatctrl_cli.records import Box
@@ -11,7 +11,7 @@ from tests.field.scenes import cloud, queries
 @pytest.mark.parametrize("num", [1, 15, 16, 17, 33, 257])
 def test_spare_entries_are_never_taken(num: int) -> None:
     centers, radii = cloud(num)
-    points = cluster_points(centers)
+    points = Spheres.of(centers, np.zeros(len(centers)))
     score, _, entry = native.nearest(points.clusters, points.offsets(radii), points.relative(queries()))
     each = np.linalg.norm(queries()[:, None] - centers, axis=2) - radii
     np.testing.assert_allclose(score, each.min(axis=1), atol=2e-7)
@@ -26,27 +26,30 @@ def test_row_sums_are_those_of_the_kernel_matrix_in_any_order(is_matern: bool) -
     d = np.linalg.norm(centers[:, None] - centers, axis=2)
     for length in (1e-6, 0.004, 0.05, 3.0):
         kernel = np.exp(-d / length) if is_matern else np.exp(-0.5 * (d / length) ** 2)
-        points = cluster_points(centers)
+        points = Spheres.of(centers, np.zeros(len(centers)))
         sums = points.gathered(native.row_sums(points.clusters, points.is_point, length, is_matern=is_matern))
         np.testing.assert_allclose(sums, kernel.sum(axis=1), rtol=1e-6, atol=700 * 2.0**-25)
         order = np.random.default_rng(0).permutation(700)
         frame = Box(lower=centers.min(axis=0), upper=centers.max(axis=0))
         more = np.concatenate([centers[order], [[9.0, 9.0, 9.0]]])
-        first, other = cluster_points(centers, frame), cluster_points(more, frame)
+        first, other = (
+            Spheres.of(centers, np.zeros(len(centers)), frame),
+            Spheres.of(more, np.zeros(len(more)), frame),
+        )
         a = first.gathered(native.row_sums(first.clusters, first.is_point, 0.05, is_matern=is_matern, threads=1))
         b = other.gathered(native.row_sums(other.clusters, other.is_point, 0.05, is_matern=is_matern, threads=3))
         np.testing.assert_array_equal(b[:-1], a[order])
 
 
 def test_at_a_centre_the_gradient_is_zero_or_finite() -> None:
-    points = cluster_points(cloud(50)[0])
+    points = Spheres.of(*cloud(50))
     at = np.ascontiguousarray(points.clusters.centers.T[:5])
     assert not native.nearest(points.clusters, points.offsets(np.full(50, 0.01)), at)[1].any()
     assert np.isfinite(native.matern(points.clusters, points.offsets(np.zeros(50)), None, 1e-10, 1e-3, at)[1]).all()
 
 
 def test_arrays_that_do_not_fit_are_refused_and_another_dtype_not_converted() -> None:
-    points = cluster_points(cloud(50)[0])
+    points = Spheres.of(*cloud(50))
     clusters, offsets = points.clusters, points.offsets(np.zeros(50))
     with pytest.raises(TypeError):
         native.nearest(clusters, offsets, queries())  # float64

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatctrl_cli.geometry import invert_transform, look_at
-from splatctrl_cli.kernels.gaussians import (
+from splatctrl_cli.kernels.raster import (
     HARMONICS,
     LOG_SCALE,
     LOGIT,
@@ -13,8 +13,9 @@ from splatctrl_cli.kernels.gaussians import (
     Float32,
     Float64,
     GaussianRasteriser,
+    Rasteriser,
+    pack_camera,
 )
-from splatctrl_cli.kernels.raster import Rasteriser, pack_camera
 from tests.reference import gaussians as reference
 
 SIZE = (50.0, 48.0, 24.3, 16.1, 45, 37)  # off-centre principal point, sizes that are no multiple of a tile

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from splatctrl_cli.field.clusters import cluster_points
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.kernels import arithmetic, native
 from splatctrl_cli.kernels import field as fields
 from splatctrl_cli.kernels.raster import (
@@ -59,7 +59,7 @@ def fit_bytes(width: int, height: int) -> bytes:
 def field_bytes() -> bytes:
     """Scores and gradients of the fields."""
     centers, radii = cloud(700)
-    points, at = cluster_points(centers), queries()
+    points, at = Spheres.of(centers, np.zeros(len(centers))), queries()
     relative, offsets = points.relative(at), points.offsets(radii)
     laid_out = points.laid_out(radii, spare=0.0).astype(np.float32)
     results = [

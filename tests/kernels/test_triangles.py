@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
-from splatctrl_cli.kernels.triangles import TriangleTree, better
+from splatctrl_cli.kernels.surface_image import TriangleTree, better
 from splatctrl_cli.records import Bool, Float64
 from tests.reference.triangles import distance_to_triangles, winding_number
 

@@ -31,7 +31,7 @@ def ball_distance(p: np.ndarray) -> np.ndarray:
 def test_signed_distance_to_a_primitive_is_that_of_its_formula(tmp_path: Path, shape: str, truth) -> None:  # type: ignore[no-untyped-def]
     (solid,) = read_solids(read_urdf(written(tmp_path, arm_of(shape, BALL))))["base"]
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (3000, 3))
-    assert solid.is_closed
+    assert solid.surface.is_closed
     assert solid.slack <= 4e-4
     np.testing.assert_allclose(SolidDistance([solid])(points), truth(points), atol=solid.slack + 1e-12)
 
@@ -58,7 +58,7 @@ def test_meshes_take_scale_and_origin_of_the_urdf(tmp_path: Path) -> None:
     origin = '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'
     mesh = '<mesh filename="ell.stl" scale="2 -1 1"/>'
     (solid,) = read_solids(read_urdf(written(tmp_path, arm_of(mesh, BALL, origin=origin))))["base"]
-    assert solid.is_closed
+    assert solid.surface.is_closed
     vertices = solid.surface.vertices
     np.testing.assert_allclose(vertices.min(axis=0), [1, 2, 3], atol=1e-6)  # (x, -y) turned by a quarter: (y, x)
     np.testing.assert_allclose(vertices.max(axis=0), [1.3, 2.6, 3.1], atol=1e-6)
@@ -122,7 +122,7 @@ def test_an_open_mesh_is_taken_apart_and_its_open_part_measured_by_its_hull_wher
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False).export(tmp_path / "sheet.stl")
     text = arm_of('<mesh filename="two.stl"/>', '<mesh filename="sheet.stl"/>')
     solids = read_solids(read_urdf(written(tmp_path, text)))
-    assert [solid.is_closed for solid in solids["base"]] == [True, False]
+    assert [solid.surface.is_closed for solid in solids["base"]] == [True, False]
     distance = SolidDistance(solids["base"])(np.array([[0.0, 0, 0], [1.0, 0, 0], [0.5, 0, 0]]))
     np.testing.assert_allclose(distance, [-0.05, -0.1, 0.4], atol=1e-6)
     assert solids["tip"][0].body is None

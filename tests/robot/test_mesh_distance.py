@@ -7,7 +7,7 @@ import trimesh
 
 from splatctrl_cli.formats.mesh import TriangleMesh, load_mesh
 from splatctrl_cli.records import Float64
-from splatctrl_cli.robot.mesh_distance import MeshDistance
+from splatctrl_cli.robot.link_meshes import MeshDistance
 from tests.reference.triangles import distance_to_triangles, winding_number
 
 CLOSED = (

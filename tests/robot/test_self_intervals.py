@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.kernels.triangles import TriangleTree
+from splatctrl_cli.kernels.surface_image import TriangleTree
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.robot.self_fusion import choose_moments, learn
 from splatctrl_cli.robot.self_intervals import VOXEL, Fused, Interval, choose_intervals

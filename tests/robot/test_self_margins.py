@@ -18,8 +18,7 @@ from splatctrl_cli.geometry import pose_at, transform_points
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.solid_scene import Solids
 from splatctrl_cli.records import Float64, SphereSet
-from splatctrl_cli.robot.link_meshes import Solid, read_solids
-from splatctrl_cli.robot.mesh_distance import MeshDistance
+from splatctrl_cli.robot.link_meshes import MeshDistance, Solid, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import DisabledPair, random_postures
 from splatctrl_cli.robot.self_margins import (

@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.geometry import look_at, pose_at, turn_about_z
-from splatctrl_cli.kernels.triangles import TriangleTree
+from splatctrl_cli.kernels.surface_image import TriangleTree
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from splatctrl_cli.robot import self_fusion
 from splatctrl_cli.robot.self_fusion import VOXEL, choose_moments, learn

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.files.summary import Grid, Summary
-from splatctrl_cli.records import DistanceGrid
+from splatctrl_cli.records import DistanceGrid, Float64, Values
 
 FORMAT = "splatctrl distance grid"
 VERSION = 2
@@ -65,7 +64,7 @@ CHANNELS: Mapping[str, Channel] = {
 class GridHead:
     """A grid file's head: origin (3,) float64 and voxel [m], cells along x, y, z."""
 
-    origin: NDArray[np.float64]
+    origin: Float64
     voxel: float
     shape: Shape
     channels: tuple[str, ...]
@@ -139,14 +138,14 @@ def check_finite(name: str, grid: DistanceGrid) -> None:
                 )
 
 
-def slabs(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
+def slabs(values: Values) -> Iterator[Values]:
     """Yield x layers in runs of `CHUNK` bytes, or one layer."""
     step = max(1, CHUNK // max(1, values.nbytes // len(values)))
     for start in range(0, len(values), step):
         yield np.ascontiguousarray(values[start : start + step])
 
 
-def x_fastest(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
+def x_fastest(values: Values) -> Iterator[Values]:
     """Yield z planes, (z, y, x[, 3]), in runs of `CHUNK` bytes or one plane."""
     x, y, z = values.shape[:3]
     step = max(1, CHUNK // max(1, values.nbytes // z))
@@ -156,11 +155,6 @@ def x_fastest(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
             tile = values[at : at + TILE, :, start : start + step]
             planes[:, :, at : at + TILE] = tile.transpose(2, 1, 0, *range(3, values.ndim))
         yield planes
-
-
-def from_x_fastest(planes: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Undo `x_fastest`: (X, Y, Z[, 3])."""
-    return np.ascontiguousarray(planes.transpose(2, 1, 0, *range(3, planes.ndim)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,10 +185,6 @@ class GridFormat:
         """File names for these channels."""
         stems = [f"{STEM}.{channel}" for channel in channels] if self.is_per_channel else [STEM]
         return tuple(f"{stem}{self.suffix}" for stem in stems)
-
-    def size_per_cell(self, bytes_of_channels: int) -> int:
-        """Bytes per cell on disk."""
-        return bytes_of_channels if self.bytes_per_cell is None else self.bytes_per_cell
 
 
 def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
@@ -256,7 +246,7 @@ class GridSlabs:
         self.folder, self.plan = folder, plan
         self.num_layers, self.counts = num_layers, counts or {}
 
-    def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
+    def write(self, slab: Mapping[str, Values], counts: Mapping[str, int] | None = None) -> None:
         """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress.
 
         counts: the baker's so far, kept with it. Raises InputError if channels or shapes differ from the plan.
@@ -288,7 +278,7 @@ class GridSlabs:
                 f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
                 remedy="continue the bake",
             )
-        channels: dict[str, NDArray[np.generic]] = {
+        channels: dict[str, Values] = {
             name: np.lib.format.open_memmap(self.folder / f"{name}.npy", mode="r") for name in self.plan.channels
         }
         origin = np.array(self.plan.origin, np.float64)
@@ -297,7 +287,7 @@ class GridSlabs:
     def _shape(self, name: str, num_layers: int) -> tuple[int, ...]:
         return CHANNELS[name].shape((num_layers, *self.plan.shape[1:]))
 
-    def _write_channel(self, name: str, values: NDArray[np.generic]) -> None:
+    def _write_channel(self, name: str, values: Values) -> None:
         path = self.folder / f"{name}.npy"
         layer = np.dtype(CHANNELS[name].dtype).itemsize * int(np.prod(self._shape(name, 1)))
         with path.open("r+b") as stream:

@@ -3,8 +3,8 @@
 Marching cubes of scikit-image (Lewiner et al. 2003) by slab, joined at a shared layer of cells.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,10 @@ STEP = 2.0**-13  # [cells] to which vertices are rounded: float32 has no more in
 FURTHEST = np.float32(1e9)  # [m] in the place of what is not known, where no cube is looked at
 
 
-@dataclass(frozen=True, kw_only=True)
-class Surface:
-    """vertices (V, 3) float64 [m], world; faces (F, 3) int64, anticlockwise from larger distances."""
-
-    vertices: Float64
-    faces: NDArray[np.int64]
-
-
-def iso_surface(grid: DistanceGrid) -> Surface:
+def iso_surface(grid: DistanceGrid) -> Any:
     """Extract the zero set of `sdf`, linear between cell centres; cubes with a NaN corner have none.
+
+    A trimesh: vertices (V, 3) float64 [m], world; faces (F, 3) int64, anticlockwise from larger distances.
 
     Raises NotEvaluableError if no cube crosses 0.
     """
@@ -63,15 +57,14 @@ def iso_surface(grid: DistanceGrid) -> Surface:
     return _joined(grid, np.concatenate(vertices), np.concatenate(faces))
 
 
-def write_surface(path: Path, surface: Surface) -> None:
+def write_surface(path: Path, surface: Any) -> None:
     """Write ``.ply`` and ``.obj`` with vertex normals, ``.stl`` with face normals."""
-    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     options: dict[str, dict[str, object]] = {
         ".ply": {"vertex_normal": True},
         ".obj": {"include_normals": True, "header": None},
         ".stl": {},
     }
-    content = mesh.export(file_type=path.suffix[1:], **options[path.suffix])
+    content = surface.export(file_type=path.suffix[1:], **options[path.suffix])
     path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
 
 
@@ -98,13 +91,13 @@ def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64
     return vertices.astype(np.float64), faces
 
 
-def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Surface:
+def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Any:
     """Merge equal vertices, in world; drop collapsed triangles."""
     unique, index = np.unique(np.round(vertices / STEP), axis=0, return_inverse=True)
     joined = index.reshape(-1)[faces]
     first, second, third = joined.T
     is_triangle = (first != second) & (second != third) & (third != first)
-    return Surface(vertices=grid.origin + grid.voxel * STEP * unique, faces=joined[is_triangle])
+    return trimesh.Trimesh(grid.origin + grid.voxel * STEP * unique, joined[is_triangle], process=False)
 
 
 def describe_mesh(path: Path, _head: bytes) -> Summary | None:

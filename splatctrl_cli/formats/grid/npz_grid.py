@@ -12,7 +12,6 @@ from math import prod
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Summary
@@ -27,7 +26,7 @@ from splatctrl_cli.formats.grid.grid_format import (
     parse_header,
     summary_of,
 )
-from splatctrl_cli.records import DistanceGrid
+from splatctrl_cli.records import DistanceGrid, Values
 
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}
 
@@ -40,7 +39,7 @@ _Members = dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]
 def write_npz(path: Path, grid: DistanceGrid) -> None:
     """Write the grid. Raises InputError for invalid channels."""
     check_grid(grid)
-    members: dict[str, NDArray[np.generic]] = {
+    members: dict[str, Values] = {
         "origin": np.asarray(grid.origin, dtype="<f8"),
         "voxel": np.asarray(grid.voxel, dtype="<f8"),
         "header": np.asarray(header_text(grid)),
@@ -134,7 +133,7 @@ def _head(path: Path, archive: zipfile.ZipFile, members: _Members) -> GridHead:
     return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header)
 
 
-def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.generic]:
+def _array(archive: zipfile.ZipFile, name: str) -> Values:
     with archive.open(f"{name}.npy") as stream:
         array = np.lib.format.read_array(stream, allow_pickle=False)
         if stream.read(1):  # reading to the end is what checks the sum
@@ -142,10 +141,17 @@ def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.generic]:
     return np.asarray(array, order="C")
 
 
-_DOCS = """
+ENTRIES = (
+    GridFormat(
+        name="npz",
+        order=0,
+        suffix=".npz",
+        write=write_npz,
+        describe=describe_npz,
+        read=read_npz,
+        docs="""
 `npz` | `field.npz`: `origin` (3,) and `voxel` () float64, `header` (JSON text), an array a channel, (X, Y, Z) or
     (X, Y, Z, 3), z fastest | this tool, `numpy.load` | NumPy 2.4.6, every value | 1.7 s, 16 MiB
-"""
-ENTRIES = (
-    GridFormat(name="npz", order=0, suffix=".npz", write=write_npz, describe=describe_npz, read=read_npz, docs=_DOCS),
+""",
+    ),
 )

@@ -96,11 +96,6 @@ def _write_all(path: Path, grid: DistanceGrid) -> None:
         write_nrrd(path.with_suffix(f".{channel}.nrrd"), grid, channel)
 
 
-_DOCS = """
-`nrrd` | `field.CHANNEL.nrrd`: `data[x, y, z]`, a gradient `data[component, x, y, z]`; header entries are
-    `splatctrl.KEY`, JSON texts | 3D Slicer, ITK, `nrrd.read` | pynrrd 1.1.3, every value; Slicer, ITK not tried |
-    4.7 s, 48 MiB
-"""
 ENTRIES = (
     GridFormat(
         name="nrrd",
@@ -109,6 +104,10 @@ ENTRIES = (
         write=_write_all,
         describe=describe_nrrd,
         is_per_channel=True,
-        docs=_DOCS,
+        docs="""
+`nrrd` | `field.CHANNEL.nrrd`: `data[x, y, z]`, a gradient `data[component, x, y, z]`; header entries are
+    `splatctrl.KEY`, JSON texts | 3D Slicer, ITK, `nrrd.read` | pynrrd 1.1.3, every value; Slicer, ITK not tried |
+    4.7 s, 48 MiB
+""",
     ),
 )

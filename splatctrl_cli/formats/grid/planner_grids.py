@@ -21,7 +21,6 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Summary
@@ -35,7 +34,7 @@ from splatctrl_cli.formats.grid.grid_format import (
     header_text,
     slabs,
 )
-from splatctrl_cli.records import Bool, DistanceGrid
+from splatctrl_cli.records import Bool, DistanceGrid, Values
 
 CUROBO = "0.7"  # the version that a file is for, as it says
 
@@ -55,7 +54,7 @@ def write_curobo(path: Path, grid: DistanceGrid) -> None:
         shape=(shape[0] * shape[1] * shape[2],),
         make=lambda: (-layers.astype(np.float32, copy=False) for layers in slabs(distances)),
     )
-    arrays: dict[str, NDArray[np.generic] | Pieces] = {
+    arrays: dict[str, Values | Pieces] = {
         "features": features,
         "dims": grid.voxel * sides,
         "voxel_size": np.asarray(grid.voxel, "<f8"),
@@ -88,12 +87,6 @@ def describe_curobo(path: Path, head: bytes) -> Summary | None:
     except (*DAMAGE, OSError, TypeError) as error:
         raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
     return Summary(path=str(path), kind="cuRobo voxel grid", facts=facts)
-
-
-_CUROBO_DOCS = """
-`curobo` | `field.curobo.npz`: `features`, `dims`, `voxel_size`, `pose`, `shape` | NVIDIA cuRobo, by the lines
-    below | its index arithmetic; cuRobo not tried | 1.1 s, 48 MiB (one channel)
-"""
 
 
 FIELDS = ("resolution", "size_x", "size_y", "size_z", "origin_x", "origin_y", "origin_z")
@@ -130,7 +123,7 @@ def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
     """True (L, Y, Z) for cells written as occupied."""
     name, most = ("bound", 0.0) if "bound" in grid.channels else ("hard", REACH * grid.voxel + ROUNDING)
     reached = np.asarray(grid.channels[name][layers]) <= np.float32(most)
-    is_clear: NDArray[np.bool_] = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
+    is_clear: Bool = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
     return reached | ~is_clear
 
 
@@ -161,11 +154,6 @@ def describe_moveit(path: Path, head: bytes) -> Summary | None:
     return Summary(path=str(path), kind="MoveIt distance field", facts=facts)
 
 
-_MOVEIT_DOCS = """
-`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2 | a
-    reader that follows its source; MoveIt not tried | 0.4 s, 16 MiB (one channel)
-"""
-
 ENTRIES = (
     GridFormat(
         name="curobo",
@@ -175,7 +163,10 @@ ENTRIES = (
         describe=describe_curobo,
         holds_unknown=False,
         bytes_per_cell=4,
-        docs=_CUROBO_DOCS,
+        docs="""
+`curobo` | `field.curobo.npz`: `features`, `dims`, `voxel_size`, `pose`, `shape` | NVIDIA cuRobo, by the lines
+    below | its index arithmetic; cuRobo not tried | 1.1 s, 48 MiB (one channel)
+""",
     ),
     GridFormat(
         name="moveit",
@@ -185,6 +176,9 @@ ENTRIES = (
         describe=describe_moveit,
         needs=frozenset({"bound", "hard"}),
         bytes_per_cell=0,
-        docs=_MOVEIT_DOCS,
+        docs="""
+`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2 | a
+    reader that follows its source; MoveIt not tried | 0.4 s, 16 MiB (one channel)
+""",
     ),
 )

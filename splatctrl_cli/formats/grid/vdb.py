@@ -162,10 +162,17 @@ def describe_vdb(path: Path, head: bytes) -> Summary | None:
     return Summary(path=str(path), kind="OpenVDB", facts=facts, grids=(table,))
 
 
-_DOCS = """
+ENTRIES = (
+    GridFormat(
+        name="vdb",
+        order=3,
+        suffix=".vdb",
+        write=write_vdb,
+        describe=describe_vdb,
+        check=openvdb,
+        docs="""
 `vdb` | `field.vdb`: a FloatGrid or Vec3SGrid a channel; header entries are metadata | Houdini, Blender, OpenVDB |
     OpenVDB 10.0.1, every value; others not tried | 0.8 s, 454 MiB (256³, one channel)
-"""
-ENTRIES = (
-    GridFormat(name="vdb", order=3, suffix=".vdb", write=write_vdb, describe=describe_vdb, check=openvdb, docs=_DOCS),
+""",
+    ),
 )

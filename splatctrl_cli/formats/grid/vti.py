@@ -13,7 +13,6 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Grid, Summary
@@ -25,13 +24,12 @@ from splatctrl_cli.formats.grid.grid_format import (
     check_finite,
     check_grid,
     check_layout,
-    from_x_fastest,
     header_text,
     parse_header,
     summary_of,
     x_fastest,
 )
-from splatctrl_cli.records import DistanceGrid
+from splatctrl_cli.records import DistanceGrid, Values
 
 _TYPES = {"<f4": "Float32", "|u1": "UInt8"}
 _DTYPES = {name: dtype for dtype, name in _TYPES.items()}
@@ -151,7 +149,7 @@ def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[Gri
     return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header), starts
 
 
-def _values(path: Path, stream: BinaryIO, head: GridHead, name: str, start: int) -> NDArray[np.generic]:
+def _values(path: Path, stream: BinaryIO, head: GridHead, name: str, start: int) -> Values:
     stream.seek(start)
     (x, y, z), channel = head.shape, CHANNELS[name]
     count = x * y * z * channel.components
@@ -162,9 +160,9 @@ def _values(path: Path, stream: BinaryIO, head: GridHead, name: str, start: int)
             f"{path}: {name}: expected {size} bytes, got {max(there, 0)}",
             remedy="the file is cut; bake it again",
         )
-    flat: NDArray[np.generic] = np.fromfile(stream, channel.dtype, count)
+    flat: Values = np.fromfile(stream, channel.dtype, count)
     planes = flat.reshape((z, y, x) if channel.components == 1 else (z, y, x, channel.components))
-    return from_x_fastest(planes)
+    return np.ascontiguousarray(planes.transpose(2, 1, 0, *range(3, planes.ndim)))
 
 
 def _comments(grid: DistanceGrid) -> list[str]:
@@ -197,10 +195,17 @@ def describe_vti(path: Path, head: bytes) -> Summary | None:
 _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
 
 
-_DOCS = """
+ENTRIES = (
+    GridFormat(
+        name="vti",
+        order=1,
+        suffix=".vti",
+        write=write_vti,
+        describe=describe_vti,
+        read=read_vti,
+        docs="""
 `vti` | `field.vti`: ImageData, points at the cell centres; the header is a string in the field data | ParaView,
     VTK | VTK 9.7.2, every value; ParaView not tried | 3.2 s, 48 MiB
-"""
-ENTRIES = (
-    GridFormat(name="vti", order=1, suffix=".vti", write=write_vti, describe=describe_vti, read=read_vti, docs=_DOCS),
+""",
+    ),
 )

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Parts, flush, sha256, write_durably
@@ -18,14 +17,14 @@ from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL, SHELL_FILE, Snapshot
 from splatctrl_cli.formats.scene.voxel_file import write_occupancy, write_states
 from splatctrl_cli.formats.splat.splats import SHELL, write_ply
-from splatctrl_cli.records import SplatSet, UInt8
+from splatctrl_cli.records import SplatSet, UInt8, Values
 from splatctrl_cli.voxels import KnownVoxels
 
 CHECKPOINT = "checkpoint/state.npz"
 AUDIT = "audit.jsonl"
 START_OVER = "start over: the same command without --resume"
 
-State = Mapping[str, NDArray[np.generic]]
+State = Mapping[str, Values]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import read_arrays, savez
-from splatctrl_cli.records import Label, UInt8
+from splatctrl_cli.records import Array, Label, UInt8, Values
 from splatctrl_cli.voxels import (
     FIRST_REASON,
     MOST_VOXELS,
@@ -33,7 +32,7 @@ _GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": 
 _EVIDENCE = ("last_seen", "unrepresented", "unrepresented_labels")
 _STATES, _OCCUPANCY, _OURS = "the voxel states of a snapshot", "an occupancy grid of ours", "a voxel file of ours"
 
-Arrays = Mapping[str, NDArray[Any]]
+Arrays = Mapping[str, Array]
 
 
 def write_occupancy(path: Path, known: KnownVoxels) -> None:
@@ -50,7 +49,7 @@ def write_states(path: Path, known: KnownVoxels, states: UInt8) -> None:
     savez(path, {"header": header, "states": states, **_evidence(known)}, level=3)
 
 
-def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.generic]:
+def _header(known: KnownVoxels, special: Mapping[str, object]) -> Values:
     common = {
         "frame": "world",
         "units": "m",
@@ -67,7 +66,7 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.gen
     return np.array(json.dumps({**special, **common}))
 
 
-def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
+def _evidence(known: KnownVoxels) -> dict[str, Values]:
     """Arrays of both files; last_seen in one byte is twice as fast."""
     balls = known.unrepresented
     return {
@@ -106,7 +105,7 @@ def read_seen(path: Path) -> SeenVoxels | None:
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
-        arrays = read_arrays(path, ("last_seen", *_edges_in(header)), most=2 * MOST_VOXELS + _MOST_EDGES)
+        arrays = read_arrays(path, ("last_seen", *({"edges"} & header.keys())), most=2 * MOST_VOXELS + _MOST_EDGES)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
         return SeenVoxels(
             origin=np.array(header["origin"], np.float64),
@@ -135,7 +134,8 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
-        arrays = read_arrays(path, (*_GRID, *_EVIDENCE, *_edges_in(header)), most=22 * MOST_VOXELS + _MOST_EDGES)
+        names = (*_GRID, *_EVIDENCE, *({"edges"} & header.keys()))
+        arrays = read_arrays(path, names, most=22 * MOST_VOXELS + _MOST_EDGES)
         grid = _grid_of(arrays, header)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
         last_seen = _last_seen(arrays["last_seen"], header, len(stamps_ns))
@@ -168,7 +168,7 @@ def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
     )
 
 
-def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[Any]:
+def _last_seen(stored: Array, header: Mapping[str, Any], num_steps: int) -> Array:
     """`last_seen` in one byte or two; the largest numbers say why a voxel was never seen.
 
     Raises ValueError for another shape, or too many time steps.
@@ -197,10 +197,6 @@ def _balls(arrays: Arrays, voxel: float) -> Balls:
     return Balls.of_voxels(centers, voxel, labels)
 
 
-def _edges_in(header: Mapping[str, Any]) -> set[str]:
-    return {"edges"} & header.keys()
-
-
 def _edges(arrays: Arrays) -> LostEdges:
     if "edges" not in arrays:
         return NO_EDGES
@@ -210,7 +206,7 @@ def _edges(arrays: Arrays) -> LostEdges:
     return LostEdges(centers=edges[:, :3], radii=edges[:, 3])
 
 
-def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:
+def _voxels(values: Array, name: str, kind: type[np.generic], header: Mapping[str, Any]) -> Array:
     wanted = (np.dtype(kind), tuple(header["shape"]))
     if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
         raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config.fixed import CENTER_LENGTH, CENTER_SHARE, SPARSEST, SPARSEST_SAMPLE
@@ -28,7 +27,7 @@ from splatctrl_cli.formats.splat.splat_format import (
     unit_quaternions,
     without_labels,
 )
-from splatctrl_cli.records import Float32, Float64, GaussianSet, Label, UInt8
+from splatctrl_cli.records import Array, Float32, Float64, GaussianSet, Label, UInt8, Values
 
 REST = tuple(f"f_rest_{index}" for index in range(45))
 NAMES = (
@@ -58,7 +57,7 @@ def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str
     write_table(path, rows_of(gaussians, dtype), {**HEADER_COMMENTS, **comments})
 
 
-def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
+def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> Array:
     """Rows (N,) of `dtype`; properties that Gaussians do not have are 0."""
     g = gaussians
     rest = np.zeros((len(g), 3, 15), dtype=np.float32)
@@ -142,7 +141,7 @@ def log_sigmas(ply: PlyFile) -> Float64:
 
     They are none if no scale is below 0 and 95 % of splats are over SPARSEST times as large as their spacing.
     """
-    found = [name for name in SCALES if name in ply]
+    found = [name for name in SCALES if name in ply.names]
     if len(found) == 2:
         raise InputError(
             f"{ply.path}: expected scale_0 alone or scale_0 to scale_2, got {' and '.join(found)}: the flat splats of"
@@ -168,7 +167,7 @@ def log_sigmas(ply: PlyFile) -> Float64:
 
 def labels_of(ply: PlyFile) -> UInt8:
     """Labels (N,), 0 (object) by default. Raises InputError unless whole numbers 0 to 255."""
-    if "label" not in ply:
+    if "label" not in ply.names:
         return np.zeros(len(ply), dtype=np.uint8)
     values = ply.column("label")
     is_bad = (values < 0) | (values > 255) | (values != np.floor(values))
@@ -187,7 +186,7 @@ def without_zero_degrees(harmonics: Float32) -> Float32:
 def check_gaussians(where: str, gaussians: GaussianSet) -> None:
     """Raise InputError naming the first invalid Gaussian's index."""
     g = gaussians
-    groups: dict[str, NDArray[np.generic]] = {"center": g.centers, "sigma": g.scales, "rotation": g.quats_wxyz}
+    groups: dict[str, Values] = {"center": g.centers, "sigma": g.scales, "rotation": g.quats_wxyz}
     groups |= {"opacity": g.opacities, "harmonics": g.harmonics}
     check_finite(where, len(g), groups)
     if g.harmonics.shape[1] not in (1, 4, 9, 16):
@@ -202,7 +201,7 @@ def _harmonics(ply: PlyFile) -> Float32:
     """(N, K, 3); f_rest has each channel's in a row."""
     num_rest = sum(name.startswith("f_rest_") for name in ply.names)
     names = [f"f_rest_{index}" for index in range(num_rest)]
-    if num_rest not in REST_PER_DEGREE or not all(name in ply for name in names):
+    if num_rest not in REST_PER_DEGREE or not all(name in ply.names for name in names):
         expected = ", ".join(map(str, REST_PER_DEGREE))
         raise InputError(f"{ply.path}: f_rest_*: expected {expected} of them in a row from 0, got {num_rest}")
     channels = [[f"f_dc_{channel}", *names[channel * num_rest // 3 :][: num_rest // 3]] for channel in range(3)]
@@ -210,14 +209,18 @@ def _harmonics(ply: PlyFile) -> Float32:
     return np.ascontiguousarray(np.array(values).transpose(2, 1, 0))
 
 
-_DOCS = """
+_PLY = SplatFormat(
+    name="3D-GS PLY",
+    order=0,
+    suffix=".ply",
+    write=write_gaussian_ply,
+    read=read_gaussian_ply,
+    docs="""
 `.ply`, short | 3D-GS PLY with `label` and `density`, for isotropic splats | float32 | view-dependent colour
 
 `.ply`, full | 3D-GS PLY, the reference's 62 properties | float32 | density; labels (kept as a 63rd property
     unless `--layout full`)
-"""
-_PLY = SplatFormat(
-    name="3D-GS PLY", order=0, suffix=".ply", write=write_gaussian_ply, read=read_gaussian_ply, docs=_DOCS
+""",
 )
 REFERENCE_PLY = replace(
     _PLY,

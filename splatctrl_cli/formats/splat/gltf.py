@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import SH_C0, SplatFormat, refuse, unit_quaternions
 from splatctrl_cli.formats.unpacking import read_bytes
-from splatctrl_cli.records import Float32, GaussianSet, Label
+from splatctrl_cli.records import Array, Float32, GaussianSet, Label, UInt8
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942  # glTF, JSON, BIN
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -36,7 +35,7 @@ PROPERTIES = {
 }
 
 
-def _write(path: Path, document: Mapping[str, Any], tables: Sequence[NDArray[Any]]) -> None:
+def _write(path: Path, document: Mapping[str, Any], tables: Sequence[Array]) -> None:
     """Write a document and its tables (N, 1 | 3 | 4) of float32, or of uint8 for 0 to 1."""
     views, accessors, binary = list[dict[str, Any]](), list[dict[str, Any]](), bytearray()
     for table in tables:
@@ -115,7 +114,7 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     of an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
-    tables: dict[str, NDArray[Any]] = {  # the first has its range beside it
+    tables: dict[str, Array] = {  # the first has its range beside it
         "POSITION": gaussians.centers,
         "COLOR_0": _point_colors(gaussians),
         ROTATION: np.roll(gaussians.quats_wxyz, -1, axis=1),
@@ -160,7 +159,7 @@ def coefficient_name(index: int) -> str:
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index - degree * degree}"
 
 
-def _point_colors(gaussians: GaussianSet) -> NDArray[np.uint8]:
+def _point_colors(gaussians: GaussianSet) -> UInt8:
     """(N, 4) red, green, blue, opacity, 0 to 255, for point clouds."""
     colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
     return np.rint(255.0 * np.column_stack([colors, gaussians.opacities])).astype(np.uint8)
@@ -213,15 +212,17 @@ def _gaussians(path: Path, attributes: Mapping[str, int], table: Callable[[int, 
     )
 
 
-_DOCS = """
+ENTRIES = (
+    SplatFormat(
+        name="glTF with KHR_gaussian_splatting",
+        order=3,
+        suffix=".glb",
+        write=write_glb,
+        read=read_gltf,
+        docs="""
 `.glb` | glTF 2.0 with
     [KHR_gaussian_splatting](https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting)
     | float32 | density
-"""
-
-
-ENTRIES = (
-    SplatFormat(
-        name="glTF with KHR_gaussian_splatting", order=3, suffix=".glb", write=write_glb, read=read_gltf, docs=_DOCS
+""",
     ),
 )

@@ -93,12 +93,6 @@ def splat_bound(gaussians: GaussianSet) -> Differences:
     return Differences(center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0)
 
 
-_SPLAT_DOCS = """
-`.splat` | 32 bytes per Gaussian, no header | colour, opacity 1/510; rotation 0.9 degrees | labels, density,
-    comments, view-dependent colour, colours outside 0 to 1
-"""
-
-
 MAGIC = 0x5053474E  # NGSP
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, number, degree, fraction bits, flags, reserved
 GZIP, PLAIN = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # a file of versions 2 and 3 begins so, one of version 4
@@ -299,12 +293,6 @@ def _quaternions(table: UInt8) -> Float32:
     return np.roll(quats, 1, axis=1).astype(np.float32)
 
 
-_SPZ_DOCS = """
-`.spz` | version 3 (gzip); 2 to 4 are read | centre 0.12 mm (within 2 km), sigma 3.2 %, colour 0.0037, opacity 1/510,
-    rotation 0.28 degrees, harmonics 1/256 | labels, density, comments; sigmas below 0.045 mm, colours outside -0.44
-    to 1.44, harmonics outside -1 to 1
-"""
-
 ENTRIES = (
     SplatFormat(
         name=".splat, 32 bytes each",
@@ -314,7 +302,10 @@ ENTRIES = (
         read=read_splat,
         held=held_by_splat,
         bound=splat_bound,
-        docs=_SPLAT_DOCS,
+        docs="""
+`.splat` | 32 bytes per Gaussian, no header | colour, opacity 1/510; rotation 0.9 degrees | labels, density,
+    comments, view-dependent colour, colours outside 0 to 1
+""",
     ),
     SplatFormat(
         name=".spz",
@@ -324,6 +315,10 @@ ENTRIES = (
         read=read_spz,
         held=held_by_spz,
         bound=spz_bound,
-        docs=_SPZ_DOCS,
+        docs="""
+`.spz` | version 3 (gzip); 2 to 4 are read | centre 0.12 mm (within 2 km), sigma 3.2 %, colour 0.0037, opacity 1/510,
+    rotation 0.28 degrees, harmonics 1/256 | labels, density, comments; sigmas below 0.045 mm, colours outside -0.44
+    to 1.44, harmonics outside -1 to 1
+""",
     ),
 )

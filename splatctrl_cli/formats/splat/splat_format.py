@@ -3,13 +3,11 @@
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Bool, Float32, Float64, GaussianSet
+from splatctrl_cli.records import Array, Bool, Float32, Float64, Floats, GaussianSet
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 UNIT_TOLERANCE = 5e-7  # of a quaternion's length; float32 can do no better
@@ -39,7 +37,7 @@ def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
     return values.astype(np.float32)
 
 
-def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
+def unit_quaternions(where: str, quats: Floats) -> Float32:
     """Normalise (N, 4), bit-exact if already unit. Raises InputError for zero length."""
     wide = quats.astype(np.float64)
     lengths = np.linalg.norm(wide, axis=1, keepdims=True)
@@ -47,7 +45,7 @@ def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
     return np.where(np.abs(lengths - 1.0) <= UNIT_TOLERANCE, wide, wide / lengths).astype(np.float32)
 
 
-def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: str) -> None:
+def refuse(where: str, name: str, values: Array, is_bad: Bool, expected: str) -> None:
     """Raise InputError naming the first splat where `is_bad` (N,)."""
     bad = np.flatnonzero(is_bad)
     if len(bad):
@@ -56,12 +54,13 @@ def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: 
         raise InputError(f"{where}: splat {bad[0]}: {name}: expected {expected}, got {shown}")
 
 
-def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> None:
+def check_finite(where: str, num: int, groups: Mapping[str, Array]) -> None:
     """Raise InputError at the first non-finite value, or for an array without `num` rows."""
     for name, values in groups.items():
         if len(values) != num:
             raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")
-        refuse(where, name, values, ~np.isfinite(values.reshape(num, -1 if num else 1)).all(axis=1), "finite")
+        is_finite = np.isfinite(values.reshape(num, -1 if num else 1)).all(axis=1)
+        refuse(where, name, values, np.asarray(~is_finite), "finite")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.summary import Summary
@@ -35,7 +34,7 @@ from splatctrl_cli.formats.splat.splat_format import (
     sigmoid,
 )
 from splatctrl_cli.libraries import entries_of
-from splatctrl_cli.records import Bool, Float32, Float64, GaussianSet, Label, SplatSet
+from splatctrl_cli.records import Bool, Float32, Float64, Floats, GaussianSet, Label, SplatSet
 
 MAX_SCALE_SPREAD = 1e-5  # largest difference of log scales that still reads as isotropic
 NAMES = (
@@ -184,7 +183,7 @@ def splats_of(ply: PlyFile) -> SplatSet:
         colors=np.column_stack([0.5 + SH_C0 * ply.column(f"f_dc_{axis}") for axis in range(3)]).astype(np.float32),
         opacities=sigmoid(ply.column("opacity")),
         labels=labels_of(ply),
-        density=(ply.column("density") if "density" in ply else np.zeros(len(ply))).astype(np.float32),
+        density=(ply.column("density") if "density" in ply.names else np.zeros(len(ply))).astype(np.float32),
     )
     check_splats(str(path), splats)
     return splats
@@ -307,5 +306,5 @@ def describe_splats(path: Path, _head: bytes) -> Summary:
     return Summary(path=str(path), kind="splats", facts=facts)
 
 
-def _rounded(values: NDArray[np.floating]) -> list[float]:
+def _rounded(values: Floats) -> list[float]:
     return [float(f"{value:.4g}") for value in values]

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import SplatFormat, unit_quaternions
-from splatctrl_cli.records import Float32, GaussianSet, Label
+from splatctrl_cli.records import Array, Float32, GaussianSet, Label
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
@@ -137,7 +136,7 @@ def _array(path: Path, prim: Any, name: str, width: int) -> Float32:
     for candidate in (name, f"{name}h"):
         values = prim.GetAttribute(candidate).Get()
         if values is not None and len(values):
-            table: NDArray[Any] = np.asarray(values).reshape(len(values), -1)
+            table: Array = np.asarray(values).reshape(len(values), -1)
             if table.shape[1] == width:
                 return table.astype(np.float32)
     raise InputError(f"{path}: its {PRIM_TYPE} has no {name}")

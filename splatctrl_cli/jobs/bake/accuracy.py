@@ -23,8 +23,7 @@ from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, noted, verdict_of
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import KERNEL_OF
-from splatctrl_cli.field.grid_cells import LOSS
-from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.field.grid_cells import LOSS, exact_channel
 from splatctrl_cli.field.incremental import Changes
 from splatctrl_cli.field.probability import probabilities
 from splatctrl_cli.field.report import GridStatistics

@@ -13,15 +13,22 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
-from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
+from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
-from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
 from splatctrl_cli.field.report import grid_statistics
-from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.field.slabs import (
+    Kept,
+    UnknownSpace,
+    baked_planes,
+    bytes_per_cell,
+    check_slab_memory,
+    field_header,
+    slabs,
+)
 from splatctrl_cli.field.unknown import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
-from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
+from splatctrl_cli.formats.grid.grid_format import CHANNELS, GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
 from splatctrl_cli.jobs.bake.accuracy import (
     SUMMARY_METRICS,
@@ -119,7 +126,8 @@ def clear_leftovers(partial: Path) -> None:
 def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError if channels and output files do not fit the disk."""
     per_cell = bytes_per_cell(channels)
-    copies = sum(FORMATS[name].size_per_cell(per_cell) for name in formats)
+    sizes = (FORMATS[name].bytes_per_cell for name in formats)
+    copies = sum(per_cell if size is None else size for size in sizes)
     needed = (per_cell + copies) * layout.num_cells + (1 << 26)  # bytes for what is small
     free = shutil.disk_usage(folder).free
     if needed > free:

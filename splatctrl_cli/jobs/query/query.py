@@ -18,10 +18,8 @@ from splatctrl_cli.config.fixed import CARD_LEAST_TABLE, MARCH_STEPS
 from splatctrl_cli.control.audit import observed_at
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import SphereField, field_over, march
-from splatctrl_cli.field.grid_cells import check_room
-from splatctrl_cli.field.grid_field import GridField
-from splatctrl_cli.field.on_device import OnDevice
+from splatctrl_cli.field.distance import OnDevice, SphereField, field_over, march
+from splatctrl_cli.field.grid_cells import GridField, check_room
 from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.field.unknown import DEFAULT_LABELS, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Parts, Stopwatch, output_path
@@ -93,7 +91,7 @@ class SceneAnswers:
         self._exact: SphereField | OnDevice
         self._field: DistanceField
         if device is None:
-            self._exact = SphereField.over(self._spheres, threads=threads)
+            self._exact = SphereField(self._spheres, threads=threads)
             self._field = field_over(self._spheres, config.field, threads=threads)
         else:
             self._exact = OnDevice(self._spheres, replace(config.field, distance="hard"), device)
@@ -105,14 +103,14 @@ class SceneAnswers:
         if known is not None:
             states = known.states(limits.free_below, limits.occupied_above)
             self._observed = partial(observed_at, states, known.origin, known.voxel)
-        self._reach = float(np.abs(splats.centers - self._spheres.points.anchor).max())
+        self._reach = float(np.abs(splats.centers - self._spheres.anchor).max())
 
     def at(self, points: Float64) -> Answers:
         """Answer at points (Q, 3) [m], world."""
         distance, gradient = self._field.query(points)
         nearest = self._exact.nearest(points)
         walked = march(self._field, self._exact, points, steps=MARCH_STEPS)
-        size = self._reach + np.abs(points - self._spheres.points.anchor).max(axis=1)
+        size = self._reach + np.abs(points - self._spheres.anchor).max(axis=1)
         return Answers(
             in_box=None if self._workspace is None else self._workspace.contains(points),
             distance=distance,
@@ -160,7 +158,7 @@ class GridAnswers:
 
     def at(self, points: Float64) -> Answers:
         """Answer at points (Q, 3) [m], world; none outside the box of cell centres."""
-        inside = self._field.contains(points)
+        inside = self._field.box.contains(points)
         distance, gradient = self._field.query(points)
         probability = None if self._probability is None else self._probability.query(points)[0]
         return Answers(

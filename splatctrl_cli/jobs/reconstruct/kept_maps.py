@@ -11,6 +11,7 @@ import numpy as np
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEWS_LEAST, SAME_MOMENT_NS
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.unknown import obstacle_spheres
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
@@ -65,7 +66,7 @@ class _Map:
 
     @classmethod
     def of(cls, path: Path, spheres: SplatSet | None, states: OccupancyGrid) -> "_Map":
-        field = None if spheres is None else SphereField(spheres.centers, spheres.radii)
+        field = None if spheres is None else SphereField(Spheres.of(spheres.centers, spheres.radii))
         return cls(path=path, field=field, states=states)
 
     def num_new(self, spheres: SplatSet) -> int:

@@ -23,6 +23,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.evaluate.metrics import clearance_agreement, mark_seen
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges
 from splatctrl_cli.formats.scene.scene_folder import open_scene
@@ -225,7 +226,7 @@ def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
     if not len(points):
         return points
     deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)), 0.0)
-    body = SphereField(model.sphere_centers(q), model.sphere_set.radii + deficit)
+    body = SphereField(Spheres.of(model.sphere_centers(q), model.sphere_set.radii + deficit))
     return points[body.query(points)[0] > ROBOT_MARGIN]
 
 
@@ -245,7 +246,7 @@ class Swept:
         """Enclose cells (K, 3), whole numbers of SPHERE_CELL, by radii (K,) [m], the largest in each."""
         centers, self._reach = (cells + 0.5) * SPHERE_CELL, reach
         enlarged = radii + 0.5 * SPHERE_CELL * 3**0.5
-        self._field = SphereField(centers, enlarged)
+        self._field = SphereField(Spheres.of(centers, enlarged))
         far = (enlarged + reach)[:, None]
         self._box = Box(lower=(centers - far).min(axis=0), upper=(centers + far).max(axis=0))
 

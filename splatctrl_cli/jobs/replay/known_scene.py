@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEXT_SCENE_NS
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_at
+from splatctrl_cli.control.barriers import SceneStep, guarded
 from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
-from splatctrl_cli.control.scene_field import SceneStep, guarded
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField, field_over
-from splatctrl_cli.field.grid_field import GridField, exact_channel
+from splatctrl_cli.field.grid_cells import GridField, exact_channel
 from splatctrl_cli.field.unknown import NO_SPLAT, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz
@@ -240,9 +240,13 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
     chosen = obstacles.splats
     spheres = Spheres.of(chosen.centers, chosen.radii)
     people = chosen.labels == Label.HUMAN
-    human = SphereField(chosen.centers[people], chosen.radii[people], threads=threads) if people.any() else None
+    human = (
+        SphereField(Spheres.of(chosen.centers[people], chosen.radii[people]), threads=threads)
+        if people.any()
+        else None
+    )
     barrier = guarded(field_over(spheres, config.field, threads=threads), human, config.control)
-    exact = SphereField.over(spheres, threads=threads)
+    exact = SphereField(spheres, threads=threads)
     balls = BallDistance(of_points=_distance(exact), centers=chosen.centers, radii=chosen.radii)
     return KnownFields(
         barrier=barrier,
@@ -265,7 +269,7 @@ def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction 
     centers, radii = obstacles.splats.centers[is_splat], obstacles.splats.radii[is_splat]
     if not len(radii):
         return lambda points: np.full(len(points), np.inf)
-    field = SphereField(centers, radii, threads=threads)
+    field = SphereField(Spheres.of(centers, radii), threads=threads)
     return BallDistance(of_points=_distance(field), centers=centers, radii=radii)
 
 

@@ -9,7 +9,17 @@ import numpy as np
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
 from splatctrl_cli.control.arm import sphere_names
-from splatctrl_cli.control.audit import AuditTrace, Clearance, audit, moving_clearance, part_clearances
+from splatctrl_cli.control.audit import (
+    AuditTrace,
+    Between,
+    Clearance,
+    Reach,
+    audit,
+    between_states,
+    clearances,
+    moving_clearance,
+    part_clearances,
+)
 from splatctrl_cli.control.events import (
     EventFold,
     EventKind,
@@ -20,10 +30,9 @@ from splatctrl_cli.control.events import (
     stale_signal,
     step_signals,
 )
-from splatctrl_cli.control.fixed_parts import FixedParts
-from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace, Seen
+from splatctrl_cli.control.preconditions import FixedParts
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene

@@ -1,16 +1,55 @@
-"""A CUDA card, over its driver and cuda-core."""
+"""A CUDA card, over its driver and cuda-core; its kernels are compiled at run time with NVRTC, cached on disk."""
 
+import hashlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from cuda.bindings import driver
-from cuda.core import Device, LaunchConfig, launch
+from cuda.core import Device, LaunchConfig, ObjectCode, Program, ProgramOptions, launch
+from cuda.core.utils import FileStreamProgramCache, make_program_cache_key
 
 from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.memory import FIT, Array, DeviceError, Graph, Launch, OutOfMemory
-from splatctrl_cli.kernels.cuda.program import compiled
+
+HERE = Path(__file__).parent
+FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include looks through them
+
+
+@cache
+def source_digest() -> bytes:
+    """Digest of all files that kernels may include."""
+    digest = hashlib.sha256()
+    for folder in FOLDERS:
+        for path in sorted(p for p in folder.iterdir() if p.suffix in {"", ".h", ".cu", ".cuh"} and p.is_file()):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.digest()
+
+
+def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, source: str = FIT) -> Any:
+    """Machine code of a source for a compute capability, cached in cuda-core's or the given folder, if writable."""
+    options = ProgramOptions(
+        name=source, arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
+    )
+    code = (HERE / "src" / source).read_text()
+    key = make_program_cache_key(
+        code=code, code_type="c++", options=options, target_type="cubin", extra_digest=source_digest()
+    )
+    try:
+        store = FileStreamProgramCache(cache_folder)
+        known = store.get(key)
+    except OSError:
+        return Program(code, "c++", options).compile("cubin")
+    if known is not None:
+        return ObjectCode.from_cubin(known)
+    made = Program(code, "c++", options).compile("cubin")
+    with suppress(OSError):
+        store[key] = made
+    return made
+
 
 MANY = 20  # replays in a graph: a launch costs the host as much as a small map's iteration
 
@@ -91,21 +130,18 @@ class CudaDevice:
         with _named_faults():
             for count in (1, MANY):
                 builder = self._device.create_graph_builder().begin_building()
-                self._queue(builder, [*launches] * count)
+                self.queue([*launches] * count, builder)
                 graphs[count] = builder.end_building().complete()
                 graphs[count].upload(self._stream)
         return CudaGraph(graphs, self._stream)
 
-    def queue(self, launches: Sequence[Launch]) -> None:
-        """Queue launches singly, for tools that inspect each."""
-        self._queue(self._stream, launches)
-
-    def _queue(self, target: Any, launches: Sequence[Launch]) -> None:
+    def queue(self, launches: Sequence[Launch], target: Any = None) -> None:
+        """Queue launches singly, for tools that inspect each, or in the `target` of a graph."""
         for one in launches:
             config = LaunchConfig(grid=one.grid, block=one.block)
             if one.source not in self._codes:
                 self._codes[one.source] = compiled(self.capability, source=one.source)
-            launch(target, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
+            launch(target or self._stream, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
 
     def seconds(self, graph: Graph, num_times: int) -> float:
         """Mean time of a replay on the device."""

@@ -6,11 +6,11 @@ Shapes: N splats, (H, W) pixels, K tiles of 16 x 16 pixels. If a list is too sho
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
 from itertools import groupby
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import Float32, Float64
+from splatctrl_cli.kernels import Float32, Float64, Int32
 from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, Memory, OutOfMemory
 from splatctrl_cli.kernels.raster import LossTerms, LossWeights, Moments, OptimiserSettings, TargetView
 
@@ -198,23 +198,17 @@ class DeviceFit:
             self.rewind([view], weights, settings, 0)
             self._graph(height, width, "gradients").run()
             if self._fits():
-                out = np.empty((self.num_splats, 8), np.float32)
-                self.device.read(self._addresses["gradients"], out)
-                return out, self._terms([view])[view]
+                return self._read("gradients", (self.num_splats, 8)), self._terms([view])[view]
 
-    def list_lengths(self, view: int) -> NDArray[np.int32]:
+    def list_lengths(self, view: int) -> Int32:
         """Number of splats (K,) on each tile's list, after the last launch on the view's size."""
         height, width = self.views[view].height, self.views[view].width
-        out = np.empty(-(-height // TILE) * -(-width // TILE), np.int32)
-        self.device.read(self._addresses[f"num_entries {height} {width}"], out)
-        return out
+        return self._read(f"num_entries {height} {width}", (-(-height // TILE) * -(-width // TILE),), np.int32)
 
     def read_image(self, name: str, view: int, channels: int) -> Float32:
         """Read `planes`, `plane_gradients` or `maps` (channels, H, W), after the last launch on the view's size."""
         height, width = self.views[view].height, self.views[view].width
-        out = np.empty((channels, height, width), np.float32)
-        self.device.read(self._addresses[f"{name} {height} {width}"], out)
-        return out
+        return self._read(f"{name} {height} {width}", (channels, height, width))
 
     def _state(self, parameters: Float32, moments: Moments) -> dict[str, Array]:
         return {
@@ -232,6 +226,11 @@ class DeviceFit:
             self._sizes[name] = num_bytes
             self._graphs = {}
         return self._addresses[name]
+
+    def _read(self, name: str, shape: tuple[int, ...], kind: Any = np.float32) -> Array:
+        out = np.empty(shape, kind)
+        self.device.read(self._addresses[name], out)
+        return out
 
     def _image(self, values: Array) -> int:
         address = self._allocate(values.nbytes)
@@ -284,8 +283,7 @@ class DeviceFit:
 
     def _fits(self) -> bool:
         """Return True if all lists had room; else grow them."""
-        counters = np.zeros((), COUNTERS)
-        self.device.read(self._addresses["counters"], counters)
+        counters = self._read("counters", (), COUNTERS)
         longest, most = int(counters["longest_list"]), int(counters["most_parts"])
         if longest:
             self.list_capacity = 1 << longest.bit_length()
@@ -297,8 +295,7 @@ class DeviceFit:
         return not longest and not most
 
     def _terms(self, schedule: Sequence[int]) -> dict[int, LossTerms]:
-        sums = np.empty((len(self.views), NUM_TERMS))
-        self.device.read(self._addresses["terms"], sums)
+        sums = self._read("terms", (len(self.views), NUM_TERMS), np.float64)
         terms = {}
         for k in dict.fromkeys(schedule):
             view, (l1, ssim, depth, transmittance, squared) = self.views[k], sums[k].tolist()

@@ -1,4 +1,4 @@
-// Anisotropic Gaussians: see kernels/gaussians.py for shapes.
+// Anisotropic Gaussians: see kernels/raster.py for shapes.
 #include "bind.h"
 #include "gaussians.h"
 

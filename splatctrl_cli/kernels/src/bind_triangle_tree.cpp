@@ -1,4 +1,4 @@
-// Trees of triangles: see kernels/triangles.py for shapes.
+// Trees of triangles: see kernels/surface_image.py for shapes.
 #include <nanobind/stl/vector.h>
 
 #include "bind.h"

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.formats.grid import grid_format, planner_grids
 from splatctrl_cli.formats.grid import iso_surface as module
-from splatctrl_cli.formats.grid.iso_surface import Surface, iso_surface, write_surface
+from splatctrl_cli.formats.grid.iso_surface import iso_surface, write_surface
 from splatctrl_cli.formats.grid.npz_grid import write_npz
 from splatctrl_cli.formats.grid.nrrd import PREFIX, write_nrrd
 from splatctrl_cli.formats.grid.planner_grids import read_moveit_head, write_curobo, write_moveit
@@ -306,7 +306,7 @@ def test_no_rounding_loses_a_cell(tmp_path: Path, voxel: float, shape: tuple[int
 MIDDLE = np.array([0.1, 0.0, 0.0])
 
 
-def mesh_of(surface: Surface) -> trimesh.Trimesh:
+def mesh_of(surface: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(surface.vertices, surface.faces, process=False)
 
 
@@ -343,7 +343,7 @@ def test_cells_without_a_distance_make_no_surface(monkeypatch: pytest.MonkeyPatc
     blank[1:5, 9:13, 9:13] = True
     grid.channels["sdf"] = np.where(blank, np.float32(np.nan), grid.channels["sdf"])
 
-    def touches(surface: Surface) -> np.ndarray:  # type: ignore[type-arg]
+    def touches(surface: trimesh.Trimesh) -> np.ndarray:  # type: ignore[type-arg]
         cube = np.floor((surface.vertices[surface.faces].mean(axis=1) - grid.origin) / grid.voxel).astype(int)
         return np.any([blank[tuple((cube + corner).T)] for corner in np.ndindex(2, 2, 2)], axis=0)
 

@@ -91,7 +91,7 @@ def test_an_update_can_be_in_slabs_and_interrupted(
 ) -> None:
     monkeypatch.setattr(slabs, "SLAB_BYTES", 1)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("splatctrl_cli.field.header.label_counts", interrupt)
+        patch.setattr("splatctrl_cli.field.slabs.label_counts", interrupt)
         bake(scene, tmp_path / "field", at=2, update=fields / "0")
     bake(scene, tmp_path / "field", at=2, update=fields / "0", resume=True)
     assert npz(tmp_path / "field") == npz(fields / "2")

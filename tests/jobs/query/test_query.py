@@ -11,8 +11,9 @@ import pytest
 
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.field.distance import SphereField, make_field, march
-from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.distance import SphereField, field_over, march
+from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.formats import ply
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.splat.splats import write_ply
@@ -53,7 +54,7 @@ def column(rows: list[dict[str, str]], *names: str) -> Float64:
 def test_a_scene_answers_with_its_field_its_nearest_splat_and_the_surface(scene: Path) -> None:
     result, rows = asked(scene)
     centers, radii = np.array([ball[0] for ball in BALLS]), np.array([ball[1] for ball in BALLS])
-    field, exact = make_field(centers, radii, FieldConfig()), SphereField(centers, radii)
+    field, exact = field_over(Spheres.of(centers, radii), FieldConfig()), SphereField(Spheres.of(centers, radii))
     distance, gradient = field.query(POINTS)
     walked = march(field, exact, POINTS)
     assert column(rows, "distance")[:, 0] == pytest.approx(distance, abs=1e-6)

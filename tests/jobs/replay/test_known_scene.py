@@ -12,6 +12,7 @@ from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.events import Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space
@@ -90,7 +91,7 @@ def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measur
     drawn = arm.with_self_model(held_part(link, ball_at_hand, *ALWAYS))
     model = drawn._changed(sphere_deficit=np.where(np.array(arm.sphere_set.links) == link, 0.05, 0.0))
     center = model.sphere_centers(q[0])[-1] + [0.0, 0.0, -0.3]
-    ball = SphereField(center[None], np.array([0.01]))
+    ball = SphereField(Spheres.of(center[None], np.array([0.01])))
     scene = BallDistance(of_points=lambda points: ball.query(points)[0], centers=center[None], radii=np.array([0.01]))
     nothing = Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan))
     fields = KnownFields(

@@ -16,7 +16,7 @@ from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
-from splatctrl_cli.robot.mesh_distance import MeshDistance
+from splatctrl_cli.robot.link_meshes import MeshDistance
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
 from splatctrl_cli.simulate import tabletop

@@ -8,10 +8,8 @@ import pytest
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import GpdfField, SeField, SphereField, make_field
-from splatctrl_cli.field.grid_cells import RESOLUTION, GridLayout
-from splatctrl_cli.field.grid_field import GridField
-from splatctrl_cli.field.on_device import OnDevice
+from splatctrl_cli.field.distance import GpdfField, OnDevice, SeField, SphereField, field_over
+from splatctrl_cli.field.grid_cells import RESOLUTION, GridField, GridLayout
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.field import Choice, DeviceField
 from splatctrl_cli.kernels.cuda.memory import Memory
@@ -39,8 +37,8 @@ def device_field(
     **choice: object,
 ) -> DeviceField:
     chosen: dict[str, object] = {"kernel": kernels[0] if kernels else None, "resolution": RESOLUTION, **choice}
-    terms = {name: KINDS[name].over(of, config).terms() for name in kernels}
-    return DeviceField(memory, of.points.clusters, SphereField.over(of).radii, terms, Choice(**chosen))  # type: ignore[arg-type]
+    terms = {name: KINDS[name](of, config).terms() for name in kernels}
+    return DeviceField(memory, of.clusters, SphereField(of).radii, terms, Choice(**chosen))  # type: ignore[arg-type]
 
 
 def span_of(of: Spheres, box: Box, voxel: float, first: int = 0, last: int | None = None) -> tuple[GridSpan, Float64]:
@@ -48,7 +46,7 @@ def span_of(of: Spheres, box: Box, voxel: float, first: int = 0, last: int | Non
     shape = tuple(int(n) for n in np.ceil((box.upper - box.lower) / voxel))
     last = shape[0] if last is None else last
     span = GridSpan(
-        origin=box.lower - of.points.anchor, voxel=voxel, shape=(shape[0], shape[1], shape[2]), first=first, last=last
+        origin=box.lower - of.anchor, voxel=voxel, shape=(shape[0], shape[1], shape[2]), first=first, last=last
     )
     cells = np.stack(np.meshgrid(np.arange(first, last), *map(np.arange, shape[1:]), indexing="ij"), axis=-1)
     return span, (box.lower + voxel * cells).reshape(-1, 3)
@@ -63,9 +61,9 @@ def by_processor(of: Spheres, config: FieldConfig, span: GridSpan, name: str) ->
     distance = np.zeros(span.shape_of_channel, np.float32)
     gradient = np.zeros((*distance.shape, 3), np.float32)
     if name == "hard":
-        native.bake_hard(of.points.clusters, SphereField.over(of).radii, span, distance, gradient)
+        native.bake_hard(of.clusters, SphereField(of).radii, span, distance, gradient)
     else:
-        KINDS[name].over(of, config).bake_raw(span, distance, gradient, threads=1)
+        KINDS[name](of, config).bake_raw(span, distance, gradient, threads=1)
     return distance, gradient
 
 
@@ -87,7 +85,7 @@ def test_exact_distances_of_a_grid_are_those_of_the_processor(where: str, device
     np.testing.assert_array_equal(baked.bound, (baked.hard.astype(np.float64) - 0.01).astype(np.float32))
     assert baked.entry is not None
     assert baked.gradient is not None
-    centers, radii = (values[of.points.source[baked.entry.ravel()]] for values in cloud(NUM))
+    centers, radii = (values[of.source[baked.entry.ravel()]] for values in cloud(NUM))
     mine = np.linalg.norm(points - centers, axis=1) - radii
     np.testing.assert_allclose(mine, expected.ravel(), rtol=0, atol=1e-6)  # a tie may go either way
     same = np.abs(baked.gradient - gradient).max(axis=-1) < 1e-4
@@ -157,17 +155,17 @@ def test_points_are_answered_as_by_the_processor(num: int, device: Memory) -> No
     of, config = spheres(num), replace(EXACT, truncation=1e-7)
     points = np.concatenate([queries(200), 3.0 * queries(40, seed=2), cloud(num)[0][:4]])
     field = device_field(device, of, config)
-    found = field.query(points, of.points.anchor, ALL)
-    hard, _ = SphereField.over(of).query(points)
+    found = field.query(points, of.anchor, ALL)
+    hard, _ = SphereField(of).query(points)
     np.testing.assert_allclose(found.hard, hard, rtol=1e-5, atol=1e-6)
-    nearest = SphereField.over(of).nearest(points)
+    nearest = SphereField(of).nearest(points)
     assert found.entry is not None
-    assert np.mean(of.points.source[found.entry] == nearest) > 0.99
+    assert np.mean(of.source[found.entry] == nearest) > 0.99
     for name, kind in KINDS.items():
-        raw, raw_slope = kind.over(of, config).query_raw(points)
+        raw, raw_slope = kind(of, config).query_raw(points)
         raw[np.isnan(raw)] = hard[np.isnan(raw)]
         np.testing.assert_allclose(found.kernels[name], raw, rtol=1e-5, atol=2e-6)
-        single = device_field(device, of, config, (name,), is_single=True).query(points, of.points.anchor)
+        single = device_field(device, of, config, (name,), is_single=True).query(points, of.anchor)
         clear = np.abs(raw - hard) > 1e-5
         assert single.gradient is not None
         assert away(single.gradient[clear], raw_slope[clear]) < 3e-4
@@ -203,7 +201,7 @@ def test_the_order_of_threads_changes_no_byte() -> None:
     answers = []
     for backwards in (False, True):
         field = device_field(EmulatedDevice(backwards=backwards), of)
-        answers += [(field.bake(span_of(of, NEAR, 0.03)[0], ALL), field.query(points, of.points.anchor, ALL))]
+        answers += [(field.bake(span_of(of, NEAR, 0.03)[0], ALL), field.query(points, of.anchor, ALL))]
     for one, other in zip(*answers, strict=True):
         for name in ("hard", "distance", "gradient", "entry"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -214,8 +212,8 @@ def test_memory_is_given_back() -> None:
     memory = EmulatedDevice()
     of = spheres()
     field = device_field(memory, of)
-    field.query(queries(10), of.points.anchor)
-    field.query(queries(30), of.points.anchor)
+    field.query(queries(10), of.anchor)
+    field.query(queries(30), of.anchor)
     field.close()
     assert not memory.held
 
@@ -250,7 +248,7 @@ def test_a_certified_bound_never_exceeds_the_exact_distance_of_the_processor(dev
     baker.bake(0, layout.shape[0], planes)
     field = GridField(DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header={}))
     points = rng.uniform(layout.box.lower - 0.1, layout.box.upper + 0.1, (1_000_000, 3))
-    exact = SphereField(*cloud(NUM), threads=2).query(points)[0]
+    exact = SphereField(Spheres.of(*cloud(NUM)), threads=2).query(points)[0]
     gap = exact - field.certified(points)
     assert gap.min() >= 0.0
     assert gap.min() < 0.01  # it comes near
@@ -261,9 +259,9 @@ def test_a_field_on_a_device_answers_as_that_of_the_processor(device: Memory) ->
     for distance in ("safe", "hard", "gpdf"):
         named = replace(config, distance=distance)
         field = OnDevice.of(*cloud(NUM), named, device)
-        found, expected = field.distance(points), make_field(*cloud(NUM), named).query(points)[0]
+        found, expected = field.distance(points), field_over(Spheres.of(*cloud(NUM)), named).query(points)[0]
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2 * config.truncation)
-        np.testing.assert_array_equal(field.nearest(points), SphereField(*cloud(NUM)).nearest(points))
+        np.testing.assert_array_equal(field.nearest(points), SphereField(Spheres.of(*cloud(NUM))).nearest(points))
         np.testing.assert_array_equal(field.query(points)[0], found)
         assert len(field.query(points[:0])[0]) == len(field.distance(points[:0])) == 0
         assert len(field.nearest(points[:0])) == 0

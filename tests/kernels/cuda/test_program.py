@@ -5,31 +5,31 @@ from typing import Any
 
 import pytest
 
-from splatctrl_cli.kernels.cuda import program
+from splatctrl_cli.kernels.cuda import card
 from splatctrl_cli.kernels.cuda.memory import FIELD, FIT
 
 
 @pytest.mark.parametrize("source", [FIT, FIELD])
 @pytest.mark.parametrize("capability", [(7, 5), (8, 0), (9, 0), (12, 0)])
 def test_kernels_compile_for_every_generation(capability: tuple[int, int], source: str, tmp_path: Path) -> None:
-    code = program.compiled(capability, tmp_path, source=source).code
+    code = card.compiled(capability, tmp_path, source=source).code
     assert code[:4] == b"\x7fELF"
     assert b".text.bake_hard" in code or source == FIT  # by its name, as it is launched
 
 
 def test_a_second_start_does_not_compile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = program.compiled((8, 0), tmp_path).code
+    first = card.compiled((8, 0), tmp_path).code
 
     def fails(*_: Any) -> None:
         raise AssertionError("compiled again")
 
-    monkeypatch.setattr(program, "Program", fails)
-    assert program.compiled((8, 0), tmp_path).code == first
-    monkeypatch.setattr(program, "source_digest", lambda: b"changed")
+    monkeypatch.setattr(card, "Program", fails)
+    assert card.compiled((8, 0), tmp_path).code == first
+    monkeypatch.setattr(card, "source_digest", lambda: b"changed")
     with pytest.raises(AssertionError, match="compiled again"):
-        program.compiled((8, 0), tmp_path)
+        card.compiled((8, 0), tmp_path)
 
 
 def test_a_cache_that_cannot_be_written_costs_the_compilation_only(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    assert program.compiled((8, 0), tmp_path / "file").code[:4] == b"\x7fELF"
+    assert card.compiled((8, 0), tmp_path / "file").code[:4] == b"\x7fELF"
