@@ -236,20 +236,23 @@ def _learn_link(
 
 
 def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: int) -> Fused:
-    total, weight = (np.zeros((num, len(cells)), np.float32) for _ in range(2))
-    seen, free = (np.zeros((num, len(cells)), bool) for _ in range(2))
+    total, weight = np.zeros((2, 2, num, len(cells)), np.float32)  # of surfaces, of free rays
+    votes, known = np.zeros((num, len(cells)), np.int8), np.zeros((num, len(cells)), bool)
     for view, k in used:
         points = transform_points(view.T_camera_world @ view.T_world_link[number], cells)
         ahead, v, u, before = _landing(view, points, np.arange(len(cells)))
         link = view.links[v // view.stride, u // view.stride]
         is_free = before > TRUNCATION
         is_seen = (np.abs(before) <= TRUNCATION) & ((link == UNEXPLAINED) | (link == number))
-        share = np.clip((before + TRUNCATION) / (TRUNCATION - VOXEL), 0.0, 1.0) * (is_free | is_seen)
-        total[k, ahead] += share * np.minimum(before, TRUNCATION)
-        weight[k, ahead] += share
-        seen[k, ahead] |= is_seen
-        free[k, ahead] |= is_free
-    return Fused(total=total, weight=weight, seen=seen, free=free)
+        share = np.clip((before + TRUNCATION) / (TRUNCATION - VOXEL), 0.0, 1.0)
+        for kind, chosen in enumerate((is_seen, is_free)):
+            total[kind, k, ahead[chosen]] += (share * np.minimum(before, TRUNCATION))[chosen]
+            weight[kind, k, ahead[chosen]] += share[chosen]
+        votes[k, ahead] += is_seen.astype(np.int8) - is_free
+        known[k, ahead] |= is_seen | is_free
+    seen = votes > 0
+    total, weight = (np.where(seen, each[0], each.sum(axis=0)) for each in (total, weight))
+    return Fused(total=total, weight=weight, seen=seen, free=known & ~seen)
 
 
 def _stays_in_world(
