@@ -15,7 +15,6 @@ from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
 from splatctrl_cli.recording.source import describe
 
 WIDTH = 118  # columns of text
-FEW = 3  # unread rows, up to which all are printed
 
 
 def run(args: argparse.Namespace) -> int:
@@ -97,7 +96,7 @@ def _described(summary: Summary, *, is_long: bool) -> Iterator[str]:
     yield from _facts(summary.facts, "  ")
     for grid in summary.grids:
         yield ""
-        num = len(grid.unused) if len(grid.unused) > FEW and not is_long else 0
+        num = len(grid.unused) if len(grid.unused) > 3 and not is_long else 0  # few are all printed
         rows = [row for row in grid.rows if not num or row[0] not in grid.unused]
         yield from table(grid.header, rows) if rows else () if num else [f"no {grid.name}"]
         yield from [f"and {num} {grid.name} that no command reads; -v prints them"] if num else ()

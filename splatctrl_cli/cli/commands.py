@@ -95,7 +95,6 @@ _CONFIG = (
     option("--template", "print a file to begin with: every default, commented out, with its meaning and range"),
     option("--schema", "print the JSON Schema of what every command prints with --json"),
 )
-_COMPLETION = (option("SHELL", "whose script", SHELLS),)
 _DEMO = (
     option("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data; without it, simulated first)", Path),
     *output("folder for everything the demo makes", default="demo_output"),
@@ -133,7 +132,6 @@ _ROBOT_SPHERES = (
     seed("the greedy covers"),
     *_ROBOT_JUDGED,
 )
-_ROBOT_CHECK = (*_ROBOT, *_ROBOT_JUDGED)
 _ROBOT_PAIRS = (
     *_ROBOT,
     LOCK,
@@ -152,7 +150,6 @@ _ROBOT_LEARN = (
     group("robot", BASE, LOCK),
     *OF_FOLDERS,
 )
-_ROBOT_INFO = (*_robot("none, or those of the URDF"), LOCK)
 
 
 COMMANDS = {
@@ -294,7 +291,7 @@ COMMANDS = {
                 summary="measure how much of the collision surface a set of spheres covers",
                 run="robot:run_check",
                 judges=True,
-                options=_ROBOT_CHECK,
+                options=(*_ROBOT, *_ROBOT_JUDGED),
             ),
             "pairs": Command(
                 summary="list which links may collide with each other, and why others may not",
@@ -309,7 +306,7 @@ COMMANDS = {
             "info": Command(
                 summary="show joints with limits, links, shapes and spheres",
                 run="robot:run_info",
-                options=_ROBOT_INFO,
+                options=(*_robot("none, or those of the URDF"), LOCK),
             ),
         },
     ),
@@ -323,7 +320,7 @@ COMMANDS = {
         summary="print a script by which a shell completes commands, options and files",
         examples=("completion bash", "completion zsh"),
         run="config:run_completion",
-        options=_COMPLETION,
+        options=(option("SHELL", "whose script", SHELLS),),
     ),
     "help": Command(
         summary="print a page of the documentation, or their list",

@@ -8,7 +8,6 @@ from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareResult, FigureChange, compare
 
 FORM = ".6g"
-MOST_ROWS = 20  # of changes that are no regression; --json has all
 
 
 def run(args: argparse.Namespace) -> int:
@@ -20,7 +19,7 @@ def run(args: argparse.Namespace) -> int:
 def _lines(result: CompareResult, *, is_long: bool) -> Iterator[str]:
     kinds = (Change.WORSE, Change.BETTER, *((Change.OTHER,) if is_long else ()))
     rows = [_row(one) for one in result.figures if one.change in kinds]
-    num = len(rows) if is_long else max(MOST_ROWS, result.metrics["num_worse"])
+    num = len(rows) if is_long else max(20, result.metrics["num_worse"])  # --json has all
     if rows:
         yield from table(("figure", "run", "before", "after", "allowed", "unit", "", "where"), rows[:num])
         yield from [f"and {len(rows) - num} more; -v prints all"] if len(rows) > num else []

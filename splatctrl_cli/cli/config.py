@@ -14,8 +14,6 @@ from splatctrl_cli.config.ranges import shown
 from splatctrl_cli.errors import UsageError, did_you_mean
 from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
-ROOTS = (Path(__file__).parents[1], Path(__file__).parents[2])  # of docs/: of a wheel, of the repository
-
 
 def run(args: argparse.Namespace) -> int:
     console = Console(args)
@@ -35,7 +33,8 @@ def run_completion(args: argparse.Namespace) -> int:
 
 
 def run_help(args: argparse.Namespace) -> int:
-    folder = next(place / "docs" for place in ROOTS if (place / "docs" / "README.md").is_file())
+    roots = Path(__file__).parents[1:3]  # of a wheel, of the repository
+    folder = next(place / "docs" for place in roots if (place / "docs" / "README.md").is_file())
     names = sorted(page.stem for page in folder.glob("*.md"))
     topic = args.topic or "README"
     if topic not in names:

@@ -13,8 +13,6 @@ from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.config import load_config
 from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 
-RATED = 1000  # points from which on a rate says something
-
 
 def run(args: argparse.Namespace) -> int:
     """Run; without an output answers go to stdout, figures to stderr."""
@@ -47,7 +45,8 @@ def _lines(result: QueryResult) -> Iterator[str]:
     yield from (f"note: {note}" for note in result.notes)
     rate = (result.metrics["num_points"] or 0) / max(result.seconds["answer"], 1e-9)
     wrote = [] if result.out is None else [f"wrote {result.out}"]
-    yield from [*([f"{rate:,.0f} points/s"] if (result.metrics["num_points"] or 0) >= RATED else []), *wrote]
+    # a rate of fewer points says nothing
+    yield from [*([f"{rate:,.0f} points/s"] if (result.metrics["num_points"] or 0) >= 1000 else []), *wrote]
 
 
 def _shown(name: str, value: float | None) -> str:

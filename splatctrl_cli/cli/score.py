@@ -32,7 +32,6 @@ COLUMNS = {
     "valid_share": "valid",
     "chamfer": "Chamfer mm",
 }
-SHARES = ("seen_share", "in_front_seen", "mask_share", "valid_share")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -165,6 +164,6 @@ def _cell(name: str, value: float | None) -> str:
         return f"{1000 * value:.1f}"
     if name == "chamfer":
         return f"{1000 * value:.2f}"
-    if name in SHARES:
+    if name in ("seen_share", "in_front_seen", "mask_share", "valid_share"):
         return f"{100 * value:.1f}%"
     return f"{value:.2f}" if name.startswith("psnr") else f"{value:.4f}"

@@ -62,12 +62,14 @@ class RegionScore:
     in_front: float
 
 
-DEPTH_ERROR = Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.02)
 REGION = {
     "psnr": DECIBELS,
     "ssim": SIMILARITY,
     "depth_pixels": DESCRIBES,
-    **dict.fromkeys(("depth_median", "depth_mean", "depth_p90"), DEPTH_ERROR),
+    **dict.fromkeys(
+        ("depth_median", "depth_mean", "depth_p90"),
+        Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.02),
+    ),
     **dict.fromkeys(("depth_within_1cm", "depth_within_2cm", "depth_coverage"), GOOD_SHARE),
     "in_front": BAD_SHARE,
 }  # of the pixels of a region

@@ -24,7 +24,6 @@ class Outcome(StrEnum):
 
 
 EXIT_CODES = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.NOT_EVALUABLE: 5}
-SHORT = 80  # characters of a value that `brief` prints
 _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a definite failure outranks missing evidence
 
 
@@ -212,7 +211,7 @@ def brief(result: Any) -> str:
     shown = []
     for name, value in ((each.name, getattr(result, each.name)) for each in fields(result)):
         text, size = repr(value), f" of {len(value)}" if isinstance(value, Sized) else ""
-        is_short = len(text) <= SHORT or isinstance(value, Verdict)
+        is_short = len(text) <= 80 or isinstance(value, Verdict)
         shown.append(f"{name}={text if is_short else f'<{type(value).__name__}{size}>'}")
     return f"{type(result).__name__}({', '.join(shown)})"
 

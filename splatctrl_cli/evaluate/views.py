@@ -210,7 +210,9 @@ def depth_errors(
         both &= mask
     errors = np.abs(depth[both].astype(np.float64) - reference[both])
     if not errors.size:
-        return DepthErrors(num_pixels=0, **dict.fromkeys(_DEPTH_FIGURES, math.nan))
+        return DepthErrors(
+            num_pixels=0, **dict.fromkeys(("median", "mean", "p90", "within_1cm", "within_2cm"), math.nan)
+        )
     return DepthErrors(
         num_pixels=int(errors.size),
         median=float(np.median(errors)),
@@ -219,9 +221,6 @@ def depth_errors(
         within_1cm=float(np.mean(errors <= 0.01)),
         within_2cm=float(np.mean(errors <= 0.02)),
     )
-
-
-_DEPTH_FIGURES = ("median", "mean", "p90", "within_1cm", "within_2cm")
 
 
 def _window_mean(image: Float64, border: Literal["reflect", "constant"]) -> Float64:

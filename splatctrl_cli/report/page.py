@@ -154,8 +154,6 @@ def _inner(full: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 STEPS = 65535  # of a number of 16 bits
-END_OF_LIBRARY = "var camera,controls"  # where three.js ends in trimesh's page and its own script begins
-REMEDY = "pip install 'trimesh>=4.4,<6'"
 
 
 def three_js() -> str:
@@ -163,9 +161,10 @@ def three_js() -> str:
     try:
         archive = trimesh.util.decompress(trimesh.resources.get_bytes("templates/viewer.zip"), file_type="zip")
         page = archive["viewer.html.template"].read().decode("utf-8")
-        script = page[page.index("<script>") + len("<script>") : page.index(END_OF_LIBRARY)]
+        # three.js ends where trimesh's own script begins
+        script = page[page.index("<script>") + len("<script>") : page.index("var camera,controls")]
     except (OSError, KeyError, ValueError) as error:
-        raise UsageError(f"three.js: not found in trimesh: {error}", remedy=REMEDY) from None
+        raise UsageError(f"three.js: not found in trimesh: {error}", remedy="pip install 'trimesh>=4.4,<6'") from None
     return _deflated(script.encode("utf-8"))
 
 
@@ -255,7 +254,6 @@ def _deflated(data: bytes | bytearray) -> str:
 
 
 PARTS = Path(__file__).parent / "page_parts"
-QUALITY = 70  # of JPEG: WebP is a third smaller, and takes ten times as long
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,7 +349,8 @@ def picture(path: Path, title: str, most: int) -> Picture:
     if width > most:
         height, width = round(height * most / width), most
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+    # JPEG: WebP is a third smaller, and takes ten times as long
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
     text = base64.b64encode(data).decode("ascii")
     return Picture(title=title, data=f"data:image/jpeg;base64,{text}", width=width, height=height)
 

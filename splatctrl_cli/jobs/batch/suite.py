@@ -22,8 +22,6 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
     *("controller failed", "goal not reached", "gate failed"),
 )
 _NAME = re.compile(r"[\w][\w.+-]*")
-_COMMON = ("log", "capture", "recording", "data")  # common names, which get the folder's name in front
-_ENDINGS = (".mcap", ".bag", ".db3", ".toml", ".capture")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +115,7 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     if command not in commands:
         remedy = _near(command, commands, "give command = one of")
         raise UsageError(f"{where}: no job is called {command!r}", remedy=remedy)
-    own = next((option for option in _OWN if option in table), None)
+    own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
     if own is not None:
         raise UsageError(f"{where}: a batch gives {own} itself", remedy="leave it out")
     matrix = table.get("matrix", {})
@@ -143,7 +141,6 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     )
 
 
-_OWN = ("out", "force", "resume", "json", "verbose", "quiet")
 _LIMITS = tuple(each.name for each in fields(Limits))
 
 
@@ -177,7 +174,10 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
     files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
     beside = Counter(map(_without_ending, set(files)))
     places = [path if beside[_without_ending(path)] > 1 else _without_ending(path) for path in files]
-    own = [f"{p.parent.name}-{p.name}" if p.name in _COMMON else p.name for p in places]
+    # a common name gets the folder's in front
+    own = [
+        f"{p.parent.name}-{p.name}" if p.name in ("log", "capture", "recording", "data") else p.name for p in places
+    ]
     names = [each.name or _plain(name) for each, name in zip(recordings, own, strict=True)]
     for above in range(max((len(place.parts) - 1 for place in places), default=0)):
         alike: dict[str, list[int]] = {}
@@ -191,7 +191,7 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def _without_ending(path: Path) -> Path:
-    return path.with_suffix("") if path.suffix in _ENDINGS else path
+    return path.with_suffix("") if path.suffix in (".mcap", ".bag", ".db3", ".toml", ".capture") else path
 
 
 def _plain(name: str) -> str:

@@ -43,9 +43,6 @@ from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Lab
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
 
-LAYOUT_COMMENTS = frozenset({"splat", "label"})  # describe a PLY's layout: wrong for the next file
-IMAGE_SIZE = (320, 240)
-
 Splats = SplatSet | GaussianSet
 
 
@@ -121,7 +118,8 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
             f"--layout short: expected isotropic splats, {source} has {len(chosen)} Gaussians that are not all so",
             remedy="give --isotropic, or --layout full",
         )
-    kept = {key: value for key, value in comments.items() if key not in LAYOUT_COMMENTS}
+    # describe a PLY's layout: wrong for the next file
+    kept = {key: value for key, value in comments.items() if key not in {"splat", "label"}}
     name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=request.force, is_folder=False) as partial:
         kept |= {"exported_from": f"{name} sha256 {sha256(source)}"}
@@ -258,7 +256,7 @@ def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
     """Cameras around and above the box of most splats, and its diagonal [m]."""
     lower, upper = np.percentile(centers.astype(np.float64), [2, 98], axis=0)
     middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
-    width, height = IMAGE_SIZE
+    width, height = 320, 240
     intrinsics = Intrinsics(fx=width, fy=width, cx=(width - 1) / 2, cy=(height - 1) / 2, width=width, height=height)
     angles = 2 * np.pi * (np.arange(EXPORT_VIEWS) + 0.5) / EXPORT_VIEWS
     directions = np.column_stack([np.cos(angles), np.sin(angles), np.full(EXPORT_VIEWS, 0.7)])

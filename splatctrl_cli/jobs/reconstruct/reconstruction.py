@@ -34,8 +34,6 @@ from splatctrl_cli.scene.scale import RecordedDepth, fitted_to, in_words
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep, cloud_box, depth_box, time_steps
 
-LONGEST_SHARE = 50  # a checkpoint waits 50 times as long as the last one took: below 2 % of the run
-
 KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes a checkpoint stores unchanged
 
 
@@ -302,7 +300,8 @@ class Reconstruction:
 
     def _save_if_due(self) -> None:
         period = self.config.scene.checkpoint_period
-        if period > 0 and time.monotonic() < self._saved_at + max(period, LONGEST_SHARE * self._save_time):
+        # a checkpoint waits 50 times as long as the last one took: below 2 % of the run
+        if period > 0 and time.monotonic() < self._saved_at + max(period, 50 * self._save_time):
             return
         start = time.monotonic()
         self._save()

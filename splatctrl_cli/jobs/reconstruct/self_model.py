@@ -29,8 +29,6 @@ from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import own_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 
-MOST_MOMENTS = 2000  # of a recording, to choose from
-
 
 @dataclass(frozen=True, kw_only=True)
 class LearnRequest(RobotOptions):
@@ -101,7 +99,7 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
     """
     stamps = stamps_by_camera(source)
     stamps = {camera: its for camera, its in stamps.items() if camera in training_cameras(source)}
-    found = [(stamp, arm.surface_poses(stamp)) for stamp in spread(min(stamps.values(), key=len), MOST_MOMENTS)]
+    found = [(stamp, arm.surface_poses(stamp)) for stamp in spread(min(stamps.values(), key=len), 2000)]
     posed = [(stamp, T) for stamp, T in found if T is not None]
     if not posed:
         raise InputError(f"{source.name}: no frame has a joint state within {1e-9 * STATES_CLOSE_NS:g} s")

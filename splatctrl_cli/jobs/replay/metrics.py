@@ -104,7 +104,6 @@ SPEED = Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02)
 SLACK = Scale(unit="m/s", better=Better.HIGHER, absolute=1e-3, relative=0.02)  # or rad/s, by the row
 AT_GOAL = Scale(unit="m", better=Better.LOWER, absolute=ControlConfig().goal_position)  # within it, it is reached
 TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_rotation)
-RESIDUAL = Scale(better=Better.LOWER, absolute=1e-6)
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
 NEAREST = least_of("clearance_exact")
 AUDIT = partial(_of, "audit.figures")
@@ -199,13 +198,12 @@ OF_STATES: Declared = (
 
 
 LARGEST_DIFFERENCE, LEAST_SLACK = largest_of("velocity_difference"), least_of("barrier_margin_logged")
-FULFILLED_STEPS = Scale(better=Better.HIGHER, relative=0.05)
 STEPS, ASKED = partial(_of, "kept_steps.figures"), partial(_of, "open_loop.figures")
 
 
 def _rung(rung: Rung) -> Metric[Replay]:
     name, shown = "num_" + rung.value.replace("-", "_"), Shown(column="rung", pick=rung.value)
-    scale = FULFILLED_STEPS if rung is Rung.SOLVED else FAULTS
+    scale = Scale(better=Better.HIGHER, relative=0.05) if rung is Rung.SOLVED else FAULTS
     return counted(name, STEPS("rung"), lambda _, values: values == RUNGS.index(rung), scale=scale, shown=shown)
 
 
@@ -217,7 +215,13 @@ OF_STEPS: Declared = (
     *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
     folded("num_refused", TOTAL, STEPS("refused"), scale=FAULTS),
     counted("num_scaled_back", STEPS("scale"), lambda _, values: values < 1, shown=least_of("scale")),
-    folded("max_residual", LARGEST, STEPS("residual"), scale=RESIDUAL, shown=largest_of("residual")),
+    folded(
+        "max_residual",
+        LARGEST,
+        STEPS("residual"),
+        scale=Scale(better=Better.LOWER, absolute=1e-6),
+        shown=largest_of("residual"),
+    ),
 )
 OF_OPEN_LOOP: Declared = (
     folded("mean_velocity_difference", MEAN, ASKED("size"), scale=SPEED, shown=LARGEST_DIFFERENCE),

@@ -24,10 +24,8 @@ from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_o
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
-MOST_STATES = 240  # of a motion
 MOST_SETS = 5  # of splats over time
 MOST_UNKNOWN = 6000  # cubes of space never seen
-MOST_CELLS = 80  # along a side of a grid whose surface is drawn
 PLACE = re.compile(r"at \((-?[\d.]+), (-?[\d.]+), (-?[\d.]+)\)")
 
 
@@ -71,7 +69,7 @@ def space_of_grid(path: Path) -> Space:
     grid = read_npz(path)
     if "sdf" not in grid.channels:
         raise InputError(f"{path}: expected the channel sdf, got {', '.join(grid.channels)}")
-    step = -(-max(grid.channels["sdf"].shape) // MOST_CELLS)
+    step = -(-max(grid.channels["sdf"].shape) // 80)  # cells along a side at most
     channels = {"sdf": np.ascontiguousarray(grid.channels["sdf"][::step, ::step, ::step])}
     thinned = DistanceGrid(origin=grid.origin, voxel=step * grid.voxel, channels=channels, header=grid.header)
     try:
@@ -206,7 +204,7 @@ def _with_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) 
 
 def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
     count = len(states.seconds)
-    chosen = set(np.linspace(0, count - 1, min(count, MOST_STATES)).round().astype(int).tolist())
+    chosen = set(np.linspace(0, count - 1, min(count, 240)).round().astype(int).tolist())
     worst = states.worst()
     which = sorted(chosen if worst is None else chosen | {worst})
     bodies = robot_bodies(robot)

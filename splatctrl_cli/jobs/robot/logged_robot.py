@@ -19,7 +19,6 @@ from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 NO_SELF_MODEL = Path("none")  # as --self-model: neither learned nor taken from the scene
-LARGEST_SELF_MODEL = 2**30  # bytes
 TAKE = "leave --urdf out to take the log's own, or correct the file"
 
 
@@ -68,7 +67,7 @@ def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = 
     if path is None or path == NO_SELF_MODEL or (given is None and not path.is_file()):
         return model
     try:
-        found = SelfModel.from_arrays(read_arrays(path, most=LARGEST_SELF_MODEL))
+        found = SelfModel.from_arrays(read_arrays(path, most=2**30))  # bytes
     except (*DAMAGE, OSError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: not a self-model: {error}", remedy="write it with: splatctrl robot learn"
