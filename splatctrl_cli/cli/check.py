@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 
 from splatctrl_cli.checks.finding import CheckReport
-from splatctrl_cli.cli.common import Console, shown, table
-from splatctrl_cli.cli.options import locked_joints, request_of, source_options
+from splatctrl_cli.cli.common import Console, format_cell, locked_joints, request_of, source_options, table
 from splatctrl_cli.errors import DAMAGED
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
@@ -50,9 +49,9 @@ def _lines(report: CheckReport) -> Iterator[str]:
             (
                 rate.topic,
                 rate.messages,
-                shown(rate.hz, ".2f"),
-                shown(rate.longest_s, ".3f"),
-                shown(rate.delay_s, ".3f"),
+                format_cell(rate.hz, ".2f"),
+                format_cell(rate.longest_s, ".3f"),
+                format_cell(rate.delay_s, ".3f"),
             )
             for rate in rates
         ]

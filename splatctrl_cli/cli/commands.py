@@ -10,7 +10,7 @@ from pathlib import Path
 
 from splatctrl_cli import __version__
 from splatctrl_cli.cli import run_options, scene_options
-from splatctrl_cli.cli.options import (
+from splatctrl_cli.cli.common import (
     BASE,
     COMMON,
     GATES,
@@ -190,7 +190,7 @@ COMMANDS = {
             f"reconstruct out/x.capture --cameras cam0,cam1 {ROBOT} -o out/scene",
             "reconstruct --dtu sample_data/dtu --protocol holdout:2,5 -o out/scan",
         ),
-        run="reconstruct:run",
+        run="scene:run_reconstruct",
         judges=True,
         options=scene_options.RECONSTRUCT,
     ),
@@ -200,7 +200,7 @@ COMMANDS = {
             "export out/scene --labels object -o out/scene.spz",
             "export out/audit --mcap",
         ),
-        run="export:run",
+        run="export:run_export",
         options=scene_options.EXPORT,
     ),
     "sdf-bake": Command(
@@ -209,7 +209,7 @@ COMMANDS = {
             f"sdf-bake out/scene {ROBOT} -o out/field",
             "sdf-bake out/scene --box=-1,-1,0,1,1,1 --voxel 0.02 --formats npz,nrrd -o out/grid",
         ),
-        run="sdf_bake:run",
+        run="scene:run_bake",
         judges=True,
         options=scene_options.SDF_BAKE,
     ),
@@ -219,7 +219,7 @@ COMMANDS = {
             "query out/scene points.csv -o out/near.csv",
             "query out/field points.csv --scene out/scene",
         ),
-        run="query:run",
+        run="export:run_query",
         options=scene_options.QUERY,
     ),
     "score": Command(
@@ -255,26 +255,26 @@ COMMANDS = {
             "sweep out/audit --over margin=0.02:0.08 -o out/margin",
             "sweep out/audit --over latency=0:1 --over depth-noise=0:0.02 -o out/both",
         ),
-        run="sweep:run",
+        run="runs:run_sweep",
         options=run_options.SWEEP,
     ),
     "compare": Command(
         summary="say what got worse between two runs, two batches, or since a stored baseline",
         examples=("compare out/old out/new", "compare out/new --against baseline.toml"),
-        run="compare:run",
+        run="runs:run_compare",
         judges=True,
         options=run_options.COMPARE,
     ),
     "report": Command(
         summary="write one HTML file on a run or a batch, with scenes in 3-D",
         examples=("report out/audit", "report out/batch --against baseline.toml -o report.html"),
-        run="report:run",
+        run="runs:run_report",
         options=run_options.REPORT,
     ),
     "view": Command(
         summary="show a replay, scene, field or splats in 3-D in a browser",
         examples=("view out/audit", "view out/scene --no-open -o scene.html"),
-        run="report:run_view",
+        run="runs:run_view",
         options=run_options.VIEW,
     ),
     "robot": Command(

@@ -10,9 +10,9 @@ from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import SCHEMA_FILE
+from splatctrl_cli.config.load import resolved_settings, template_of, toml_of
 from splatctrl_cli.config.ranges import shown
 from splatctrl_cli.errors import UsageError, did_you_mean
-from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
 
 def run(args: argparse.Namespace) -> int:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from splatctrl_cli.cli.options import (
+from splatctrl_cli.cli.common import (
     BOX,
     CONFIG,
     CONFIG_FILE,

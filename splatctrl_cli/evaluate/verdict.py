@@ -234,9 +234,6 @@ def _plain(reason: Reason) -> dict[str, Any]:
     return plain
 
 
-FirstTime = Callable[[str, Callable[[float], bool]], float | None]
-"""Metric name, whether a value holds -> the first time [s] that does not."""
-
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 
 
@@ -262,7 +259,7 @@ def gate_reasons(
     metrics: Mapping[str, float | None],
     counts: Mapping[str, int],
     *,
-    first_time: "FirstTime | None" = None,
+    first_time: Callable[[str, Callable[[float], bool]], float | None] | None = None,
 ) -> list[Reason]:
     """A reason per requirement: passed, failed, or not evaluable without a finite value or count.
 

@@ -4,6 +4,8 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -51,7 +53,7 @@ def views_to_score(
         return
     counts: Counter[str] = Counter()
     newest: dict[str, RgbdFrame] = {}
-    for recorded in _moments(source):
+    for _, recorded in groupby(frames_of(source), key=attrgetter("stamp_ns")):
         moment = [corrected(frame) for frame in recorded]
         newest |= {frame.camera: frame for frame in moment if frame.camera in training}
         for frame in moment:
@@ -68,17 +70,6 @@ def _name(camera: str, number: int) -> str:
 def frames_of(source: RecordSource) -> Iterator[RgbdFrame]:
     """The frames among a source's records."""
     return (record for record in source.records() if isinstance(record, RgbdFrame))
-
-
-def _moments(source: RecordSource) -> Iterator[list[RgbdFrame]]:
-    moment: list[RgbdFrame] = []
-    for frame in frames_of(source):
-        if moment and frame.stamp_ns != moment[0].stamp_ns:
-            yield moment
-            moment = []
-        moment.append(frame)
-    if moment:
-        yield moment
 
 
 def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tolerance: float = 0.02) -> Bool:

@@ -18,6 +18,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.errors import InputError, UsageError
@@ -134,23 +135,11 @@ def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most
         blocks = is_unknown[tuple(slice(0, n * factor) for n in shape)]
         cells = blocks.reshape(shape[0], factor, shape[1], factor, shape[2], factor)
         full = 2 * cells.sum(axis=(1, 3, 5), dtype=np.int32) >= factor**3
-        borders = np.argwhere(full & ~_inner(full))
+        borders = np.argwhere(full & ~binary_erosion(full, border_value=1))
         if len(borders) <= most:
             centers = origin + voxel * (factor * borders + (factor - 1) / 2)
             return np.asarray(centers, np.float32), factor * voxel
         factor += 1
-
-
-def _inner(full: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells with six full neighbours; outside the grid counts as full."""
-    padded = np.pad(full, 1, constant_values=True)
-    inner = np.ones_like(full)
-    for axis in range(3):
-        for shift in (0, 2):
-            where = [slice(1, -1)] * 3
-            where[axis] = slice(shift, shift + full.shape[axis])
-            inner &= padded[tuple(where)]
-    return inner
 
 
 STEPS = 65535  # of a number of 16 bits

@@ -307,7 +307,19 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
         axes = figure.subplots(1, len(VIEWS), width_ratios=widths)
         for view, (title, across, along, viewer) in zip(axes, VIEWS, strict=True):
             _draw_shapes(view, triangles, is_bare, (across, along), viewer)
-            _draw_spheres(view, centers[:, [across, along]], radii)
+            view.add_collection(
+                mpl.collections.EllipseCollection(
+                    2 * radii,
+                    2 * radii,
+                    np.zeros(len(radii)),
+                    units="xy",
+                    offsets=centers[:, [across, along]],
+                    offset_transform=view.transData,
+                    facecolors="#e69f0020",
+                    edgecolors=SPHERE_EDGE,
+                    linewidths=0.7,
+                )
+            )
             view.set(xlim=(lower[across], upper[across]), ylim=(lower[along], upper[along]), aspect="equal")
             view.set(title=title, xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[along]} [m]")
         figure.suptitle(
@@ -326,22 +338,6 @@ def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int,
     view.add_collection(
         mpl.collections.PolyCollection(
             list(seen[:, :, list(plane)]), facecolors=colors, edgecolors=colors, linewidths=0.2
-        )
-    )
-
-
-def _draw_spheres(view: Any, centers: Float64, radii: Float64) -> None:
-    view.add_collection(
-        mpl.collections.EllipseCollection(
-            2 * radii,
-            2 * radii,
-            np.zeros(len(radii)),
-            units="xy",
-            offsets=centers,
-            offset_transform=view.transData,
-            facecolors="#e69f0020",
-            edgecolors=SPHERE_EDGE,
-            linewidths=0.7,
         )
     )
 

@@ -210,7 +210,7 @@ def check_request(request: BakeRequest) -> None:
         raise UsageError("--truth and --seen-by: expected both or neither")
     if request.previous_scene is not None and request.update is None:
         raise UsageError("--previous-scene: belongs to --update", remedy="give the field folder to --update as well")
-    of_truth = () if request.truth is None else field_accuracy.metric_names(FIELDS)
+    of_truth = () if request.truth is None else field_accuracy.metric_scales(FIELDS)
     check_gate_names(request.require, (*SUMMARY_METRICS, *of_truth))
 
 

@@ -198,7 +198,7 @@ def _nodes_of(
 
 
 def _short(values: Sequence[Any]) -> list[str]:
-    parts = [_text(value).strip("/").split("/") for value in values]
+    parts = [text_of(value).strip("/").split("/") for value in values]
     least = min(map(len, parts)) - 1
     first = min(_num_alike(parts), least)
     last = min(_num_alike([each[::-1] for each in parts]), least - first)
@@ -209,9 +209,9 @@ def _num_alike(lists: Sequence[Sequence[str]]) -> int:
     return sum(1 for _ in itertools.takewhile(lambda each: len(set(each)) == 1, zip(*lists, strict=False)))
 
 
-def _text(value: Any) -> str:
+def text_of(value: Any) -> str:
     if isinstance(value, list):
-        return ",".join(map(_text, value))
+        return ",".join(map(text_of, value))
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 

@@ -31,7 +31,6 @@ NAME, OWNERS = "ledger.sqlite", ".owners"
 FILE, FORMAT, FILE_VERSION = "batch.json", "splatctrl-batch", 1  # what a batch says of itself
 VERSION = 1  # of the tables
 BUSY_S, WAIT_S = 30.0, 0.02  # longest wait for another writer, and between attempts
-_COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
 THREADS = "--threads"  # changes no byte
 _MESH = re.compile(r'filename\s*=\s*"([^"]+)"')
 _PATTERN = {"=": "GLOB", "==": "GLOB", "!=": "NOT GLOB"}  # of texts with a *
@@ -177,7 +176,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10". Raises UsageError for others."""
         clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
         for condition in conditions:
-            match = _COMPARISON.fullmatch(condition.strip())
+            match = re.fullmatch(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)", condition.strip())
             if match is None or match[1] not in COLUMNS:
                 raise UsageError(
                     f"--where {condition}: expected COLUMN=VALUE", remedy=f"columns: {', '.join(COLUMNS)}"

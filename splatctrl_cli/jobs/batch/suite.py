@@ -6,7 +6,7 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
     *("passed", "failed", "not evaluable", "done", "safe", "margin broken", "contact", "limits broken"),
     *("controller failed", "goal not reached", "gate failed"),
 )
-_NAME = re.compile(r"[\w][\w.+-]*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,11 +136,8 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
             memory=int(_amount(where, table, "memory", UNITS, limits.memory)),
             retries=int(_amount(where, table, "retries", {}, limits.retries)),
         ),
-        options={key: v for key, v in table.items() if key not in {"command", "matrix", "expect", *_LIMITS}},
+        options={key: v for key, v in table.items() if key not in {"command", "matrix", "expect", *vars(limits)}},
     )
-
-
-_LIMITS = tuple(each.name for each in fields(Limits))
 
 
 def _recordings(folder: Path, table: Table) -> list[Recording]:
@@ -228,7 +224,7 @@ def _near(word: str, known: Sequence[str], otherwise: str = "known here") -> str
 
 
 def _checked_name(where: str, name: str) -> None:
-    if not _NAME.fullmatch(name):
+    if not re.fullmatch(r"\w[\w.+-]*", name):
         raise UsageError(f"{where}: {name!r} is no name of a folder", remedy="use letters, digits, . _ + -")
 
 

@@ -38,10 +38,9 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
+from splatctrl_cli.jobs.score.views import rendered
 from splatctrl_cli.recording.container.foxglove_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
-from splatctrl_cli.scene.gaussians import render_gaussians
-from splatctrl_cli.scene.render import Rendering, render
 
 Splats = SplatSet | GaussianSet
 
@@ -118,7 +117,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
             f"--layout short: expected isotropic splats, {source} has {len(chosen)} Gaussians that are not all so",
             remedy="give --isotropic, or --layout full",
         )
-    # describe a PLY's layout: wrong for the next file
+    # these describe a PLY's layout: wrong for the next file
     kept = {key: value for key, value in comments.items() if key not in {"splat", "label"}}
     name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=request.force, is_folder=False) as partial:
@@ -238,18 +237,12 @@ def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:
-        one, two = (_render(splats, intrinsics, T_world_camera) for splats in (a, b))
+        one, two = (rendered(splats, intrinsics, T_world_camera) for splats in (a, b))
         pairs = ((one.color, two.color), (one.opacity, two.opacity), (one.depth / size, two.depth / size))
         largest = max(largest, *(float(np.abs(x.astype(np.float64) - y).max()) for x, y in pairs))
         covered += float(np.mean(one.opacity > 0)) / len(poses)
         squared += float(np.mean(np.square(one.color.astype(np.float64) - two.color))) / len(poses)
     return largest, -10.0 * math.log10(squared) if squared else None, covered
-
-
-def _render(splats: Splats, intrinsics: Intrinsics, T_world_camera: Float64) -> Rendering:
-    if isinstance(splats, SplatSet):
-        return render(splats, intrinsics, T_world_camera)
-    return render_gaussians(splats, intrinsics, T_world_camera)
 
 
 def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:

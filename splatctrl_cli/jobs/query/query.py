@@ -89,14 +89,16 @@ class SceneAnswers:
             )
         splats = obstacles.splats
         self._spheres = Spheres.of(splats.centers, splats.radii)
-        self._exact: SphereField | OnDevice
-        self._field: DistanceField
-        if device is None:
-            self._exact = SphereField.over(self._spheres, threads=threads)
-            self._field = field_over(self._spheres, config.field, threads=threads)
-        else:
-            self._exact = OnDevice(self._spheres, replace(config.field, distance="hard"), device)
-            self._field = OnDevice(self._spheres, config.field, device, threads=threads)
+        self._exact: SphereField | OnDevice = (
+            SphereField.over(self._spheres, threads=threads)
+            if device is None
+            else OnDevice(self._spheres, replace(config.field, distance="hard"), device)
+        )
+        self._field: DistanceField = (
+            field_over(self._spheres, config.field, threads=threads)
+            if device is None
+            else OnDevice(self._spheres, config.field, device, threads=threads)
+        )
         self._probability = make_probability(self._spheres, config.field, threads=threads)
         self._labels, self._index = splats.labels, obstacles.index
         self._workspace, known, limits = source.workspace, source.occupancy, config.occupancy

@@ -1,7 +1,6 @@
 """The controller of a replay and its goal."""
 
 import csv
-import math
 import re
 import shlex
 import tomllib
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.ranges import POSE, checked_pose
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import TwistTrack
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController, class_command
@@ -41,7 +41,6 @@ TWIST_FIGURES = {
         Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02),
     ),
 }
-POSE = "x,y,z,qx,qy,qz,qw"
 POSE_COLUMNS = tuple(POSE.split(","))
 
 
@@ -140,18 +139,6 @@ def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, list[float]]]:
         if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
             raise InputError(f"{path}: waypoint {number}: {kind}: expected an array of numbers, got {values}")
         yield kind, [float(value) for value in values]
-
-
-def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
-    """Return the pose `POSE` unchanged. Raises ValueError for a wrong length or quaternion norm."""
-    if len(values) != 7:
-        raise ValueError(f"expected 7 numbers {POSE}, got {len(values)}")
-    if not all(math.isfinite(value) for value in values):
-        raise ValueError(f"expected finite numbers, got {','.join(map(str, values))}")
-    length = math.hypot(*values[3:])
-    if abs(length - 1.0) > 0.01:
-        raise ValueError(f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}")
-    return tuple(values)
 
 
 def check_twists(request: ReplayRequest) -> None:

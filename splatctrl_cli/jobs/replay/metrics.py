@@ -46,7 +46,6 @@ from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.voxels import EvidenceClass
 
 Metrics = dict[str, float | None]
-Counts = dict[str, int]
 Declared = tuple[Metric[Replay], ...]
 
 
@@ -287,16 +286,10 @@ def _declared_of(replay: Replay) -> Declared:
     return _declared(replay.mode, tuple(replay.audit.clearance))
 
 
-def metric_names(
-    mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
-) -> tuple[str, ...]:
-    """Names of `metrics_of` and of the log's own figures."""
-    return tuple(metric_scales(mode, of_fields, has_truth=has_truth, has_twists=has_twists))
-
-
 def metric_scales(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
+    """Comparison scales of `metrics_of` and of the log's own figures, by name."""
     scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)} | LOG_FIGURES
     scales |= TWIST_FIGURES if has_twists else {}
     if has_truth:
@@ -320,7 +313,7 @@ def metrics_of(replay: Replay) -> Metrics:
     return metrics
 
 
-def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
+def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
     """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
     found = dict.fromkeys(metrics, num_states(replay))
     found |= {metric.name: metric.count(replay) for metric in _declared_of(replay)}

@@ -17,7 +17,7 @@ from splatctrl_cli.jobs.recordings.provenance import times_apart
 from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, twist_figures, twist_track
 from splatctrl_cli.jobs.replay.inputs import check_inside
 from splatctrl_cli.jobs.replay.known_scene import Certified, KnownScene, certified_distance
-from splatctrl_cli.jobs.replay.request import FIRST_MAP, Replay, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
 from splatctrl_cli.jobs.replay.state_store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.jobs.running.progress import Progress
@@ -211,7 +211,7 @@ def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
         )
     if request.start_time is None:
         return int(stamps[0])
-    if request.start_time == FIRST_MAP:
+    if request.start_time == "first-map":
         return max(int(stamps[0]), int(stamps[0]) if scene.first_ns is None else scene.first_ns)
     start = int(stamps[0]) + round(float(request.start_time) * 1e9)
     if start > stamps[-1]:

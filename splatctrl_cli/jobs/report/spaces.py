@@ -24,7 +24,6 @@ from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_o
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
-MOST_SETS = 5  # of splats over time
 MOST_UNKNOWN = 6000  # cubes of space never seen
 PLACE = re.compile(r"at \((-?[\d.]+), (-?[\d.]+), (-?[\d.]+)\)")
 
@@ -91,8 +90,7 @@ def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
         raise InputError(f"{run.path}: no steps.csv", remedy="replay again")
     robot = robot_of(run, states, roots)
     deciding = _deciding(run, states, robot)
-    space = replace(_scene_of(run, states, roots, deciding), deciding=deciding)
-    return replace(space, motion=_motion(run, states, robot))
+    return replace(_scene_of(run, states, roots, deciding), deciding=deciding, motion=_motion(run, states, robot))
 
 
 def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
@@ -180,12 +178,12 @@ def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple
 
 
 def spread(times: list[float], when: float) -> list[int]:
-    """Indices of at most MOST_SETS of `times`: first, last, the one at `when`, others evenly."""
+    """Indices of at most 5 of `times`: first, last, the one at `when`, others evenly."""
     if not times:
         return []
     count = len(times)
     at = max((i for i, time in enumerate(times) if time <= when), default=0)
-    most = min(count, MOST_SETS)
+    most = min(count, 5)
     even = np.linspace(0, count - 1, most).round().astype(int).tolist()
     nearest = min(range(most), key=lambda i: abs(even[i] - at))
     if 0 < nearest < most - 1:
