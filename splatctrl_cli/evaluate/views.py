@@ -82,7 +82,8 @@ def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tol
         unseen = np.flatnonzero(~seen)
         if not len(unseen):
             break
-        seen[unseen] = _agrees(points_world[unseen], frame, tolerance)
+        landing, own, measured = measured_along(points_world[unseen], frame)
+        seen[unseen[landing]] = (measured > 0) & (np.abs(measured - own) <= tolerance)
     return seen
 
 
@@ -99,13 +100,6 @@ def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float 
     nearest = sorted(others, key=lambda other: float(np.linalg.norm(other.T_world_camera[:3, 3] - center)))
     seen[seen] = seen_by(points_world, nearest, tolerance)
     return seen
-
-
-def _agrees(points_world: NDArray[np.floating], frame: RgbdFrame, tolerance: float) -> Bool:
-    agrees = np.zeros(len(points_world), dtype=np.bool_)
-    landing, own, measured = measured_along(points_world, frame)
-    agrees[landing] = (measured > 0) & (np.abs(measured - own) <= tolerance)
-    return agrees
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:

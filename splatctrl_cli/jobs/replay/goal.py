@@ -151,10 +151,8 @@ def check_twists(request: ReplayRequest) -> None:
         raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
 
 
-def twist_track(
-    request: ReplayRequest, model: RobotModel, span_ns: tuple[int, int], console: Progress
-) -> TwistTrack | None:
-    """Read the twists of --twist-topic, None without it; span_ns: first and last joint state.
+def twist_track(request: ReplayRequest, model: RobotModel, states_ns: Stamps, console: Progress) -> TwistTrack | None:
+    """Read the twists of --twist-topic, None without it; states_ns (T,): of the joint states.
 
     Raises InputError for an unknown frame, or no overlap in time.
     """
@@ -168,13 +166,13 @@ def twist_track(
             remedy=f"give --twist-frame, one of: world, {', '.join(model.frame_names)}",
         )
     first, last = int(logged.stamp_ns[0]), int(logged.stamp_ns[-1])
-    if last < span_ns[0] or first > span_ns[1]:
+    if last < states_ns[0] or first > states_ns[-1]:
         raise InputError(
-            f"{logged.where}: mixed clocks: expected twists between the joint states' stamps {span_ns[0]} and "
-            f"{span_ns[1]} ns, got {first} to {last} ns",
+            f"{logged.where}: mixed clocks: expected twists between the joint states' stamps {states_ns[0]} and "
+            f"{states_ns[-1]} ns, got {first} to {last} ns",
             remedy="record both by one clock",
         )
-    from_s, to_s = ((stamp - span_ns[0]) * 1e-9 for stamp in (first, last))
+    from_s, to_s = ((stamp - states_ns[0]) * 1e-9 for stamp in (first, last))
     console.log(f"replay: {len(logged.stamp_ns)} twists in {frame}, {from_s:.2f} to {to_s:.2f} s of the log")
     for note in logged.notes:
         console.log(f"replay: {request.twist_topic}: {note}")

@@ -133,7 +133,21 @@ def _record(folder: Path, request: SimulateRequest, progress: Progress) -> tuple
             num_frames[record.camera] += 1
             if record.camera == recording.cameras[-1].name and num_frames[record.camera] % 10 == 0:
                 progress.log(f"simulate: {(record.stamp_ns - recording.start_ns) / 1e9:.1f} s recorded")
-    return _truth(folder, recording, contrast), num_frames
+    stamps, clearance = recording.clearances()
+    truth = Truth(
+        path=folder / "truth.json",
+        primitives=recording.primitives,
+        cameras=recording.cameras,
+        luminance_std=contrast,
+        joint_names=recording.robot.joint_names,
+        robot_urdf=folder / "robot.urdf",
+        robot_spheres=folder / "robot_spheres.yaml",
+        T_world_base=recording.robot.T_world_base,
+        stamps=stamps,
+        clearance=clearance,
+        unmodelled=recording.unmodelled,
+    )
+    return truth, num_frames
 
 
 def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Recording:
@@ -152,23 +166,6 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
         progress.log("simulate: looking for a way through the scene")
         scene = replace(scene, motion=adapted_motion(scene, robot, surfaces))
     return Recording(options, robot, scene, request.unmodelled)
-
-
-def _truth(folder: Path, recording: Recording, contrast: Mapping[str, float]) -> Truth:
-    stamps, clearance = recording.clearances()
-    return Truth(
-        path=folder / "truth.json",
-        primitives=recording.primitives,
-        cameras=recording.cameras,
-        luminance_std=contrast,
-        joint_names=recording.robot.joint_names,
-        robot_urdf=folder / "robot.urdf",
-        robot_spheres=folder / "robot_spheres.yaml",
-        T_world_base=recording.robot.T_world_base,
-        stamps=stamps,
-        clearance=clearance,
-        unmodelled=recording.unmodelled,
-    )
 
 
 def _write_scan(folder: Path) -> None:
