@@ -123,7 +123,7 @@ class Reconstruction:
 
     @property
     def fitter(self) -> SceneFitter:
-        """The fitter, once the first time step has said what the workspace is."""
+        """The fitter, made from the first time step with a workspace."""
         assert self._fitter is not None
         return self._fitter
 
