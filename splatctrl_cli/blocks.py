@@ -5,6 +5,7 @@ Jobs and requests are in `splatctrl_cli.api`; these names may change with a mino
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
 from splatctrl_cli.config.fixed import START_ROOM
+from splatctrl_cli.config.ranges import checked_pose
 from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audit
 from splatctrl_cli.control.barriers import SceneStep, rate_of
@@ -41,7 +42,7 @@ from splatctrl_cli.geometry import (
     turn_about_z,
 )
 from splatctrl_cli.jobs.replay.criteria import Judged
-from splatctrl_cli.jobs.replay.goal import checked_pose, goal_waypoints
+from splatctrl_cli.jobs.replay.goal import goal_waypoints
 from splatctrl_cli.jobs.replay.inputs import LoggedStates, MeasuredRobot, measured_robot
 from splatctrl_cli.jobs.replay.known_scene import (
     ROUNDING,

@@ -11,8 +11,8 @@ import pytest
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.config import Config, fixed, load_config
+from splatctrl_cli.config.load import resolved_settings, template_of, toml_of
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
 
 def test_assignments_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:

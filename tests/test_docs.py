@@ -17,7 +17,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.parser import GONE
 from splatctrl_cli.config import PRESETS, load_config
 from splatctrl_cli.evaluate.verdict import check_gate_names
-from splatctrl_cli.jobs.replay.metrics import metric_names
+from splatctrl_cli.jobs.replay.metrics import metric_scales
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])
@@ -312,7 +312,7 @@ def test_the_first_page_knows_its_settings_gates_and_figures() -> None:
         if args.command != "replay":
             continue
         load_config(None, args.set)
-        names = metric_names(args.mode, ("exact", "barrier"), has_truth=args.truth is not None)
+        names = metric_scales(args.mode, ("exact", "barrier"), has_truth=args.truth is not None)
         check_gate_names(args.require, names)
         for line in lines:
             figure = re.fullmatch(r"([a-z]\w*) +-?[\d.]+(?:e-\d+)?", line)

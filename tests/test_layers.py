@@ -22,7 +22,7 @@ ROOMS = [  # a room imports those of the rows above its own
 INSIDE = {  # of a room, its folders and the modules beside them, likewise
     "jobs": [
         ["running"],
-        ["robot", "batch", "simulate", "ingest", "settings"],
+        ["robot", "batch", "simulate", "ingest"],
         ["check", "runs"],
         ["calibrate", "recordings", "bake", "sweep"],
         ["reconstruct", "query"],

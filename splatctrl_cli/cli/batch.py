@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.cli.commands import build_parser
-from splatctrl_cli.cli.common import Console, table
-from splatctrl_cli.cli.options import request_of
+from splatctrl_cli.cli.common import Console, request_of, table
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
@@ -24,7 +23,7 @@ from splatctrl_cli.jobs.batch.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, of_shard
+from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, of_shard, text_of
 from splatctrl_cli.jobs.batch.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batch.run import DONE, FAILED, told
 from splatctrl_cli.jobs.batch.suite import Table
@@ -144,9 +143,9 @@ def _words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> 
             raise UsageError(f"{where}: expected true or false, got {value!r}")
         return [name] * value
     if isinstance(value, Mapping):
-        texts = [f"{key}={_text(each)}" for key, each in _flat(value)]
+        texts = [f"{key}={text_of(each)}" for key, each in _flat(value)]
     else:
-        texts = [_text(each) for each in (value if isinstance(value, list) else [value])]
+        texts = [text_of(each) for each in (value if isinstance(value, list) else [value])]
     if action.type is Path:
         texts = [str(folder / text) for text in texts]
     if name and not isinstance(action, argparse._AppendAction):
@@ -160,10 +159,6 @@ def _flat(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any
             yield from _flat(value, f"{before}{key}.")
         else:
             yield before + key, value
-
-
-def _text(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:

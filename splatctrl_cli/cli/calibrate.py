@@ -5,8 +5,7 @@ import math
 from collections.abc import Iterator
 
 from splatctrl_cli.calibration.board import board_of
-from splatctrl_cli.cli.common import Console, table
-from splatctrl_cli.cli.options import locked_joints, request_of, source_options
+from splatctrl_cli.cli.common import Console, locked_joints, request_of, source_options, table
 from splatctrl_cli.config import fixed
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 

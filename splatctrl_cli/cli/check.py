@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 
 from splatctrl_cli.checks.finding import CheckReport
-from splatctrl_cli.cli.common import Console, shown, table
-from splatctrl_cli.cli.options import locked_joints, request_of, source_options
+from splatctrl_cli.cli.common import Console, format_cell, locked_joints, request_of, source_options, table
 from splatctrl_cli.errors import DAMAGED
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
@@ -15,7 +14,6 @@ from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
 from splatctrl_cli.recording.source import describe
 
 WIDTH = 118  # columns of text
-FEW = 3  # unread rows, up to which all are printed
 
 
 def run(args: argparse.Namespace) -> int:
@@ -51,9 +49,9 @@ def _lines(report: CheckReport) -> Iterator[str]:
             (
                 rate.topic,
                 rate.messages,
-                shown(rate.hz, ".2f"),
-                shown(rate.longest_s, ".3f"),
-                shown(rate.delay_s, ".3f"),
+                format_cell(rate.hz, ".2f"),
+                format_cell(rate.longest_s, ".3f"),
+                format_cell(rate.delay_s, ".3f"),
             )
             for rate in rates
         ]
@@ -97,7 +95,7 @@ def _described(summary: Summary, *, is_long: bool) -> Iterator[str]:
     yield from _facts(summary.facts, "  ")
     for grid in summary.grids:
         yield ""
-        num = len(grid.unused) if len(grid.unused) > FEW and not is_long else 0
+        num = len(grid.unused) if len(grid.unused) > 3 and not is_long else 0  # few are all printed
         rows = [row for row in grid.rows if not num or row[0] not in grid.unused]
         yield from table(grid.header, rows) if rows else () if num else [f"no {grid.name}"]
         yield from [f"and {num} {grid.name} that no command reads; -v prints them"] if num else ()

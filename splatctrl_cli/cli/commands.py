@@ -10,7 +10,7 @@ from pathlib import Path
 
 from splatctrl_cli import __version__
 from splatctrl_cli.cli import run_options, scene_options
-from splatctrl_cli.cli.options import (
+from splatctrl_cli.cli.common import (
     BASE,
     COMMON,
     GATES,
@@ -95,7 +95,6 @@ _CONFIG = (
     option("--template", "print a file to begin with: every default, commented out, with its meaning and range"),
     option("--schema", "print the JSON Schema of what every command prints with --json"),
 )
-_COMPLETION = (option("SHELL", "whose script", SHELLS),)
 _DEMO = (
     option("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data; without it, simulated first)", Path),
     *output("folder for everything the demo makes", default="demo_output"),
@@ -133,7 +132,6 @@ _ROBOT_SPHERES = (
     seed("the greedy covers"),
     *_ROBOT_JUDGED,
 )
-_ROBOT_CHECK = (*_ROBOT, *_ROBOT_JUDGED)
 _ROBOT_PAIRS = (
     *_ROBOT,
     LOCK,
@@ -152,7 +150,6 @@ _ROBOT_LEARN = (
     group("robot", BASE, LOCK),
     *OF_FOLDERS,
 )
-_ROBOT_INFO = (*_robot("none, or those of the URDF"), LOCK)
 
 
 COMMANDS = {
@@ -193,7 +190,7 @@ COMMANDS = {
             f"reconstruct out/x.capture --cameras cam0,cam1 {ROBOT} -o out/scene",
             "reconstruct --dtu sample_data/dtu --protocol holdout:2,5 -o out/scan",
         ),
-        run="reconstruct:run",
+        run="scene:run_reconstruct",
         judges=True,
         options=scene_options.RECONSTRUCT,
     ),
@@ -203,7 +200,7 @@ COMMANDS = {
             "export out/scene --labels object -o out/scene.spz",
             "export out/audit --mcap",
         ),
-        run="export:run",
+        run="export:run_export",
         options=scene_options.EXPORT,
     ),
     "sdf-bake": Command(
@@ -212,7 +209,7 @@ COMMANDS = {
             f"sdf-bake out/scene {ROBOT} -o out/field",
             "sdf-bake out/scene --box=-1,-1,0,1,1,1 --voxel 0.02 --formats npz,nrrd -o out/grid",
         ),
-        run="sdf_bake:run",
+        run="scene:run_bake",
         judges=True,
         options=scene_options.SDF_BAKE,
     ),
@@ -222,7 +219,7 @@ COMMANDS = {
             "query out/scene points.csv -o out/near.csv",
             "query out/field points.csv --scene out/scene",
         ),
-        run="query:run",
+        run="export:run_query",
         options=scene_options.QUERY,
     ),
     "score": Command(
@@ -258,26 +255,26 @@ COMMANDS = {
             "sweep out/audit --over margin=0.02:0.08 -o out/margin",
             "sweep out/audit --over latency=0:1 --over depth-noise=0:0.02 -o out/both",
         ),
-        run="sweep:run",
+        run="runs:run_sweep",
         options=run_options.SWEEP,
     ),
     "compare": Command(
         summary="say what got worse between two runs, two batches, or since a stored baseline",
         examples=("compare out/old out/new", "compare out/new --against baseline.toml"),
-        run="compare:run",
+        run="runs:run_compare",
         judges=True,
         options=run_options.COMPARE,
     ),
     "report": Command(
         summary="write one HTML file on a run or a batch, with scenes in 3-D",
         examples=("report out/audit", "report out/batch --against baseline.toml -o report.html"),
-        run="report:run",
+        run="runs:run_report",
         options=run_options.REPORT,
     ),
     "view": Command(
         summary="show a replay, scene, field or splats in 3-D in a browser",
         examples=("view out/audit", "view out/scene --no-open -o scene.html"),
-        run="report:run_view",
+        run="runs:run_view",
         options=run_options.VIEW,
     ),
     "robot": Command(
@@ -294,7 +291,7 @@ COMMANDS = {
                 summary="measure how much of the collision surface a set of spheres covers",
                 run="robot:run_check",
                 judges=True,
-                options=_ROBOT_CHECK,
+                options=(*_ROBOT, *_ROBOT_JUDGED),
             ),
             "pairs": Command(
                 summary="list which links may collide with each other, and why others may not",
@@ -309,7 +306,7 @@ COMMANDS = {
             "info": Command(
                 summary="show joints with limits, links, shapes and spheres",
                 run="robot:run_info",
-                options=_ROBOT_INFO,
+                options=(*_robot("none, or those of the URDF"), LOCK),
             ),
         },
     ),
@@ -323,7 +320,7 @@ COMMANDS = {
         summary="print a script by which a shell completes commands, options and files",
         examples=("completion bash", "completion zsh"),
         run="config:run_completion",
-        options=_COMPLETION,
+        options=(option("SHELL", "whose script", SHELLS),),
     ),
     "help": Command(
         summary="print a page of the documentation, or their list",

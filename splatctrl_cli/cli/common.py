@@ -1,17 +1,278 @@
-"""Output of subcommands: tables and JSON on stdout, log lines on stderr."""
+"""Options and output of several subcommands; imports nothing heavy, for quick help."""
 
 import argparse
 import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
 
-from splatctrl_cli.cli.options import names_of
+from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several, whole
 from splatctrl_cli.cli.reports import enveloped, reports_of
-from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.config import PRESETS
+from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, shown
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.verdict import Verdict, gate
 from splatctrl_cli.files.output import plain
-from splatctrl_cli.records import Label
+from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, PoseTopic, SourceOptions
+
+T = TypeVar("T")
+
+POSE = "X,Y,Z,QX,QY,QZ,QW"
+BOX = "X0,Y0,Z0,X1,Y1,Z1"
+SEVERAL_LOGS = "several logs of one session are read as one"
+
+
+def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
+    """Build a request from `given` fields, else equally named options, else defaults."""
+    names = {field.name for field in fields(kind)} - given.keys()  # type: ignore[arg-type]
+    parsed = {name: value for name, value in vars(args).items() if name in names and value is not None}
+    return kind(**given, **{name: tuple(v) if isinstance(v, list) else v for name, v in parsed.items()})
+
+
+def source_options(args: argparse.Namespace) -> SourceOptions:
+    """Read the options that `SOURCE` declares. Raises UsageError for a value of the wrong form."""
+    return request_of(
+        SourceOptions,
+        args,
+        cameras=_names(args.cameras),
+        camera_topics=tuple(_topics(text) for text in args.camera),
+        camera_poses=dict(_pose(text) for text in args.camera_pose if not _is_topic(text)),
+        camera_pose_topics=dict(_pose_topic(text) for text in args.camera_pose if _is_topic(text)),
+        human_topics=dict(_human_topic(text) for text in args.human_topic),
+        intrinsics=dict(_intrinsics(text) for text in args.intrinsics),
+        pairing_tolerance_s=args.pairing_tolerance,
+        holdout=_names(args.holdout),
+        perturb=dict(_number_of("--perturb", text) for text in args.perturb),
+    )
+
+
+def locked_joints(args: argparse.Namespace) -> dict[str, float]:
+    """Values of ``--lock JOINT=VALUE``. Raises UsageError for other values."""
+    return dict(_number_of("--lock", text, "JOINT") for text in args.lock)
+
+
+def _number_of(option: str, assignment: str, what: str = "NAME") -> tuple[str, float]:
+    name, _, text = assignment.partition("=")
+    value = several(text)
+    if len(value) != 1:
+        raise UsageError(f"{option} {assignment}: expected {what}=VALUE, got {text!r} for the value")
+    return name, value[0]
+
+
+def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: str) -> tuple[str, ...]:
+    """Names in a comma list. Raises UsageError for an unknown name or none."""
+    names = tuple(dict.fromkeys(_names(text) or ()))
+    unknown = [name for name in names if name not in choices]
+    if unknown or not names:
+        raise UsageError(f"{option} {text}: expected some of: {', '.join(choices)}")
+    return names
+
+
+def pose(text: str) -> tuple[float, ...]:
+    """Parse a pose as POSE, for argparse."""
+    try:
+        return checked_pose(numbers(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _device(text: str) -> str:
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
+        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {shown(text)}")
+    return text
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """Finite numbers joined by commas, for argparse."""
+    values = several(text)
+    if not values:
+        raise argparse.ArgumentTypeError(f"expected finite numbers joined by commas, up to 1e6, got {shown(text)}")
+    return values
+
+
+def _listed(name: str, text: str) -> str:
+    """Strip a comma list, for argparse. Raises UsageError if empty."""
+    names = _names(text)
+    if not names:
+        raise UsageError(f"{name} {text!r}: expected names, got none", remedy="leave the option out")
+    return ",".join(names)
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _topics(text: str) -> CameraTopics:
+    name, equals, rest = text.partition("=")
+    topics = rest.split(",")
+    if not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)):
+        raise UsageError(f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO")
+    return CameraTopics(name=name, color=topics[0], depth=topics[1], info=topics[2] if len(topics) == 3 else "")
+
+
+def _human_topic(text: str) -> tuple[str, str]:
+    name, _, topic = text.partition("=")
+    if not name or not topic:
+        raise UsageError(f"--human-topic {text}: expected NAME=TOPIC")
+    return name, topic
+
+
+def _pose(text: str) -> tuple[str, tuple[float, ...]]:
+    name, _, rest = text.partition("=")
+    if name and rest == "identity":
+        return name, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    values = several(rest)
+    if not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
+        raise UsageError(f"--camera-pose {text}: expected NAME={POSE} with a unit quaternion, or NAME=identity")
+    return name, values
+
+
+def _is_topic(text: str) -> bool:
+    return text.partition("=")[2].startswith("/")
+
+
+def _pose_topic(text: str) -> tuple[str, PoseTopic]:
+    name, _, rest = text.partition("=")
+    topic, at, frame = rest.partition("@")
+    if not name or not topic or bool(at) != bool(frame):
+        raise UsageError(f"--camera-pose {text}: expected NAME=TOPIC or NAME=TOPIC@FRAME")
+    return name, PoseTopic(topic=topic, frame=frame.strip("/"))
+
+
+def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
+    name, _, rest = text.partition("=")
+    values = several(rest)
+    if not name or len(values) - 4 not in (0, *NUM_COEFFICIENTS) or not min(values[:2]) > 0:
+        counts = ", ".join(map(str, NUM_COEFFICIENTS))
+        raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels, then 0, {counts} coefficients")
+    return name, values
+
+
+def _preset(text: str) -> str:
+    if text not in PRESETS:
+        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {shown(text)}")
+    return f"preset={text}"
+
+
+def output(what: str, *, default: str) -> tuple[Adds, ...]:
+    """``-o/--out`` and ``--force``."""
+    return (
+        option("-o/--out PATH", f"{what} (default: {default})", Path),
+        option("--force", "replace the output if it exists"),
+    )
+
+
+def settings(example: str = "") -> tuple[Adds, ...]:
+    """``--set`` and ``--preset``, the first of the settings."""
+    paper = "paper: as printed (splatctrl help paper has our departures)"
+    return (
+        option("--set SECTION.KEY=VALUE ...", f"one setting{example}"),
+        option("--preset NAME", paper, _preset, dest="set", action="append"),
+    )
+
+
+def seed(what: str) -> Adds:
+    return option("--seed SEED", f"seed of {what}", whole(0, MAX_SEED), 0)
+
+
+COMMON = (  # which every command has
+    option("--json", "print one JSON object instead of a table"),
+    of_run(
+        option("-v/--verbose", "say more; show tracebacks", action="count", default=0),
+        option("-q/--quiet", "no progress, no log lines"),
+    ),
+)
+JUNIT = (  # which every command that judges has
+    option("--junit FILE", "write the verdict for CI as JUnit XML, a case for each criterion", Path),
+)
+THREADS = of_run(
+    option("--threads THREADS", "threads, at most 16 or one per core (default: one per core)", whole(0, 1024))
+)
+CONFIG_FILE = option("--config FILE.toml", "configuration, see splatctrl help config", Path)
+CONFIG = (CONFIG_FILE, *settings(), of_run(seed("everything random")), THREADS)
+DEVICE = of_run(
+    option(
+        "--device NAME",
+        "where to compute: auto, cpu, cuda or cuda:N; auto takes a card that is worth its start (splatctrl help gpu)",
+        _device,
+        "auto",
+    )
+)
+GATES = option("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
+HOLDOUT = option(
+    "--holdout 0,6", "keep frames of an image folder for judging, as camera holdout", partial(_listed, "--holdout")
+)
+SOURCE = (  # the options of a source, all but --cameras in a group of their own
+    option("--cameras A,B", "only these cameras", partial(_listed, "--cameras")),
+    group(
+        "input",
+        option("--camera NAME=COLOR,DEPTH[,INFO] ...", "topics of a camera, instead of those found"),
+        option(
+            f"--camera-pose NAME={POSE} ...",
+            "pose of a fixed camera in the world; or NAME=identity; or NAME=TOPIC[@FRAME], a topic of its poses, or"
+            " of FRAME's",
+        ),
+        option(
+            "--intrinsics NAME=FX,FY,CX,CY[,K1,K2,P1,P2...] ...",
+            "of a camera [px], and its distortion where it has one, instead of the recorded ones",
+        ),
+        option(
+            "--human-topic NAME=TOPIC ...", "mono8 masks of a camera's colour images, not 0 where they show a person"
+        ),
+        option("--world-frame FRAME", "tf frame of poses (default: root of the tf tree)"),
+        option("--depth-scale M", "metres per count of depth (default: 0.001)", real(1e-9, 1e3, "m")),
+        option("--pairing-tolerance S", "colour to depth, seconds", real(0, 3600, "s"), 0.02),
+        option("--calibration FILE.toml", "what calibrate wrote: poses, depths and clock of this recording", Path),
+        option(
+            "--perturb NAME=VALUE ...",
+            "read frames with errors: depth-noise (m at 1 m), pose-error (m), pose-turn (degrees); seed of these",
+        ),
+        option("--stamps", "a log's times: those of the headers, or of logging", ("header", "log"), "header"),
+        option("--joint-topic TOPIC", "JointState topic (default: /joint_states)"),
+        option("--root DIR", "folder of the images that a .toml describes", Path),
+    ),
+)
+OF_FOLDERS = (SOURCE[0], HOLDOUT, SOURCE[1])  # likewise, of commands that read image folders
+SCAN = (  # the options of a DTU scan
+    option("--scan NAME", "which scan of --dtu (default: the only one)"),
+    option(
+        "--protocol NAME",
+        "which views train and which are scored: dtu-train, dtu-holdout8, regnerf-3, regnerf-6, regnerf-9, mvsnerf,"
+        " holdout:everyN, holdout:everyN+FIRST or holdout:2,5 (splatctrl help score)",
+    ),
+    option("--depths DIR", "depth_map_0000.pfm and so on of a scan in IDR's layout", Path),
+    option(
+        "--downscale N",
+        "make images of --dtu N times smaller (default: as the protocol has them, if N is whole)",
+        whole(1, 64),
+    ),
+)
+DISAGREEMENT = (  # by how much a log may contradict itself
+    option(
+        "--max-pose-jump M",
+        "how far a camera may move between frames less than a second apart",
+        real(1e-3, MAX_PLACE, "m"),
+        POSE_JUMP,
+    ),
+    option("--allow-disagreement", "continue although cameras disagree about surfaces"),
+)
+DECLARE = option("--declare FILE.toml", "what the robot carries, contact meant (splatctrl help declare)", Path)
+PACKAGES = option(
+    "--packages DIR ...", "where package:// paths of the URDF are found (default: the folders above it)", Path
+)
+SELF_MODEL = option(
+    "--self-model FILE.npz",
+    "self-model of 'robot learn' (none: learn and apply nothing)",
+    Path,
+)
+LOCK = option("--lock JOINT=VALUE ...", "hold a joint, and what mimics it, at a value [rad or m]")
+BASE = option(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
+
 
 _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
@@ -97,11 +358,8 @@ def long_table(header: Sequence[str], rows: Callable[[], Iterable[Sequence[objec
     yield from map(line, rows())
 
 
-def shown(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
-def labels_of(text: str) -> frozenset[Label]:
-    """Labels in a field: objects and those of ``--include``. Raises UsageError for others."""
-    names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
-    return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})
+def format_cell(value: object, form: str = ".4g") -> str:
+    """A value in a table: floats by `form`, a dash for nothing."""
+    if value is None or value == "":
+        return "-"
+    return format(value, form) if isinstance(value, float) else str(value)

@@ -10,11 +10,9 @@ from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import SCHEMA_FILE
+from splatctrl_cli.config.load import resolved_settings, template_of, toml_of
 from splatctrl_cli.config.ranges import shown
 from splatctrl_cli.errors import UsageError, did_you_mean
-from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
-
-ROOTS = (Path(__file__).parents[1], Path(__file__).parents[2])  # of docs/: of a wheel, of the repository
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,7 +33,8 @@ def run_completion(args: argparse.Namespace) -> int:
 
 
 def run_help(args: argparse.Namespace) -> int:
-    folder = next(place / "docs" for place in ROOTS if (place / "docs" / "README.md").is_file())
+    roots = Path(__file__).parents[1:3]  # of a wheel, of the repository
+    folder = next(place / "docs" for place in roots if (place / "docs" / "README.md").is_file())
     names = sorted(page.stem for page in folder.glob("*.md"))
     topic = args.topic or "README"
     if topic not in names:

@@ -25,7 +25,6 @@ INTERRUPTED = 130  # exit code
 RESUME = "--resume"  # the option of what can be gone on with
 MAX_PIXELS = 1 << 27  # of an image file: twice the largest cameras; a small file can announce a thousand million
 
-_BY_THE_SHELL = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/")  # as in --config <(...)
 _WRITES = os.O_WRONLY | os.O_RDWR
 _NEVER_END = {"FIFO": stat.S_ISFIFO, "socket": stat.S_ISSOCK, "device": stat.S_ISCHR, "disk": stat.S_ISBLK}
 
@@ -184,7 +183,7 @@ def _look(event: str, arguments: tuple[object, ...]) -> None:
     if not isinstance(path, str | bytes) or (isinstance(flags, int) and flags & _WRITES):
         return
     name = os.fsdecode(path)
-    if name.startswith(_BY_THE_SHELL) or name == os.devnull:
+    if name.startswith(("/dev/stdin", "/dev/fd/", "/proc/self/fd/")) or name == os.devnull:  # as in --config <(...)
         return
     try:
         mode = os.stat(name).st_mode  # noqa: PTH116  (also called while Path itself is imported)

@@ -14,7 +14,6 @@ from splatctrl_cli.errors import UsageError
 T = TypeVar("T", int, float)
 
 MAX_SECONDS = 1e8  # [s] of a recording: three years
-MOST_WIDTH = 100  # columns of help
 GONE = {  # removed commands and options, with replacements
     "capture": "`tar -cf X.tar X.capture` for one file, `splatctrl export REPLAY --mcap` for a viewer",
     "splatctrl reconstruct --method": "python -m experiments fits",
@@ -195,7 +194,7 @@ class _HelpAll(argparse.Action):
 
 class _Formatter(argparse.HelpFormatter):
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=28, width=min(shutil.get_terminal_size().columns - 2, MOST_WIDTH))
+        super().__init__(prog, max_help_position=28, width=min(shutil.get_terminal_size().columns - 2, 100))
 
     def _format_action_invocation(self, action: argparse.Action) -> str:
         return invocation(action)

@@ -4,8 +4,15 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from splatctrl_cli.cli.common import Console, long_table, table
-from splatctrl_cli.cli.options import locked_joints, request_of, source_options
+from splatctrl_cli.cli.common import (
+    Console,
+    format_cell,
+    locked_joints,
+    long_table,
+    request_of,
+    source_options,
+    table,
+)
 from splatctrl_cli.config import load_config
 from splatctrl_cli.jobs.replay.files import chunks_of, when_and_why
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
@@ -43,7 +50,7 @@ def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator
     replay, metrics = result.replay, result.metrics
     shown = metrics if is_long else {name: metrics[name] for name in HEADLINE if metrics.get(name) is not None}
     lines = when_and_why(replay)
-    lines += ["", *table(("replay", "value"), [(name, _shown(value)) for name, value in shown.items()])]
+    lines += ["", *table(("replay", "value"), [(name, format_cell(value)) for name, value in shown.items()])]
     yield from lines
     yield from result.notes
     if not is_long:
@@ -60,12 +67,6 @@ def _step_lines(replay: Replay) -> Iterator[str]:
     def rows() -> Iterator[list[str]]:
         for chunk in chunks_of(replay):
             shown = [values for name, values in chunk.items() if is_shown(name)]
-            yield from ([_shown(value) for value in row] for row in zip(*shown, strict=True))
+            yield from ([format_cell(value) for value in row] for row in zip(*shown, strict=True))
 
     return long_table([name for name in next(chunks_of(replay)) if is_shown(name)], rows)
-
-
-def _shown(value: object) -> str:
-    if value is None or value == "":
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -11,7 +11,7 @@ from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.report.junit import Case, Suite, cases_of, error_case, notes_of, tell_github, write_junit
+from splatctrl_cli.report.junit import Suite, cases_of, error_case, notes_of, tell_github, write_junit
 
 RECORDINGS = ("log", "source", "reference", "dtu", "scene", "data", "output", "urdf")  # logs before maps
 JUNIT = "--junit"
@@ -34,26 +34,20 @@ class Reports:
     junit: Path | None
     start: float
 
-    def conclude(self, verdict: Mapping[str, Any], code: int) -> None:
-        """Report a verdict. Raises UsageError or WriteError if the file is unwritable."""
-        self._write(cases_of(verdict, self._group), notes_of(verdict), code, {"label": verdict["label"]})
+    def conclude(self, verdict: Mapping[str, Any] | None, code: int, line: str = "") -> None:
+        """Report a verdict, or a command without one by its error line.
 
-    def fail(self, line: str, code: int) -> None:
-        """Report a command without a verdict by its error line."""
-        self._write([error_case(self._group, line, exit_code=code)], (), code, {})
-
-    @property
-    def _group(self) -> str:
-        return f"{self.path}/{self.command}" if self.path else self.command
-
-    def _write(self, cases: Sequence[Case], notes: Sequence[str], code: int, more: Mapping[str, str]) -> None:
+        Raises UsageError or WriteError if the file is unwritable.
+        """
         seconds = time.perf_counter() - self.start
+        group = f"{self.path}/{self.command}" if self.path else self.command
+        properties = {"splatctrl": __version__, "command": self.command, "exit code": str(code)}
         suite = Suite(
             name=self.path or self.command,
             path=self.path,
-            cases=cases,
-            notes=notes,
-            properties={"splatctrl": __version__, "command": self.command, "exit code": str(code), **more},
+            cases=[error_case(group, line, exit_code=code)] if verdict is None else cases_of(verdict, group),
+            notes=() if verdict is None else notes_of(verdict),
+            properties=properties | ({} if verdict is None else {"label": verdict["label"]}),
             started=(datetime.now(UTC) - timedelta(seconds=seconds)).isoformat(timespec="seconds"),
             seconds=seconds,
         )
@@ -87,7 +81,7 @@ def tell_of_failure(
     """
     unparsed = Reports(command=words[0], path="", junit=_junit_in(words), start=start)
     try:
-        (unparsed if args is None else reports_of(args)).fail(line, code)
+        (unparsed if args is None else reports_of(args)).conclude(None, code, line)
     except (SplatCtrlError, OSError) as error:
         if str(error) != line:
             print(f"splatctrl: {' '.join(str(error).split())}", file=sys.stderr)

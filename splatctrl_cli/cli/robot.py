@@ -4,11 +4,10 @@ import argparse
 import math
 from collections.abc import Iterator
 
-from splatctrl_cli.cli.common import Console, table
-from splatctrl_cli.cli.options import locked_joints, request_of, source_options
+from splatctrl_cli.cli.common import Console, locked_joints, request_of, source_options, table
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.files.output import finite
-from splatctrl_cli.jobs.reconstruct.self_model import LearnRequest, learn_robot
+from splatctrl_cli.jobs.reconstruct.reconstruct import LearnRequest, learn_robot
 from splatctrl_cli.jobs.robot.robot import (
     CoverageResult,
     PairsResult,

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from splatctrl_cli.cli.options import BASE, LOCK, OF_FOLDERS, PACKAGES, SEVERAL_LOGS, numbers, output, seed
+from splatctrl_cli.cli.common import BASE, LOCK, OF_FOLDERS, PACKAGES, SEVERAL_LOGS, numbers, output, seed
 from splatctrl_cli.cli.parser import group, option, real, whole
 
 ROOT = "folder in which the scene and robot of a replay's command line are looked for, if they were moved"

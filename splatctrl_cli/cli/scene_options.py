@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from splatctrl_cli.cli.options import (
+from splatctrl_cli.cli.common import (
     BOX,
     CONFIG,
     CONFIG_FILE,
@@ -222,7 +222,6 @@ SCORE = (
 
 
 MODES = ("audit", "open-loop", "closed-loop")
-UNSEEN_IS = ("judge", "occupied")
 STEP_LIMIT = 10.0  # [s]
 
 
@@ -312,7 +311,7 @@ REPLAY = (  # what people use, and in groups the rest
         option(
             "--unseen",
             "space near the arm not seen free: judge it (splatctrl help verdict), or take it for an obstacle",
-            UNSEEN_IS,
+            ("judge", "occupied"),
             "judge",
         ),
         option("--require-proof", "not evaluable (exit 5) if space near the arm was assumed to be free"),

@@ -5,9 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from splatctrl_cli.cli.common import Console, table
-from splatctrl_cli.cli.options import request_of
-from splatctrl_cli.cli.reconstruct import recording_of
+from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.cli.scene import recording_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.score_report import PREFIX
 from splatctrl_cli.evaluate.verdict import counted
@@ -32,7 +31,6 @@ COLUMNS = {
     "valid_share": "valid",
     "chamfer": "Chamfer mm",
 }
-SHARES = ("seen_share", "in_front_seen", "mask_share", "valid_share")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -165,6 +163,6 @@ def _cell(name: str, value: float | None) -> str:
         return f"{1000 * value:.1f}"
     if name == "chamfer":
         return f"{1000 * value:.2f}"
-    if name in SHARES:
+    if name in ("seen_share", "in_front_seen", "mask_share", "valid_share"):
         return f"{100 * value:.1f}%"
     return f"{value:.2f}" if name.startswith("psnr") else f"{value:.4f}"

@@ -1,6 +1,6 @@
 """Numbers of the method by section of the paper. The paper's value is the default where it gives one."""
 
-from splatctrl_cli.config.load import PRESETS, Config, check_voxel, load_config, sources_of
+from splatctrl_cli.config.load import PRESETS, Config, check_voxel, load_config
 from splatctrl_cli.config.sections import (
     ControlConfig,
     FieldConfig,
@@ -23,5 +23,4 @@ __all__ = [
     "VerdictConfig",
     "check_voxel",
     "load_config",
-    "sources_of",
 ]

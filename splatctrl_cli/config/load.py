@@ -1,7 +1,8 @@
-"""The whole configuration: defaults, a TOML file, single assignments."""
+"""The whole configuration: defaults, a TOML file, single assignments; every key with value and source."""
 
 import copy
 import dataclasses
+import json
 import math
 import tomllib
 import types
@@ -11,7 +12,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
-from splatctrl_cli.config.ranges import Section, Within, check, cut, shown
+from splatctrl_cli.config.ranges import Declared, Section, Within, check, cut, shown
 from splatctrl_cli.config.sections import (
     ControlConfig,
     FieldConfig,
@@ -98,15 +99,6 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
         given.setdefault(section, {}).update(_typed(where, section, values))
     default = Config()
     return replace(default, **{name: replace(getattr(default, name), **values) for name, values in given.items()})
-
-
-def sources_of(path: Path | None, assignments: Sequence[str]) -> dict[str, str]:
-    """Source (preset, file or ``--set``) of each given ``section.key``. Raises as `load_config`."""
-    return {
-        f"{section}.{key}": "--set" if where.startswith("--set ") else where
-        for where, section, values in _tables(path, assignments)
-        for key in values
-    }
 
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -199,3 +191,88 @@ def _of_type(value: Any, hint: Any) -> Any:
     if float in options and type(value) is int and abs(value) < 1 << 1023:  # what a float holds
         return float(value)
     return value
+
+
+DEFAULT = "default"
+
+Value = int | float | str | tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """A key with its value; source: `DEFAULT`, preset, file name, or ``--set``."""
+
+    section: str
+    key: str
+    value: Value
+    default: Value
+    source: str
+    declared: Declared
+
+    @property
+    def name(self) -> str:
+        return f"{self.section}.{self.key}"
+
+    def as_dict(self) -> dict[str, object]:
+        return {
+            "value": self.value,
+            "default": self.default,
+            "source": self.source,
+            "expected": self.declared.expected,
+            "meaning": self.declared.reason,
+        }
+
+
+def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Setting, ...]:
+    """All keys after defaults, preset, file and assignments. Raises as `load_config`."""
+    used, default = load_config(path, assignments), Config()
+    sources = {
+        f"{section}.{key}": "--set" if where.startswith("--set ") else where
+        for where, section, values in _tables(path, assignments)
+        for key in values
+    }
+    settings = []
+    for section in fields(Config):
+        kind = getattr(default, section.name)
+        for key, declared in kind.declared.items():
+            settings.append(
+                Setting(
+                    section=section.name,
+                    key=key,
+                    value=getattr(getattr(used, section.name), key),
+                    default=getattr(kind, key),
+                    source=sources.get(f"{section.name}.{key}", DEFAULT),
+                    declared=declared,
+                )
+            )
+    return tuple(settings)
+
+
+def toml_of(settings: Sequence[Setting]) -> Iterator[str]:
+    """TOML lines of every key; changed ones with source and default."""
+    for section, setting in _with_sections(settings):
+        yield from section
+        changed = f"  # {setting.source} (default: {toml_value(setting.default)})"
+        yield f"{setting.key} = {toml_value(setting.value)}" + ("" if setting.source == DEFAULT else changed)
+
+
+def template_of(settings: Sequence[Setting]) -> Iterator[str]:
+    """TOML lines of every default as a comment, with meaning and range."""
+    for section, setting in _with_sections(settings):
+        yield from section
+        yield f"# {setting.declared.reason}; {setting.declared.expected}"
+        yield f"# {setting.key} = {toml_value(setting.default)}"
+
+
+def toml_value(value: Value) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(repr, value))}]"
+    return json.dumps(value) if isinstance(value, str) else repr(value)
+
+
+def _with_sections(settings: Sequence[Setting]) -> Iterator[tuple[list[str], Setting]]:
+    before = ""
+    for setting in settings:
+        blank = [""] if before else []
+        yield ([*blank, f"[{setting.section}]"] if setting.section != before else []), setting
+        before = setting.section

@@ -1,7 +1,9 @@
 """Ranges of configuration keys, declared with their defaults; checks and docs follow."""
 
 import copy
+import math
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -9,6 +11,7 @@ from splatctrl_cli.errors import UsageError
 
 MOST_SHOWN = 60  # characters of a refused value
 MAX_PLACE = 1e6  # [m] of a place from the world's origin
+POSE = "x,y,z,qx,qy,qz,qw"
 MAX_SEED = 2**31 - 1  # fits every 32-bit integer, signed or not
 
 
@@ -64,6 +67,7 @@ class Section:
 
     section: ClassVar[str]
     declared: ClassVar[dict[str, Declared]]
+    ordered: ClassVar[tuple[tuple[str, str], ...]] = ()  # pairs of keys, of which the first is at most the second
 
     def __init_subclass__(cls, *, section: str) -> None:
         """Raises TypeError for a key without a range."""
@@ -81,6 +85,10 @@ class Section:
         for key, declared in self.declared.items():
             value = getattr(self, key)
             check(declared.holds(value), f"{self.section}.{key}", declared.expected, value)
+        for low, high in self.ordered:
+            least, most = getattr(self, low), getattr(self, high)
+            expected = f"at most {self.section}.{high} = {most:g} {self.declared[high].unit}".rstrip()
+            check(least <= most, f"{self.section}.{low}", expected, least)
 
 
 def _declared(hint: Any) -> Declared:
@@ -108,3 +116,15 @@ def shown(value: object) -> str:
 def cut(text: str) -> str:
     """A long text's beginning."""
     return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
+
+
+def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
+    """Return the pose `POSE` unchanged. Raises ValueError for a wrong length or quaternion norm."""
+    if len(values) != 7:
+        raise ValueError(f"expected 7 numbers {POSE}, got {len(values)}")
+    if not all(math.isfinite(value) for value in values):
+        raise ValueError(f"expected finite numbers, got {','.join(map(str, values))}")
+    length = math.hypot(*values[3:])
+    if abs(length - 1.0) > 0.01:
+        raise ValueError(f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}")
+    return tuple(values)

@@ -126,12 +126,7 @@ class SceneConfig(Section, section="scene"):
         ),
     ] = 10.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        low, high = self.min_radius, self.max_radius
-        check(low <= high, "scene.min_radius", f"at most scene.max_radius = {high:g} m", low)
-        low, high = self.min_depth_error, self.max_depth_error
-        check(low <= high, "scene.min_depth_error", f"at most scene.max_depth_error = {high:g} m", low)
+    ordered = (("min_radius", "max_radius"), ("min_depth_error", "max_depth_error"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,10 +159,10 @@ class OccupancyConfig(Section, section="occupancy"):
         float, Within(0, 0.1, "m", "sigma of depth at 1 m, growing with its square: 0.05 px of a D435's disparity")
     ] = 0.0015
 
+    ordered = (("free_below", "occupied_above"),)
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = self.free_below, self.occupied_above
-        check(low <= high, "occupancy.free_below", f"at most occupancy.occupied_above = {high:g}", low)
         low, high = self.min_range, self.max_range
         check(low < high, "occupancy.max_range", f"above occupancy.min_range = {low:g} m", high)
         needed = max(math.log(p / (1 - p)) for p in (self.occupied_above, 1 - self.free_below))
@@ -331,10 +326,7 @@ class PlannerConfig(Section, section="planner"):
         float, Within(0, 0.1, "rad", "a start or goal this far outside a joint limit is taken for encoder noise")
     ] = 1e-3
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        low, high = self.shortest, self.reach
-        check(low <= high, "planner.shortest", f"at most planner.reach = {high:g} rad", low)
+    ordered = (("shortest", "reach"),)
 
 
 @dataclass(frozen=True, kw_only=True)

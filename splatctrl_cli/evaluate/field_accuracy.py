@@ -84,7 +84,7 @@ class FieldAccuracy:
         return {**asdict(self), "holds": self.over_estimate.holds}
 
     def figures(self) -> dict[str, float | None]:
-        """The numbers by their `metric_names`."""
+        """The numbers by the names of `metric_scales`."""
         found = {
             f"{where}.{name}.{band_name(band.lower, band.upper)}.{figure}": value
             for where, fields_ in (("everywhere", self.everywhere), ("seen", self.seen))
@@ -96,13 +96,9 @@ class FieldAccuracy:
         return found | {f"over_estimate.{name}": value for name, value in vars(self.over_estimate).items()}
 
 
-def metric_names(field_names: Sequence[str]) -> tuple[str, ...]:
-    """Flat names of the numbers: ``seen.hard.0_2cm.rmse``, ``over_estimate.count``."""
-    return tuple(metric_scales(field_names, [band_name(lower, upper) for lower, upper in BANDS]))
-
-
-def metric_scales(field_names: Sequence[str], bands: Sequence[str]) -> dict[str, Scale]:
-    """Scales of `metric_names` for comparing runs."""
+def metric_scales(field_names: Sequence[str]) -> dict[str, Scale]:
+    """Scales of the numbers for comparing runs, by flat name: ``seen.hard.0_2cm.rmse``, ``over_estimate.count``."""
+    bands = [band_name(lower, upper) for lower, upper in BANDS]
     places = [f"{where}.{name}.{band}" for where in ("everywhere", "seen") for name in field_names for band in bands]
     over = {f"over_estimate.{name}": scale for name, scale in OVER_SCALES.items()}
     return {f"{place}.{figure}": scale for place in places for figure, scale in BAND_SCALES.items()} | over

@@ -33,14 +33,6 @@ from splatctrl_cli.geometry import back_project, face_normals, transform_points
 from splatctrl_cli.kernels.field import interpolate
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, RgbdFrame
 
-MAX_POINTS = 2_000_000  # on a mesh
-MAX_SPACED = 6_000_000
-NO_PAIRS = np.empty((0, 2), np.int64)
-OTHER_UNITS = (1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
-
-
-SURFACE_ERROR = Scale(unit="m", better=Better.LOWER, absolute=2e-4, relative=0.02)
-
 
 def cloud_score(
     points: Float64,
@@ -93,7 +85,8 @@ def cloud_score(
 
 def _check_unit(points: Float64, reference: Float64, margin: float, unit: float) -> None:
     some, others = (p[:: max(1, len(p) // 20_000)] for p in (points, reference))
-    fits = {factor: _overlap(some, factor * others, margin) for factor in (1.0, *OTHER_UNITS)}
+    factors = (1.0, 1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
+    fits = {factor: _overlap(some, factor * others, margin) for factor in factors}
     best = max(fits, key=lambda factor: fits[factor])
     if fits[1.0] < CLOUD_NO_OVERLAP and fits[best] > CLOUD_GOOD_OVERLAP:
         raise NotEvaluableError(
@@ -113,7 +106,10 @@ def _overlap(points: Float64, others: Float64, margin: float) -> float:
 
 
 CLOUD_SCALES = {  # by the names of `cloud_score`
-    **dict.fromkeys(("accuracy", "completeness", "completeness_seen", "chamfer"), SURFACE_ERROR),
+    **dict.fromkeys(
+        ("accuracy", "completeness", "completeness_seen", "chamfer"),
+        Scale(unit="m", better=Better.LOWER, absolute=2e-4, relative=0.02),
+    ),
     **dict.fromkeys(("accuracy_beyond", "completeness_beyond", "completeness_seen_beyond"), BAD_SHARE),
     **dict.fromkeys(("num_points", "num_reference"), DESCRIBES),
 }
@@ -128,10 +124,12 @@ def spaced(points: Float64, spacing: float) -> Float64:
     """
     _check_spacing(spacing)
     some = thinned(points, spacing / 2)
-    if len(some) > MAX_SPACED:
+    if len(some) > 6_000_000:
         some = thinned(points, spacing)
     some = some[np.random.default_rng(0).permutation(len(some))]
-    low, high = (cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else NO_PAIRS).T
+    low, high = (
+        cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else np.empty((0, 2), np.int64)
+    ).T
     is_open, kept = np.ones(len(some), np.bool_), np.zeros(len(some), np.bool_)
     while is_open.any():  # points without an earlier open neighbour stay, their neighbours go: as if in turn
         first = is_open.copy()
@@ -166,7 +164,7 @@ def _check_spacing(spacing: float) -> None:
 
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
     """Random points (P, 3) [m] by area, four per squared `spacing`, at most 2 million."""
-    num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), MAX_POINTS)
+    num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), 2_000_000)
     return drawn_on(mesh, num, np.random.default_rng(0))[0]
 
 
@@ -199,7 +197,6 @@ def _box(points: Float64) -> str:
     return f"{corner(points.min(axis=0))} to {corner(points.max(axis=0))}"
 
 
-REFERENCE = "nearest measured depth point"
 REACH = fixed.BANDS[-1][1]  # [m] before the surface that points are put on a ray
 
 
@@ -271,7 +268,7 @@ def compare_with_held_out_depth(
             field_accuracy(values, reference, _ball_is_free(points, reference, frames), median_radius=radius),
             over_estimate=field_accuracy(values, reference, None, median_radius=radius).over_estimate,
         ),
-        reference=REFERENCE,
+        reference="nearest measured depth point",
         num_frames=len(frames),
         num_measured=len(measured),
         num_edges=num_edges,

@@ -19,15 +19,8 @@ from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 from splatctrl_cli.libraries import scipy_io
 from splatctrl_cli.records import MILLIMETRES, Bool, Float64
 
-MaskRule = Literal["given", "object", "depth"]
 REGNERF_INPUTS = (25, 22, 28, 40, 44, 48, 0, 8, 13)  # the first 3, 6 or 9 train
-REGNERF_EXCLUDED = (3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 36, 37, 38, 39)
-REGNERF_SCANS = (8, 21, 30, 31, 34, 38, 40, 41, 45, 55, 63, 82, 103, 110, 114)
-MVSNERF_TRAINING = (25, 21, 33, 22, 14, 15, 26, 30, 31, 35, 34, 43, 46, 29, 16, 36)
-MVSNERF_SCORED = (32, 24, 23, 44)
-MVSNERF_SCANS = (1, 8, 21, 103, 114)
 SURFACE_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)  # those IDR has masks for
-RULES = "expected holdout:everyN, holdout:everyN+FIRST or holdout:2,5"
 BEFORE, BEYOND = 0.060, 0.120  # [m] outside the box within which points are kept (eval.py: patch_size, twice that)
 
 
@@ -58,7 +51,7 @@ class ScoreProtocol:
 
     name: str
     source: str
-    mask: MaskRule = "given"
+    mask: Literal["given", "object", "depth"] = "given"
     fill: float = 0.0
     is_zero_padded: bool = False
     size: tuple[int, int] | None = None
@@ -108,13 +101,13 @@ def _regnerf(num_training: int) -> ScoreProtocol:
     google-research/google-research, regnerf/internal/datasets.py, class DTU, split 'pixelnerf'; figures over the
     object (regnerf/eval.py), 400x300 by ``factor = 4`` of regnerf/configs.
     """
-    unused = {*REGNERF_INPUTS, *REGNERF_EXCLUDED}
+    unused = {*REGNERF_INPUTS, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 36, 37, 38, 39}
     return ScoreProtocol(
         name=f"regnerf-{num_training}",
         mask="object",
         fill=1.0,
         size=(400, 300),
-        scans=REGNERF_SCANS,
+        scans=(8, 21, 30, 31, 34, 38, 40, 41, 45, 55, 63, 82, 103, 110, 114),
         training=REGNERF_INPUTS[:num_training],
         scored=tuple(n for n in range(49) if n not in unused),
         source="google-research/google-research, regnerf/internal/datasets.py, regnerf/eval.py",
@@ -139,9 +132,9 @@ _FIXED = (
         name="mvsnerf",
         mask="depth",
         size=(640, 512),
-        scans=MVSNERF_SCANS,
-        training=MVSNERF_TRAINING,
-        scored=MVSNERF_SCORED,
+        scans=(1, 8, 21, 103, 114),
+        training=(25, 21, 33, 22, 14, 15, 26, 30, 31, 35, 34, 43, 46, 29, 16, 36),
+        scored=(32, 24, 23, 44),
         source="apchenstu/mvsnerf, data/dtu_ft.py, renderer.ipynb, configs/pairs.th",
     ),
 )
@@ -174,7 +167,10 @@ def _holdout(name: str) -> ScoreProtocol:
     if re.fullmatch(r"\d+(,\d+)*", rule):
         scored = tuple(sorted({int(word) for word in rule.split(",")}))
         return ScoreProtocol(name=name, scored=scored, source=source)
-    raise UsageError(f"--protocol {name}: {RULES}", remedy="such as holdout:every8")
+    raise UsageError(
+        f"--protocol {name}: expected holdout:everyN, holdout:everyN+FIRST or holdout:2,5",
+        remedy="such as holdout:every8",
+    )
 
 
 def _ranges(numbers: Sequence[int]) -> str:

@@ -62,12 +62,14 @@ class RegionScore:
     in_front: float
 
 
-DEPTH_ERROR = Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.02)
 REGION = {
     "psnr": DECIBELS,
     "ssim": SIMILARITY,
     "depth_pixels": DESCRIBES,
-    **dict.fromkeys(("depth_median", "depth_mean", "depth_p90"), DEPTH_ERROR),
+    **dict.fromkeys(
+        ("depth_median", "depth_mean", "depth_p90"),
+        Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.02),
+    ),
     **dict.fromkeys(("depth_within_1cm", "depth_within_2cm", "depth_coverage"), GOOD_SHARE),
     "in_front": BAD_SHARE,
 }  # of the pixels of a region
@@ -197,13 +199,8 @@ def in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask:
     return float(np.mean(depth[both] < reference[both] - IN_FRONT)) if both.any() else math.nan
 
 
-def metric_names() -> tuple[str, ...]:
-    """All possible names of `total_score`; a mask's occur only with one."""
-    return tuple(metric_scales())
-
-
 def metric_scales() -> dict[str, Scale]:
-    """Scales of `metric_names` for comparing runs."""
+    """Scales of all names of `total_score`, for comparing runs; a mask's occur only with one."""
     of_regions = {f"{name}_{region}": scale for region in REGIONS for name, scale in REGION.items()}
     return {
         **dict.fromkeys(("num_views", "valid_share", "seen_share", "mask_share"), DESCRIBES),

@@ -25,7 +25,6 @@ from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.records import Bool, Float64
 
 PREFIX = "change_"
-COMPARED = ("name", "split", "mask_rule", "resolution", "averaging", "scans")
 SUMS = ("num_views", "num_skipped", "num_warnings", "num_points", "num_reference")
 AVERAGING = "mean over the views"
 SCALES = {
@@ -57,7 +56,7 @@ def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
     """New minus old figures, None if either is. Raises InputError if not comparable."""
     earlier = read_baseline(path)
     now, then = ({**one["protocol"], "scans": one.get("scans")} for one in (report, earlier))
-    for name in COMPARED:
+    for name in ("name", "split", "mask_rule", "resolution", "averaging", "scans"):
         if now.get(name) != then.get(name):
             raise InputError(
                 f"{path}: not comparable: {name}: expected {now.get(name)}, got {then.get(name)}",

@@ -24,7 +24,6 @@ class Outcome(StrEnum):
 
 
 EXIT_CODES = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.NOT_EVALUABLE: 5}
-SHORT = 80  # characters of a value that `brief` prints
 _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a definite failure outranks missing evidence
 
 
@@ -212,7 +211,7 @@ def brief(result: Any) -> str:
     shown = []
     for name, value in ((each.name, getattr(result, each.name)) for each in fields(result)):
         text, size = repr(value), f" of {len(value)}" if isinstance(value, Sized) else ""
-        is_short = len(text) <= SHORT or isinstance(value, Verdict)
+        is_short = len(text) <= 80 or isinstance(value, Verdict)
         shown.append(f"{name}={text if is_short else f'<{type(value).__name__}{size}>'}")
     return f"{type(result).__name__}({', '.join(shown)})"
 
@@ -234,9 +233,6 @@ def _plain(reason: Reason) -> dict[str, Any]:
         plain[name] = value if value is not None and math.isfinite(value) else None
     return plain
 
-
-FirstTime = Callable[[str, Callable[[float], bool]], float | None]
-"""Metric name, whether a value holds -> the first time [s] that does not."""
 
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 
@@ -263,7 +259,7 @@ def gate_reasons(
     metrics: Mapping[str, float | None],
     counts: Mapping[str, int],
     *,
-    first_time: "FirstTime | None" = None,
+    first_time: Callable[[str, Callable[[float], bool]], float | None] | None = None,
 ) -> list[Reason]:
     """A reason per requirement: passed, failed, or not evaluable without a finite value or count.
 

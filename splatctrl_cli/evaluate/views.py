@@ -4,6 +4,8 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -51,7 +53,7 @@ def views_to_score(
         return
     counts: Counter[str] = Counter()
     newest: dict[str, RgbdFrame] = {}
-    for recorded in _moments(source):
+    for _, recorded in groupby(frames_of(source), key=attrgetter("stamp_ns")):
         moment = [corrected(frame) for frame in recorded]
         newest |= {frame.camera: frame for frame in moment if frame.camera in training}
         for frame in moment:
@@ -70,17 +72,6 @@ def frames_of(source: RecordSource) -> Iterator[RgbdFrame]:
     return (record for record in source.records() if isinstance(record, RgbdFrame))
 
 
-def _moments(source: RecordSource) -> Iterator[list[RgbdFrame]]:
-    moment: list[RgbdFrame] = []
-    for frame in frames_of(source):
-        if moment and frame.stamp_ns != moment[0].stamp_ns:
-            yield moment
-            moment = []
-        moment.append(frame)
-    if moment:
-        yield moment
-
-
 def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tolerance: float = 0.02) -> Bool:
     """(Q,) True where a frame measured a surface at a point (Q, 3) [m].
 
@@ -91,7 +82,8 @@ def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tol
         unseen = np.flatnonzero(~seen)
         if not len(unseen):
             break
-        seen[unseen] = _agrees(points_world[unseen], frame, tolerance)
+        landing, own, measured = measured_along(points_world[unseen], frame)
+        seen[unseen[landing]] = (measured > 0) & (np.abs(measured - own) <= tolerance)
     return seen
 
 
@@ -108,13 +100,6 @@ def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float 
     nearest = sorted(others, key=lambda other: float(np.linalg.norm(other.T_world_camera[:3, 3] - center)))
     seen[seen] = seen_by(points_world, nearest, tolerance)
     return seen
-
-
-def _agrees(points_world: NDArray[np.floating], frame: RgbdFrame, tolerance: float) -> Bool:
-    agrees = np.zeros(len(points_world), dtype=np.bool_)
-    landing, own, measured = measured_along(points_world, frame)
-    agrees[landing] = (measured > 0) & (np.abs(measured - own) <= tolerance)
-    return agrees
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
@@ -210,7 +195,9 @@ def depth_errors(
         both &= mask
     errors = np.abs(depth[both].astype(np.float64) - reference[both])
     if not errors.size:
-        return DepthErrors(num_pixels=0, **dict.fromkeys(_DEPTH_FIGURES, math.nan))
+        return DepthErrors(
+            num_pixels=0, **dict.fromkeys(("median", "mean", "p90", "within_1cm", "within_2cm"), math.nan)
+        )
     return DepthErrors(
         num_pixels=int(errors.size),
         median=float(np.median(errors)),
@@ -219,9 +206,6 @@ def depth_errors(
         within_1cm=float(np.mean(errors <= 0.01)),
         within_2cm=float(np.mean(errors <= 0.02)),
     )
-
-
-_DEPTH_FIGURES = ("median", "mean", "p90", "within_1cm", "within_2cm")
 
 
 def _window_mean(image: Float64, border: Literal["reflect", "constant"]) -> Float64:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import WriteError
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame, UInt8
 
-APART = 0.5  # [s] between the moments of two events, at least
 NEAR = 0.05  # [m] in front of a camera below which nothing is drawn
 HIDDEN = 0.03  # [m] by which a surface must stand before a sphere to hide it
 OUTLINE = np.linspace(0.0, 2.0 * np.pi, 49)
@@ -52,12 +51,12 @@ class Sight:
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
     """Indices of at most `num` states with least clearance (T,), the least first.
 
-    Each is the least within `APART` [s] on either side, so that an event counts once. NaN does not count.
+    Each is the least within 0.5 s on either side, so that an event counts once. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])
     lowest = np.flatnonzero((values < beside[:-2]) & (values <= beside[2:]) & np.isfinite(values))
-    apart_ns = round(APART * 1e9)
+    apart_ns = round(0.5 * 1e9)  # [s] between the moments of two events
     chosen: list[int] = []
     for index in lowest[np.argsort(values[lowest], kind="stable")]:
         if len(chosen) == num:

@@ -167,7 +167,6 @@ PARTIAL = ".partial"  # suffix of an incomplete output
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
 _WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EBADF})
 WITH_PARTS = ("reconstruct", "sdf-bake", "replay")  # commands whose folders others rely on
-NO_PARTS = ("run.json", "checkpoint")  # the digests' own file, and what only an interrupted run reads
 
 
 def is_write_failure(error: OSError, output: Path | None = None) -> bool:
@@ -337,9 +336,10 @@ class Stopwatch:
 
 
 def part_digests(folder: Path) -> dict[str, str]:
-    """sha256 of every file below `folder` except `NO_PARTS`, by relative name."""
+    """sha256 of every file below `folder` except run.json and the checkpoint, by relative name."""
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    return {name: sha256(folder / name) for name in names if name.partition("/")[0] not in NO_PARTS}
+    # the digests' own file, and what only an interrupted run reads
+    return {name: sha256(folder / name) for name in names if name.partition("/")[0] not in ("run.json", "checkpoint")}
 
 
 def write_run(

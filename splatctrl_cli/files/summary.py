@@ -46,8 +46,7 @@ class Summary:
 
 def names_in(folder: Path) -> list[str]:
     """Sorted names in `folder`."""
-    with os.scandir(folder) as entries:
-        return sorted(entry.name for entry in entries)
+    return sorted(os.listdir(folder))  # noqa: PTH208  (paths cost ten times more)
 
 
 def files_below(path: Path) -> tuple[int, int]:

@@ -98,14 +98,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
     out = request.out or Path("calibration.toml")
     if request.options.calibration is not None:
         raise UsageError("--calibration: what is calibrated is the recording as it is", remedy="leave it out")
-    model = posed_robot(
-        request.paths,
-        request.urdf,
-        request.spheres,
-        base=request.base,
-        locked=request.locked,
-        packages=request.packages,
-    )
+    model = posed_robot(request.paths, request.urdf, request)
     source = open_session(request.paths, request.options)
     arm = None if model is None else _arm(model, source)
     with output_path(out, force=request.force, is_folder=False) as partial:

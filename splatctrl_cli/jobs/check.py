@@ -1,7 +1,7 @@
 """A check: faults of a recording, before they cost an hour."""
 
 import statistics
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,8 +11,7 @@ from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Need, Sev
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
-from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.robot.logged_robot import TAKE, differs, logged_urdf
+from splatctrl_cli.jobs.robot.logged_robot import TAKE, RobotOptions, differs, logged_urdf
 from splatctrl_cli.recording.source import open_logs
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
@@ -20,7 +19,6 @@ from splatctrl_cli.robot.sphere_files import own_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 
-NEVER = "never"
 _ALLOWING = {  # the options that take an error on
     **dict.fromkeys(("agreement", "views-agreement", "views-scale", "alignment"), "--allow-disagreement"),
     "pose-jump": "--max-pose-jump",
@@ -28,21 +26,17 @@ _ALLOWING = {  # the options that take an error on
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckRequest:
+class CheckRequest(RobotOptions):
     """One check of a recording; several `paths` only for logs of one session.
 
     num_images: images to read of each topic, None for all. urdf: robot to compare joint states and depth with; with
-    `spheres` alone the log's own. base: its pose in world as x, y, z, qx, qy, qz, qw. locked: values [rad or m] of
-    unlogged joints. fail_on: least severity that fails: "error", "warning" or NEVER.
+    `spheres` alone the log's own. fail_on: least severity that fails: "error", "warning" or "never".
     """
 
     paths: tuple[Path, ...]
     options: SourceOptions = field(default_factory=SourceOptions)
     num_images: int | None = None
     urdf: Path | None = None
-    spheres: Path | None = None
-    base: tuple[float, ...] | None = None
-    locked: Mapping[str, float] = field(default_factory=dict)
     fail_on: str = "error"
 
 
@@ -62,19 +56,21 @@ def check(request: CheckRequest) -> CheckResult:
     """
     if request.num_images is not None and request.num_images < 1:
         raise UsageError(f"--quick {request.num_images}: expected 1 or more")
-    model = posed_robot(request.paths, request.urdf, request.spheres, base=request.base, locked=request.locked)
+    model = posed_robot(request.paths, request.urdf, request)
     other = "" if request.urdf is None or model is None else differs(model.urdf, request.paths)
     report = _report(request, model)
     findings = [warning("robot-model", str(request.urdf), other, TAKE)] if other else []
     report = replace(report, findings=[*report.findings, *findings])
     verdict = _verdict(report, request.fail_on)
-    return CheckResult(report=report, verdict=verdict, exit_code=0 if request.fail_on == NEVER else verdict.exit_code)
+    return CheckResult(
+        report=report, verdict=verdict, exit_code=0 if request.fail_on == "never" else verdict.exit_code
+    )
 
 
-def refuse_errors(path: Path, options: SourceOptions, command: str, allowed: Collection[str] = ()) -> None:
-    """Raise InputError if `check` finds an error for this command, except `allowed` codes."""
+def refuse_errors(path: Path, options: SourceOptions, allowed: Collection[str] = ()) -> None:
+    """Raise InputError if `check` finds an error for reconstruct, except `allowed` codes."""
     report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
-    errors = [f for f in report.refusing(Need(command=command, lacks=())) if f.code not in allowed]
+    errors = [f for f in report.refusing(Need(command="reconstruct", lacks=())) if f.code not in allowed]
     if errors:
         first, more = errors[0], f"; {len(errors) - 1} more: splatctrl check {path}" if len(errors) > 1 else ""
         remedy = first.remedy or CHECKS[first.code].remedy
@@ -91,31 +87,20 @@ def _report(request: CheckRequest, model: RobotModel | None, *, only_errors: boo
     return replace(report, findings=[*report.findings, *_agreement(report)])
 
 
-def posed_robot(
-    paths: Sequence[Path],
-    urdf: Path | None,
-    spheres: Path | None,
-    *,
-    base: tuple[float, ...] | None,
-    locked: Mapping[str, float],
-    packages: Sequence[Path] = (),
-) -> RobotModel | None:
-    """Robot of a URDF, with `spheres` alone the recording's own; None without either.
+def posed_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) -> RobotModel | None:
+    """Robot of a URDF, with spheres alone the recording's own; None without either.
 
-    base: pose in world as x, y, z, qx, qy, qz, qw. Raises UsageError for robot options without one.
+    Raises UsageError for robot options without one.
     """
     file = None if urdf is None else read_urdf(urdf)
-    if file is None and spheres is not None:  # without spheres it is often unusable
+    if file is None and options.spheres is not None:  # without spheres it is often unusable
         file = logged_urdf(paths)
     if file is None:
-        given = {"spheres": spheres, "base": base, "lock": locked or None, "packages": packages or None}
-        for name, value in given.items():
-            if value is not None:
-                raise UsageError(f"--{name}: expected --urdf beside it")
+        for name, option in (("spheres", "spheres"), ("base", "base"), ("locked", "lock"), ("packages", "packages")):
+            if getattr(options, name):
+                raise UsageError(f"--{option}: expected --urdf beside it")
         return None
-    T_world_base = None if base is None else transform_from(base[:3], base[3:])
-    asked = own_spheres(file) if spheres is None else spheres
-    return RobotModel.from_urdf(file, asked, T_world_base=T_world_base, locked=locked, packages=packages)
+    return options.posed(file, own_spheres(file))
 
 
 def _agreement(report: CheckReport) -> Iterator[Finding]:

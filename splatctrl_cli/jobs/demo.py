@@ -30,13 +30,13 @@ from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
 from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score.views import rendered_with_shell
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.scene.render import render
 
 TRAINING, SCORING = ("cam0", "cam1", "cam2"), ("cam3",)
 CLOSED_LOOP_START = 1.8  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is
@@ -282,13 +282,8 @@ def _draw(data: Path, out: Path, threads: int) -> None:
 
 
 def _comparison(frame: RgbdFrame, scene: SceneFolder, threads: int) -> ComparisonRow:
-    camera, splats, shell = (frame.intrinsics, frame.T_world_camera), scene.splats(), scene.shell_at(None)
-    view = render(splats, *camera, threads=threads)
-    is_mapped, depth = view.opacity >= 0.5, view.normalised_depth()
-    if shell is not None:
-        view = render(splats.joined(shell), *camera, threads=threads)
-    view = view.before(scene.background)
-    figure = psnr(view.color, frame.color / 255.0, is_mapped)
+    view, depth = rendered_with_shell(scene.splats(), scene.shell_at(None), frame, scene.background, threads)
+    figure = psnr(view.color, frame.color / 255.0, depth > 0)
     return ComparisonRow(
         title=f"{frame.camera} ({'scoring only' if frame.camera in SCORING else 'training'})",
         figures=f"{figure:.1f} dB on mapped pixels",

@@ -60,9 +60,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
     out = request.out or Path(request.paths[0].stem + ".capture")
     with stopwatch.stage("survey"):
         source = open_session(request.paths, options)
-        topics = None
-        if isinstance(source, LOGGED):
-            topics = source.joint_topics
+        topics = source.joint_topics if isinstance(source, LOGGED) else None
     if set(source.cameras) == {HOLDOUT}:
         given = ",".join(options.cameras or ())
         raise UsageError(f"--cameras {given}: leaves no camera to train with", remedy="name another, or leave it out")

@@ -231,7 +231,6 @@ def _clean(text: str) -> str:
     return _NOT_XML.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
-MOST_ANNOTATIONS = 10  # of a level that GitHub shows for a step
 SUMMARY_BYTES = 1 << 20  # of a step, whoever wrote them; GitHub shows none of a larger one
 TABLE_HEAD = ["| recording | criterion | outcome | what was found |", "|---|---|---|---|"]
 MORE = "\n... and {} more that do not fit here\n"
@@ -257,7 +256,8 @@ def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping
     """A workflow command for each of the most severe cases; its file is the recording, if in the repository."""
     level = "error" if is_fatal else "warning"
     lines = []
-    for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:MOST_ANNOTATIONS]:
+    # GitHub shows ten of a level for a step
+    for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:10]:
         file = _in_repository(suite.path, environment)
         properties = {**({"file": file} if file else {}), "title": f"{case.group}: {case.name} ({case.kind})"}
         given = ",".join(

@@ -18,6 +18,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.errors import InputError, UsageError
@@ -134,28 +135,14 @@ def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most
         blocks = is_unknown[tuple(slice(0, n * factor) for n in shape)]
         cells = blocks.reshape(shape[0], factor, shape[1], factor, shape[2], factor)
         full = 2 * cells.sum(axis=(1, 3, 5), dtype=np.int32) >= factor**3
-        borders = np.argwhere(full & ~_inner(full))
+        borders = np.argwhere(full & ~binary_erosion(full, border_value=1))
         if len(borders) <= most:
             centers = origin + voxel * (factor * borders + (factor - 1) / 2)
             return np.asarray(centers, np.float32), factor * voxel
         factor += 1
 
 
-def _inner(full: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells with six full neighbours; outside the grid counts as full."""
-    padded = np.pad(full, 1, constant_values=True)
-    inner = np.ones_like(full)
-    for axis in range(3):
-        for shift in (0, 2):
-            where = [slice(1, -1)] * 3
-            where[axis] = slice(shift, shift + full.shape[axis])
-            inner &= padded[tuple(where)]
-    return inner
-
-
 STEPS = 65535  # of a number of 16 bits
-END_OF_LIBRARY = "var camera,controls"  # where three.js ends in trimesh's page and its own script begins
-REMEDY = "pip install 'trimesh>=4.4,<6'"
 
 
 def three_js() -> str:
@@ -163,9 +150,10 @@ def three_js() -> str:
     try:
         archive = trimesh.util.decompress(trimesh.resources.get_bytes("templates/viewer.zip"), file_type="zip")
         page = archive["viewer.html.template"].read().decode("utf-8")
-        script = page[page.index("<script>") + len("<script>") : page.index(END_OF_LIBRARY)]
+        # three.js ends where trimesh's own script begins
+        script = page[page.index("<script>") + len("<script>") : page.index("var camera,controls")]
     except (OSError, KeyError, ValueError) as error:
-        raise UsageError(f"three.js: not found in trimesh: {error}", remedy=REMEDY) from None
+        raise UsageError(f"three.js: not found in trimesh: {error}", remedy="pip install 'trimesh>=4.4,<6'") from None
     return _deflated(script.encode("utf-8"))
 
 
@@ -255,7 +243,6 @@ def _deflated(data: bytes | bytearray) -> str:
 
 
 PARTS = Path(__file__).parent / "page_parts"
-QUALITY = 70  # of JPEG: WebP is a third smaller, and takes ten times as long
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,7 +338,8 @@ def picture(path: Path, title: str, most: int) -> Picture:
     if width > most:
         height, width = round(height * most / width), most
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+    # JPEG: WebP is a third smaller, and takes ten times as long
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
     text = base64.b64encode(data).decode("ascii")
     return Picture(title=title, data=f"data:image/jpeg;base64,{text}", width=width, height=height)
 

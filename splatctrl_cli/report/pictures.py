@@ -22,7 +22,6 @@ from splatctrl_cli.voxels import VoxelState
 
 WIDTH = 12.0  # inches; at DPI 100 the width is 1200 pixels
 DPI = 100
-MAX_DEPTH_ERROR = 0.05  # [m] top of the depth error's colour bar
 CONTOURS = (0.0, 0.02, 0.05, 0.10)  # [m]
 CURVE_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 INK = "#222222"
@@ -153,8 +152,8 @@ def _draw_depth_error(panel: Any, row: ComparisonRow) -> tuple[Any, str]:
     """Image of |render - recorded depth| [cm], and its median in words."""
     both = (row.photo_depth > 0) & (row.render_depth > 0)
     error = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
-    panel.set_facecolor(UNRECORDED)
-    image = panel.imshow(error, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_DEPTH_ERROR, interpolation="nearest")
+    panel.set_facecolor("#d9d9d9")  # not recorded
+    image = panel.imshow(error, cmap="cividis", vmin=0.0, vmax=5.0, interpolation="nearest")
     return image, f"median {np.nanmedian(error):.2f} cm" if both.any() else "no pixel has both depths"
 
 
@@ -231,10 +230,7 @@ def extent_of(coordinates: Sequence[Float64], voxel: float) -> tuple[float, floa
     return float(left), float(right), float(bottom), float(top)
 
 
-MAX_COLOR_ERROR = 0.10  # of the range of a channel, mean of the three: top of the colour error's bar
 HOLE = "#d55e00"  # recorded, but not rendered
-UNRECORDED = "#d9d9d9"
-OUTLINE = "#ffffff"
 
 
 def view_picture(path: Path, row: ComparisonRow) -> None:
@@ -247,9 +243,7 @@ def view_picture(path: Path, row: ComparisonRow) -> None:
         axes = figure.subplots(2, 2)
         axes[0, 0].imshow(row.photo, interpolation="nearest")
         axes[0, 1].imshow(render, interpolation="nearest")
-        color = axes[1, 0].imshow(
-            color_error, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_COLOR_ERROR, interpolation="nearest"
-        )
+        color = axes[1, 0].imshow(color_error, cmap="cividis", vmin=0.0, vmax=10.0, interpolation="nearest")
         depth, median = _draw_depth_error(axes[1, 1], row)
         axes[1, 1].imshow(np.where(hole[:, :, None], mpl.colors.to_rgba(HOLE), 0.0), interpolation="nearest")
         labels = ("mean of |render - photo| over RGB, % of the range", "|render - recorded depth|, cm")
@@ -272,7 +266,7 @@ def _outline(panels: Any, mask: NDArray[np.bool_]) -> None:
     if mask.all() or not mask.any() or min(mask.shape) < 2:
         return
     for panel in panels:
-        panel.contour(mask.astype(float), levels=[0.5], colors=OUTLINE, linewidths=1.0)
+        panel.contour(mask.astype(float), levels=[0.5], colors="#ffffff", linewidths=1.0)
 
 
 def set_grid(axes: Any, axis: str = "y") -> None:
@@ -294,7 +288,6 @@ VIEWS = (  # title, axis to the right, axis upwards, where the viewer stands
     ("from above", 0, 1, np.array([0.0, 0.0, 1.0])),
 )
 BODY, UNCOVERED = np.array([0.66, 0.74, 0.79]), np.array([0.84, 0.37, 0.0])
-SPHERE = "#e69f0020"
 EDGE = 0.02  # [m] of empty space around all
 
 
@@ -314,7 +307,19 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
         axes = figure.subplots(1, len(VIEWS), width_ratios=widths)
         for view, (title, across, along, viewer) in zip(axes, VIEWS, strict=True):
             _draw_shapes(view, triangles, is_bare, (across, along), viewer)
-            _draw_spheres(view, centers[:, [across, along]], radii)
+            view.add_collection(
+                mpl.collections.EllipseCollection(
+                    2 * radii,
+                    2 * radii,
+                    np.zeros(len(radii)),
+                    units="xy",
+                    offsets=centers[:, [across, along]],
+                    offset_transform=view.transData,
+                    facecolors="#e69f0020",
+                    edgecolors=SPHERE_EDGE,
+                    linewidths=0.7,
+                )
+            )
             view.set(xlim=(lower[across], upper[across]), ylim=(lower[along], upper[along]), aspect="equal")
             view.set(title=title, xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[along]} [m]")
         figure.suptitle(
@@ -333,22 +338,6 @@ def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int,
     view.add_collection(
         mpl.collections.PolyCollection(
             list(seen[:, :, list(plane)]), facecolors=colors, edgecolors=colors, linewidths=0.2
-        )
-    )
-
-
-def _draw_spheres(view: Any, centers: Float64, radii: Float64) -> None:
-    view.add_collection(
-        mpl.collections.EllipseCollection(
-            2 * radii,
-            2 * radii,
-            np.zeros(len(radii)),
-            units="xy",
-            offsets=centers,
-            offset_transform=view.transData,
-            facecolors=SPHERE,
-            edgecolors=SPHERE_EDGE,
-            linewidths=0.7,
         )
     )
 

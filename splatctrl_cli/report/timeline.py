@@ -20,7 +20,6 @@ from splatctrl_cli.report.replay_pictures import (
 
 WIDTH, LEFT, RIGHT = 1000, 160, 70  # pixels
 TOP, HEIGHT, STRIP = 12, 230, 20
-ROOM = 8  # pixels of a letter
 COLUMNS = 500  # of a curve
 SOLVED = "#b7cde0"  # a step that was plainly taken
 DASHES = {"barrier": "6 4"}
@@ -162,7 +161,7 @@ def _strips(axis: _Axis, strips: Mapping[str, Sequence[tuple[float, float, str, 
                 f'<rect x="{first:.1f}" y="{top}" width="{max(last - first, 1.0):.1f}" height="{STRIP - 6}"'
                 f' fill="{color}"><title>{words}</title></rect>'
             )
-            if title != kind and last - first > ROOM * len(title):
+            if title != kind and last - first > 8 * len(title):  # pixels of a letter
                 yield f'<text class="named" x="{first + 4:.1f}" y="{top + 11}">{escape(title)}</text>'
 
 

@@ -14,7 +14,7 @@ from splatctrl_cli.calibration.displacement import (
     placed,
 )
 from splatctrl_cli.calibration.evidence import Arm, transform_of
-from splatctrl_cli.jobs.reconstruct.self_model import arm_of, frames_of
+from splatctrl_cli.jobs.reconstruct.reconstruct import arm_of, frames_of
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame

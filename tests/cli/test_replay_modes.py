@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.jobs.replay.metrics import metric_names
+from splatctrl_cli.jobs.replay.metrics import metric_scales
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, scene_of, splats_of, write_scene
@@ -110,7 +110,7 @@ def test_an_old_scene_is_stale(desk: Desk) -> None:
 def test_the_names_of_gates_are_those_of_the_metrics(desk: Desk) -> None:
     """This is the audit. test_the_recorded_commands_of_ours_make_the_same_steps does the other modes."""
     assert desk.replay(*scene_of(desk, BALL), "-q") == 0
-    names = metric_names("audit", ("exact", "barrier"), has_truth=False)
+    names = metric_scales("audit", ("exact", "barrier"), has_truth=False)
     assert set(desk.metrics()) == set(names) and len(set(names)) == len(names)
 
 

@@ -7,10 +7,10 @@ import trimesh
 
 from splatctrl_cli.cli import scene_options
 from splatctrl_cli.cli.parser import words
-from splatctrl_cli.cli.sdf_bake import split_cameras
+from splatctrl_cli.cli.scene import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
-from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
+from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_scales
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import exact_channel
@@ -83,7 +83,7 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     assert result.returncode == 0, result.stderr
     accuracy = json.loads((tmp_path / "field" / "field.json").read_text())["accuracy"]["truth"]
     metrics = json.loads((tmp_path / "field" / "run.json").read_text())["metrics"]
-    assert sorted(set(metrics) - {"devices"}) == sorted((*SUMMARY_METRICS, *metric_names(FIELDS))), "as checked"
+    assert sorted(set(metrics) - {"devices"}) == sorted((*SUMMARY_METRICS, *metric_scales(FIELDS))), "as checked"
     assert accuracy["num_seen"] > 50 and accuracy["holds"] is True
     rows = [line.split()[:2] for line in result.stdout.splitlines() if line.startswith(("seen  ", "all   "))]
     assert rows == [[where, name] for where in ("seen", "all") for name in FIELDS for _ in range(4)]

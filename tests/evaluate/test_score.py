@@ -14,7 +14,7 @@ from splatctrl_cli.evaluate.score import (
     as_json,
     free_mass,
     in_front,
-    metric_names,
+    metric_scales,
     score_view,
     total_score,
 )
@@ -119,8 +119,8 @@ def test_totals_are_means_over_views() -> None:
 
 def test_the_names_of_the_totals_are_known_beforehand() -> None:
     view = masked_score()
-    assert set(metric_names()) >= set(total_score([score(perfect())]))
-    assert set(metric_names()) == set(total_score([replace(view, corrected=view)]))
+    assert set(metric_scales()) >= set(total_score([score(perfect())]))
+    assert set(metric_scales()) == set(total_score([replace(view, corrected=view)]))
     assert as_json({"a": math.nan, "b": math.inf, "c": 1.5}) == {"a": None, "b": None, "c": 1.5}
 
 

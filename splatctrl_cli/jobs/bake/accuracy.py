@@ -39,7 +39,6 @@ SUMMARY_METRICS = {
     **dict.fromkeys(("never_seen_share", "over_estimating_share"), BAD_SHARE),
     "num_warnings": FAULTS,
 }  # comparison scales of the summary's figures
-POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +83,7 @@ def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, requ
     count = min(num_cells, COMPARED_CELLS)
     drawn = np.sort(np.random.default_rng(request.seed).choice(num_cells, count, replace=False))
     points = grid.origin + grid.voxel * np.stack(np.unravel_index(drawn, shape), axis=1)
-    chunks = np.array_split(points, -(-len(points) // POINTS_PER_CHUNK))
+    chunks = np.array_split(points, -(-len(points) // 50_000))  # else large (points x primitives) arrays
     distances, surfaces = zip(*(truth.closest(chunk, stamp_ns) for chunk in chunks), strict=True)
     forms = probabilities(spheres, request.config.field, threads=request.threads)
     return compare_with_truth(

@@ -63,7 +63,6 @@ from splatctrl_cli.report.field_pictures import (
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"
-VDB_COPIES = 7  # of the channels, in memory: 454 MiB were measured for one of 64 MiB
 
 
 def bake_to_disk(
@@ -143,10 +142,8 @@ def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection
     """Raise UsageError if OpenVDB, which holds the grid in memory, lacks room."""
     if "vdb" in formats:
         remedy = "leave it out of --formats (nrrd needs no memory), or give a larger --voxel or fewer --channels"
-        check_room("format vdb:", VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, remedy)
-
-
-EXACT = frozenset({"bound", "hard"})
+        # 7 copies of the channels, in memory: 454 MiB were measured for one of 64 MiB
+        check_room("format vdb:", 7 * bytes_per_cell(channels) * layout.num_cells, remedy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +218,7 @@ def check_request(request: BakeRequest) -> None:
         raise UsageError("--truth and --seen-by: expected both or neither")
     if request.previous_scene is not None and request.update is None:
         raise UsageError("--previous-scene: belongs to --update", remedy="give the field folder to --update as well")
-    of_truth = () if request.truth is None else field_accuracy.metric_names(FIELDS)
+    of_truth = () if request.truth is None else field_accuracy.metric_scales(FIELDS)
     check_gate_names(request.require, (*SUMMARY_METRICS, *of_truth))
 
 
@@ -283,7 +280,7 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
     names |= {"probability"} if request.with_probability else set()
     chosen = (*(name for name in CHANNELS if name in names), *sorted(names - set(CHANNELS)))
     for option in ("truth", "reference_mesh", "held_out"):
-        if getattr(request, option) is not None and not EXACT & names:
+        if getattr(request, option) is not None and not {"bound", "hard"} & names:
             raise UsageError(
                 f"--{option.replace('_', '-')}: needs the exact distance",
                 remedy="bake the channel bound or hard as well",

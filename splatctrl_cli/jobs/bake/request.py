@@ -25,8 +25,6 @@ from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import Balls, OccupancyGrid
 
-NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the grid's; the others change no cell
-
 
 @dataclass(frozen=True, kw_only=True)
 class BakeRequest(RunOptions):
@@ -175,7 +173,8 @@ def check_same(
     """Raise UsageError naming settings that differ from the previous bake."""
     grid = previous.grid
     used = previous.run.get("config", {}).get("field", {})
-    settings = {name: value for name, value in vars(config).items() if name not in NOT_COMPARED}
+    # voxel is compared with the grid's; the others change no cell
+    settings = {name: value for name, value in vars(config).items() if name not in ("voxel", "padding", "max_loss")}
     then_and_now: dict[str, tuple[object, object]] = {
         "field.voxel": (grid.voxel, layout.voxel),
         "cells": (" x ".join(map(str, grid.channels["sdf"].shape)), " x ".join(map(str, layout.shape))),

@@ -21,7 +21,6 @@ from splatctrl_cli.jobs.batch.run import (
     FAILED,
     SKIPPED,
     TO_DO,
-    UNRUN,
     Scheduler,
     local_executor,
     not_run,
@@ -201,7 +200,8 @@ def write_batch(
     for node in nodes:
         run = latest.get(node.name)
         if node.name in keys and (run is None or run.key != keys[node.name]):
-            run = not_run(node, "", out, state=TO_DO, cause=UNRUN)
+            cause = "has not run since the suite, its inputs or the program changed"
+            run = not_run(node, "", out, state=TO_DO, cause=cause)
         found += [] if run is None else [run]
     document = {
         "format": FORMAT,

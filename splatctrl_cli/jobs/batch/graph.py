@@ -14,7 +14,6 @@ from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table,
 
 RECORDING, NAME = "recording", "name"  # placeholders {…} in an option, besides job names
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
-WITHOUT_OUTPUT = ("check", "info")
 CAPTURE, SCENE = "ingest", "reconstruct"
 ROLES: Mapping[str, Mapping[str, str]] = {  # default sources of options: a command's only job, or the recording
     "simulate": {},
@@ -30,7 +29,6 @@ ROLES: Mapping[str, Mapping[str, str]] = {  # default sources of options: a comm
 COMMANDS = tuple(ROLES)
 TABLES = ("set", "perturb")  # options a matrix varies by entry: set.SECTION.KEY, perturb.NAME
 _PLACE = re.compile(r"\{([\w.+-]+)\}")
-_LONGEST = 120  # characters of a node's name
 
 Variant = Mapping[str, Any]
 
@@ -200,7 +198,7 @@ def _nodes_of(
 
 
 def _short(values: Sequence[Any]) -> list[str]:
-    parts = [_text(value).strip("/").split("/") for value in values]
+    parts = [text_of(value).strip("/").split("/") for value in values]
     least = min(map(len, parts)) - 1
     first = min(_num_alike(parts), least)
     last = min(_num_alike([each[::-1] for each in parts]), least - first)
@@ -211,9 +209,9 @@ def _num_alike(lists: Sequence[Sequence[str]]) -> int:
     return sum(1 for _ in itertools.takewhile(lambda each: len(set(each)) == 1, zip(*lists, strict=False)))
 
 
-def _text(value: Any) -> str:
+def text_of(value: Any) -> str:
     if isinstance(value, list):
-        return ",".join(map(_text, value))
+        return ",".join(map(text_of, value))
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -235,7 +233,7 @@ def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
 
 
 def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before: Sequence[Node], out: Path) -> Node:
-    place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:_LONGEST]
+    place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:120]
     return Node(
         name=f"{recording.name}/{place}",
         recording=recording.name,
@@ -244,7 +242,9 @@ def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before:
         words=(),
         variant=variant,
         needs=tuple(node.name for node in before),
-        out=None if job.command in WITHOUT_OUTPUT else out / recording.name / (place + ENDINGS.get(job.command, "")),
+        out=None
+        if job.command in ("check", "info")
+        else out / recording.name / (place + ENDINGS.get(job.command, "")),
         expect=job.expect,
         limits=job.limits,
     )

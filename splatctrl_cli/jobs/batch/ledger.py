@@ -31,10 +31,7 @@ NAME, OWNERS = "ledger.sqlite", ".owners"
 FILE, FORMAT, FILE_VERSION = "batch.json", "splatctrl-batch", 1  # what a batch says of itself
 VERSION = 1  # of the tables
 BUSY_S, WAIT_S = 30.0, 0.02  # longest wait for another writer, and between attempts
-_COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
-WITHOUT_EFFECT = ("--force", "--resume", "--quiet", "-q", "--json")
 THREADS = "--threads"  # changes no byte
-_CODE = {".py", ".so", ".toml", ".json"}
 _MESH = re.compile(r'filename\s*=\s*"([^"]+)"')
 _PATTERN = {"=": "GLOB", "==": "GLOB", "!=": "NOT GLOB"}  # of texts with a *
 
@@ -179,7 +176,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10". Raises UsageError for others."""
         clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
         for condition in conditions:
-            match = _COMPARISON.fullmatch(condition.strip())
+            match = re.fullmatch(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)", condition.strip())
             if match is None or match[1] not in COLUMNS:
                 raise UsageError(
                     f"--where {condition}: expected COLUMN=VALUE", remedy=f"columns: {', '.join(COLUMNS)}"
@@ -290,7 +287,7 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
 def code_version() -> str:
     """Digest of the package's files and the versions that decide figures."""
     folder, found = Path(splatctrl_cli.__file__).parent, hashlib.sha256()
-    for place in sorted(place for place in folder.rglob("*") if place.suffix in _CODE):
+    for place in sorted(place for place in folder.rglob("*") if place.suffix in {".py", ".so", ".toml", ".json"}):
         found.update(f"{place.relative_to(folder)}\0".encode() + place.read_bytes())
     for name in PACKAGES:
         found.update(f"{name} {metadata.version(name)}\0".encode())
@@ -302,7 +299,7 @@ def _said(words: Sequence[str], named: Mapping[str, str]) -> Iterator[str]:
     longest_first = sorted(named, key=len, reverse=True)
     skip = False
     for word in words:
-        if skip or word in WITHOUT_EFFECT:
+        if skip or word in ("--force", "--resume", "--quiet", "-q", "--json"):
             skip = False
             continue
         if word.startswith(THREADS):

@@ -21,12 +21,9 @@ from splatctrl_cli.jobs.batch.task import End, Task, last_lines, read_end, run_t
 from splatctrl_cli.jobs.running.progress import Progress, duration
 
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
-NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes without a verdict
 AGAIN_S = 0.5  # between looks at what another batch runs
 STILL_S = 60.0  # without an ended node, until a log line names what runs
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
-DISK_FULL = 6
-UNRUN = "has not run since the suite, its inputs or the program changed"
 PRINTED = "printed"  # stamp of a node that only prints
 
 
@@ -87,7 +84,8 @@ class Scheduler:
             for future in ended:
                 node, end = futures.pop(future), _end_of(future)
                 tries[node.name] += 1
-                may_pass = end.exit_code == DISK_FULL or end.cause.startswith(MAY_PASS)
+                # 6: the disk was full
+                may_pass = end.exit_code == 6 or end.cause.startswith(MAY_PASS)
                 if tries[node.name] <= node.limits.retries and may_pass:
                     self.progress.log(f"batch: {node.name}: {end.cause or 'disk full'}, once more")
                     waiting[node.name] = node
@@ -189,7 +187,7 @@ def _judged_again(run: Run, node: Node) -> Run:
     if run.cause:
         return replace(run, state=ERROR)
     is_expected = node.expect in {run.label, run.outcome, f"exit {run.exit_code}"}
-    state = DONE if is_expected else ERROR if run.exit_code in NO_VERDICT else FAILED
+    state = DONE if is_expected else ERROR if run.exit_code in (2, 4, 6, 70, 130) else FAILED  # without a verdict
     return replace(run, state=state, expect=node.expect)
 
 

@@ -6,7 +6,7 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,6 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
     *("passed", "failed", "not evaluable", "done", "safe", "margin broken", "contact", "limits broken"),
     *("controller failed", "goal not reached", "gate failed"),
 )
-_NAME = re.compile(r"[\w][\w.+-]*")
-_COMMON = ("log", "capture", "recording", "data")  # common names, which get the folder's name in front
-_ENDINGS = (".mcap", ".bag", ".db3", ".toml", ".capture")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +114,7 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     if command not in commands:
         remedy = _near(command, commands, "give command = one of")
         raise UsageError(f"{where}: no job is called {command!r}", remedy=remedy)
-    own = next((option for option in _OWN if option in table), None)
+    own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
     if own is not None:
         raise UsageError(f"{where}: a batch gives {own} itself", remedy="leave it out")
     matrix = table.get("matrix", {})
@@ -139,12 +136,8 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
             memory=int(_amount(where, table, "memory", UNITS, limits.memory)),
             retries=int(_amount(where, table, "retries", {}, limits.retries)),
         ),
-        options={key: v for key, v in table.items() if key not in {"command", "matrix", "expect", *_LIMITS}},
+        options={key: v for key, v in table.items() if key not in {"command", "matrix", "expect", *vars(limits)}},
     )
-
-
-_OWN = ("out", "force", "resume", "json", "verbose", "quiet")
-_LIMITS = tuple(each.name for each in fields(Limits))
 
 
 def _recordings(folder: Path, table: Table) -> list[Recording]:
@@ -177,7 +170,10 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
     files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
     beside = Counter(map(_without_ending, set(files)))
     places = [path if beside[_without_ending(path)] > 1 else _without_ending(path) for path in files]
-    own = [f"{p.parent.name}-{p.name}" if p.name in _COMMON else p.name for p in places]
+    # a common name gets the folder's in front
+    own = [
+        f"{p.parent.name}-{p.name}" if p.name in ("log", "capture", "recording", "data") else p.name for p in places
+    ]
     names = [each.name or _plain(name) for each, name in zip(recordings, own, strict=True)]
     for above in range(max((len(place.parts) - 1 for place in places), default=0)):
         alike: dict[str, list[int]] = {}
@@ -191,7 +187,7 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def _without_ending(path: Path) -> Path:
-    return path.with_suffix("") if path.suffix in _ENDINGS else path
+    return path.with_suffix("") if path.suffix in (".mcap", ".bag", ".db3", ".toml", ".capture") else path
 
 
 def _plain(name: str) -> str:
@@ -228,7 +224,7 @@ def _near(word: str, known: Sequence[str], otherwise: str = "known here") -> str
 
 
 def _checked_name(where: str, name: str) -> None:
-    if not _NAME.fullmatch(name):
+    if not re.fullmatch(r"\w[\w.+-]*", name):
         raise UsageError(f"{where}: {name!r} is no name of a folder", remedy="use letters, digits, . _ + -")
 
 

@@ -27,12 +27,6 @@ from splatctrl_cli.kernels.cuda.driver import num_cards
 
 Entry = Callable[[list[str]], int]
 
-POLL = 0.02  # [s] between looks at a child's memory
-STOP = 2.0  # [s] for a runner to see that its stdin ended, before it is killed
-GRACE = 10.0  # [s] from asking a child to end to ending it
-PAGE = os.sysconf("SC_PAGE_SIZE")
-PR_SET_PDEATHSIG = 1  # of prctl(2): the signal a child gets when its parent dies
-RESUME = "--resume"  # omitted without a partial output
 PART = ".part"  # ends the name of a result that is not whole
 _LAST = 4096  # bytes of a log searched for its last lines
 _local = threading.local()  # each thread's runner
@@ -40,7 +34,6 @@ _runners: list["subprocess.Popen[str]"] = []
 _numbers = itertools.count()  # of the runners
 VISIBLE, CARD = "CUDA_VISIBLE_DEVICES", "SPLATCTRL_CARD_OF_RUNNER"  # a runner's card, where there are several
 BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # reported by the batch, not by its nodes
-WROTE = (0, 1, 3, 5)  # exit codes of a command that left its output
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +111,7 @@ def stop_runners() -> None:
         with contextlib.suppress(OSError):
             runner.stdin.close()
         try:
-            runner.wait(STOP)
+            runner.wait(2.0)  # [s] for a runner to see that its stdin ended, before it is killed
         except subprocess.TimeoutExpired:  # it still imports the commands, and runs nothing
             runner.kill()
             runner.wait()
@@ -208,7 +201,7 @@ def _run(function: Entry, task: Task) -> End:
         started=started,
         seconds=time.perf_counter() - start,
         peak_mb=used.ru_maxrss * 1024 / 1e6,
-        stamp=stamp_of(Path(task.out)) if not cause and os.WEXITSTATUS(status) in WROTE else "",
+        stamp=stamp_of(Path(task.out)) if not cause and os.WEXITSTATUS(status) in (0, 1, 3, 5) else "",
     )
     write_durably(Path(task.end), lambda path: path.write_text(json.dumps(asdict(end)) + "\n"))
     return end
@@ -228,12 +221,12 @@ def _be_child(function: Entry, task: Task) -> NoReturn:
     code = 70
     try:
         os.setsid()
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: the signal when the parent dies
         signal.signal(signal.SIGINT, signal.default_int_handler)
         for number, path in ((0, os.devnull), (1, task.result + PART), (2, task.log)):
             os.dup2(os.open(path, os.O_RDWR if number == 0 else os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
         has_begun = bool(task.out) and partial_path(Path(task.out)).exists()
-        words = [word for word in task.words if has_begun or word != RESUME]
+        words = [word for word in task.words if has_begun or word != "--resume"]  # only with a partial output
         sys.argv = ["splatctrl", *words]
         if CARD in os.environ and not any(word.startswith("cuda:") for word in words):
             os.environ[VISIBLE] = os.environ[CARD]
@@ -252,7 +245,7 @@ def _be_child(function: Entry, task: Task) -> NoReturn:
 def _wait(pid: int, task: Task) -> str:
     """Wait for the child, or end it and return why. Exits if stdin ends."""
     start, asked, cause = time.monotonic(), 0.0, ""
-    ended, look = os.pidfd_open(pid), POLL if task.memory else 1.0
+    ended, look = os.pidfd_open(pid), 0.02 if task.memory else 1.0  # [s] between looks at a child's memory
     try:
         while True:
             ready, _, _ = select.select([ended, 0], [], [], look)
@@ -267,7 +260,7 @@ def _wait(pid: int, task: Task) -> str:
             elif task.timeout and not asked and time.monotonic() - start > task.timeout:
                 _signal(pid, signal.SIGINT)
                 asked, cause = time.monotonic(), f"timed out after {task.timeout:g} s"
-            elif asked and time.monotonic() - asked > GRACE:
+            elif asked and time.monotonic() - asked > 10.0:  # [s] from asking a child to end to ending it
                 _signal(pid, signal.SIGKILL)
     finally:
         os.close(ended)
@@ -284,7 +277,7 @@ def _signal(pid: int, number: signal.Signals) -> None:
 def _memory_of(pid: int) -> int:
     """Resident memory of a process [bytes], 0 if gone."""
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError):
         return 0
 

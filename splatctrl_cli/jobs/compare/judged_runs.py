@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.config.fixed import BANDS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate import field_accuracy, score_report
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
@@ -35,10 +34,9 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
     replay: dict[str, Scale] = {}
     for mode in MODES:
         replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True)
-    bands = [field_accuracy.band_name(lower, upper) for lower, upper in BANDS]
     return {
         "reconstruct": reconstruct_verdict.GATED,
-        "sdf-bake": SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS, bands),
+        "sdf-bake": SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS),
         "score": score_report.SCALES,
         "replay": replay,
         "robot": robot.SCALES,
@@ -54,7 +52,6 @@ def shown() -> Mapping[str, Shown]:
 BASELINE, VERSION = "splatctrl-baseline", 1
 HEAD = "# Made by splatctrl compare --update-baseline: review what changed, then commit it.\n"
 ANEW = "write it anew with --update-baseline"
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +224,7 @@ def write_baseline(path: Path, judged: Judged) -> None:
 
 
 def _key(name: str) -> str:
-    return name if _BARE.fullmatch(name) else _toml(name)
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml(name)
 
 
 def _toml(value: object) -> str:

@@ -38,13 +38,9 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
+from splatctrl_cli.jobs.score.views import rendered
 from splatctrl_cli.recording.container.mcap_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
-from splatctrl_cli.scene.gaussians import render_gaussians
-from splatctrl_cli.scene.render import Rendering, render
-
-LAYOUT_COMMENTS = frozenset({"splat", "label"})  # describe a PLY's layout: wrong for the next file
-IMAGE_SIZE = (320, 240)
 
 Splats = SplatSet | GaussianSet
 
@@ -121,7 +117,8 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
             f"--layout short: expected isotropic splats, {source} has {len(chosen)} Gaussians that are not all so",
             remedy="give --isotropic, or --layout full",
         )
-    kept = {key: value for key, value in comments.items() if key not in LAYOUT_COMMENTS}
+    # these describe a PLY's layout: wrong for the next file
+    kept = {key: value for key, value in comments.items() if key not in {"splat", "label"}}
     name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=request.force, is_folder=False) as partial:
         kept |= {"exported_from": f"{name} sha256 {sha256(source)}"}
@@ -240,7 +237,7 @@ def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:
-        one, two = (_render(splats, intrinsics, T_world_camera) for splats in (a, b))
+        one, two = (rendered(splats, intrinsics, T_world_camera) for splats in (a, b))
         pairs = ((one.color, two.color), (one.opacity, two.opacity), (one.depth / size, two.depth / size))
         largest = max(largest, *(float(np.abs(x.astype(np.float64) - y).max()) for x, y in pairs))
         covered += float(np.mean(one.opacity > 0)) / len(poses)
@@ -248,17 +245,11 @@ def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
     return largest, -10.0 * math.log10(squared) if squared else None, covered
 
 
-def _render(splats: Splats, intrinsics: Intrinsics, T_world_camera: Float64) -> Rendering:
-    if isinstance(splats, SplatSet):
-        return render(splats, intrinsics, T_world_camera)
-    return render_gaussians(splats, intrinsics, T_world_camera)
-
-
 def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
     """Cameras around and above the box of most splats, and its diagonal [m]."""
     lower, upper = np.percentile(centers.astype(np.float64), [2, 98], axis=0)
     middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
-    width, height = IMAGE_SIZE
+    width, height = 320, 240
     intrinsics = Intrinsics(fx=width, fy=width, cx=(width - 1) / 2, cy=(height - 1) / 2, width=width, height=height)
     angles = 2 * np.pi * (np.arange(EXPORT_VIEWS) + 0.5) / EXPORT_VIEWS
     directions = np.column_stack([np.cos(angles), np.sin(angles), np.full(EXPORT_VIEWS, 0.7)])

@@ -33,7 +33,6 @@ from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory
 from splatctrl_cli.records import Bool, Box, DistanceField, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import VoxelState
 
-ROUNDING = 1e-6  # [m] and of the lengths in it: what float32 may lose of an exact distance, as in a baked bound
 TITLES = (
     *("x", "y", "z", "in_box", "distance", "gradient_x", "gradient_y", "gradient_z", "bound", "probability"),
     *("label", "splat", "observed", "surface_x", "surface_y", "surface_z", "surface_rest"),
@@ -115,7 +114,8 @@ class SceneAnswers:
             in_box=None if self._workspace is None else self._workspace.contains(points),
             distance=distance,
             gradient=gradient,
-            bound=self._exact.query(points)[0] - ROUNDING * (1.0 + size),
+            # what float32 may lose of an exact distance, as in a baked bound
+            bound=self._exact.query(points)[0] - 1e-6 * (1.0 + size),
             probability=self._probability.at(points, distance),
             label=self._labels[nearest].astype(np.int8),
             splat=self._index[nearest],
@@ -199,7 +199,6 @@ def rows_of(points: Float64, answers: Answers) -> str:
     return "".join(map(template.__mod__, zip(*cells, strict=True))).replace("nan", "")
 
 
-STANDARD_INPUT = "standard input"
 OF_GRID = {  # field settings: name and type in a grid's header
     "distance": ("distance", str),
     "length_scale": ("length_scale", float),
@@ -346,7 +345,7 @@ def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
     hidden = True if progress.is_quiet else None
     if not isinstance(points, Path):
         with tqdm(unit=" points", disable=hidden) as bar:
-            for block in point_blocks(points, STANDARD_INPUT):
+            for block in point_blocks(points, "standard input"):
                 yield block
                 bar.update(len(block))
         return

@@ -3,7 +3,6 @@
 An obstacle present only between two maps would otherwise escape a replay.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,7 @@ class KeptMaps:
 
     def __init__(self, writer: SceneWriter, config: Config) -> None:
         self._writer, self._config = writer, config
-        self._last: _Map | None = None
+        self._last: tuple[Path, SphereField | None, OccupancyGrid] | None = None  # the last kept map
 
     def is_due(self, index: int, stamp_ns: int) -> bool:
         """True every `snapshot_every` steps, but at most once in each multiple of `snapshot_period`."""
@@ -48,37 +47,27 @@ class KeptMaps:
         if not self._writer.snapshots:
             return False
         path = self._writer.snapshots[-1].path
-        if self._last is None or self._last.path != path:
+        if self._last is None or self._last[0] != path:
             self._writer.settle()
             states = path.with_suffix(".npz")
-            self._last = _Map.of(path, _spheres(read_ply(path)[0], read_unrepresented(states)), read_states(states))
+            before = _spheres(read_ply(path)[0], read_unrepresented(states))
+            field = None if before is None else SphereField(Spheres.of(before.centers, before.radii))
+            self._last = path, field, read_states(states)
         now = _spheres(fitter.splats(), fitter.unrepresented)
-        return now is not None and self._last.num_new(now) >= NEWS_LEAST
+        return now is not None and _num_new(now, *self._last[1:]) >= NEWS_LEAST
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Map:
-    """A kept map; no field without obstacles."""
-
-    path: Path
-    field: SphereField | None
-    states: OccupancyGrid
-
-    @classmethod
-    def of(cls, path: Path, spheres: SplatSet | None, states: OccupancyGrid) -> "_Map":
-        field = None if spheres is None else SphereField(Spheres.of(spheres.centers, spheres.radii))
-        return cls(path=path, field=field, states=states)
-
-    def num_new(self, spheres: SplatSet) -> int:
-        grid, centers = self.states, spheres.centers.astype(np.float64)
-        cells = np.floor((centers - grid.origin) / grid.voxel + 0.5).astype(np.int64)
-        is_inside = np.all((cells >= 0) & (cells < grid.log_odds.shape), axis=1)
-        is_free = np.zeros(len(cells), bool)
-        is_free[is_inside] = grid.log_odds[tuple(cells[is_inside].T)] < 0.0
-        if self.field is None:
-            return int(is_free.sum())
-        distance = self.field.query(centers[is_free])[0]
-        return int(np.count_nonzero(distance + spheres.radii[is_free] > 0.5 * grid.voxel))
+def _num_new(spheres: SplatSet, field: SphereField | None, grid: OccupancyGrid) -> int:
+    """Spheres that stand out of a map's field, in its free voxels; without obstacles it has no field."""
+    centers = spheres.centers.astype(np.float64)
+    cells = np.floor((centers - grid.origin) / grid.voxel + 0.5).astype(np.int64)
+    is_inside = np.all((cells >= 0) & (cells < grid.log_odds.shape), axis=1)
+    is_free = np.zeros(len(cells), bool)
+    is_free[is_inside] = grid.log_odds[tuple(cells[is_inside].T)] < 0.0
+    if field is None:
+        return int(is_free.sum())
+    distance = field.query(centers[is_free])[0]
+    return int(np.count_nonzero(distance + spheres.radii[is_free] > 0.5 * grid.voxel))
 
 
 def _spheres(splats: SplatSet, balls: Balls | None) -> SplatSet | None:

@@ -34,8 +34,6 @@ from splatctrl_cli.scene.scale import RecordedDepth, fitted_to, in_words
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep, cloud_box, depth_box, time_steps
 
-LONGEST_SHARE = 50  # a checkpoint waits 50 times as long as the last one took: below 2 % of the run
-
 KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes a checkpoint stores unchanged
 
 
@@ -106,7 +104,7 @@ class Reconstruction:
         comments = {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}
         self.writer = SceneWriter(folder, comments, checkpoint)
         self._kept = KeptMaps(self.writer, self.config)
-        self.fitter: SceneFitter | None = None
+        self._fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
         self.stamps: list[int] = []
         self.repeats: Counter[str] = Counter()  # frames with stale depth, by camera
@@ -123,21 +121,26 @@ class Reconstruction:
         if checkpoint is not None:
             self._restore(checkpoint)
 
+    @property
+    def fitter(self) -> SceneFitter:
+        """The fitter, made from the first time step with a workspace."""
+        assert self._fitter is not None
+        return self._fitter
+
     def run(self, console: Progress) -> None:
         """Process the remaining log."""
-        if self.fitter is not None:
+        if self._fitter is not None:
             self.device.give(self.fitter, [view.frame for view in self.fitter.window.newest], console)
         self._step_through(console)
         self.check_found()
         if not self.source.has_clock and not self.is_refined:
-            assert self.fitter is not None
             self._refine(self.fitter, console)
 
     def check_found(self) -> None:
         """Raise InputError if no splat was made so far."""
-        if self.fitter is None and self._early is not None:
+        if self._fitter is None and self._early is not None:
             self._workspace(self._early)  # raises: there is no depth
-        if self.fitter is None:
+        if self._fitter is None:
             raise InputError(
                 f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
                 remedy="'splatctrl info' says what the input lacks",
@@ -169,7 +172,7 @@ class Reconstruction:
         """Process the next time step, with a snapshot if due; None while the workspace is unknown."""
         index, self.num_read = self.num_read, self.num_read + 1
         needs_depth = self.request.box is None and self.robot is None and self.cloud is None  # for the workspace
-        if self.fitter is None and not step.has_depth and needs_depth:
+        if self._fitter is None and not step.has_depth and needs_depth:
             console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
             self._early = self._early or step
             return None
@@ -177,15 +180,15 @@ class Reconstruction:
             if frame.camera not in self.first_frames:
                 self.first_frames[frame.camera] = first_frame(frame)
         step = replace(step, frames=tuple(placed(frame, self._cameras_off) for frame in step.frames))
-        if self.fitter is None:
+        if self._fitter is None:
             self._fit_to(RecordedDepth.of(step.frames), console)
             frames, self.corrected = self.request.corrections.of(
                 step.frames, self.source.name, console, has_robot=self.robot is not None
             )
             step = replace(step, frames=tuple(frames))
         self.agreement.check(step, self.config.occupancy, console)
-        if self.fitter is None:
-            self.fitter = self._begin(step, console)
+        if self._fitter is None:
+            self._fitter = self._begin(step, console)
             if self.cloud is not None:
                 self.fitter.plant(self.cloud)
         elif not self.source.has_clock and self.fitter.num_steps == 1:
@@ -199,7 +202,7 @@ class Reconstruction:
         posture = self._posture(step)
         row = self.fitter.step(step.frames, posture)
         if self.fitter.num_steps == 1 and self._grow_budget(row, console):
-            self.fitter = self._begin(step, console)
+            self._fitter = self._begin(step, console)
             row = self.fitter.step(step.frames, posture)
         self._count_carried(step, posture)
         self.stamps.extend(frame.stamp_ns for frame in step.frames)
@@ -241,13 +244,11 @@ class Reconstruction:
 
     def finish(self) -> None:
         """Write the final map."""
-        assert self.fitter is not None
         fitter, stamp_ns = self.fitter, self.rows[-1].stamp_ns
         self.writer.finish(stamp_ns, fitter.splats(), fitter.known_voxels(), fitter.shell_splats())
         self._save(is_last=True)
 
     def metrics(self) -> dict[str, object]:
-        assert self.fitter is not None
         last = self.rows[-1]
         learned = None if self.robot is None else self.robot.self_model
         holding = {part.link for part in learned.held} if learned is not None else set[str]()
@@ -295,14 +296,14 @@ class Reconstruction:
         self.writer.audit(row)
 
     def snapshot(self, stamp_ns: int) -> None:
-        assert self.fitter is not None
         known, thresholds = self.fitter.known_voxels(), self.config.occupancy
         states = known.grid.states(thresholds.free_below, thresholds.occupied_above)
         self.writer.snapshot(stamp_ns, self.fitter.splats(), known, states, self.fitter.shell_splats())
 
     def _save_if_due(self) -> None:
         period = self.config.scene.checkpoint_period
-        if period > 0 and time.monotonic() < self._saved_at + max(period, LONGEST_SHARE * self._save_time):
+        # a checkpoint waits 50 times as long as the last one took: below 2 % of the run
+        if period > 0 and time.monotonic() < self._saved_at + max(period, 50 * self._save_time):
             return
         start = time.monotonic()
         self._save()
@@ -310,7 +311,6 @@ class Reconstruction:
         self._save_time = self._saved_at - start
 
     def _save(self, *, is_last: bool = False) -> None:
-        assert self.fitter is not None
         progress = {
             "run": self.identity,
             **{name: getattr(self, name) for name in KEPT},
@@ -336,7 +336,7 @@ class Reconstruction:
         self._fit_to(None if depth is None else RecordedDepth(**depth))
         budget = len(checkpoint.state["is_alive"])
         self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
-        self.fitter = self._new_fitter(workspace_of(checkpoint.state))
+        self._fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 
     def time_steps(self) -> Iterator[TimeStep]:

@@ -76,7 +76,7 @@ def open_to_train(
     if needs_depth:
         jumps = () if max_pose_jump == POSE_JUMP else ("pose-jump",)
         later = "agreement"  # `CameraAgreement` checks it, with the map's poses
-        refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps, later))
+        refuse_errors(recording.path, recording.options, (*allowed, *jumps, later))
     return source
 
 
@@ -191,15 +191,15 @@ class CameraAgreement:
         if self._guess:
             console.log(f"warning: {self._name}: {self._guess}; the map is in metres")
         is_sure = not self._guess and not are_far(step.frames)
-        for finding in check_views(step.frames, dict.fromkeys(cameras), is_sure=is_sure)[0]:
-            if finding.code == "views-scale" and not self._is_allowed:
+        findings = check_views(step.frames, dict.fromkeys(cameras), is_sure=is_sure)[0]
+        for finding in [finding for finding in findings if finding.code == "views-scale"]:
+            if not self._is_allowed:
                 raise InputError(
                     f"{self._name}: {finding.what}",
                     remedy=f"{rescaled(self._units(), finding.value or 1.0)}, or correct the poses' unit; if both are"
                     " right, give --allow-disagreement",
                 )
-            if finding.code == "views-scale":
-                console.log(f"warning: {self._name}: {finding.what}")
+            console.log(f"warning: {self._name}: {finding.what}")
 
     def _units(self) -> set[float | None]:
         """Depth units [m per count] of the cameras; None if unknown."""

@@ -32,8 +32,6 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.unrepresented import agreement_with_grid
 from splatctrl_cli.simulate.truth import Truth
 
-TILES = (6, 8)  # rows and columns of a first frame's stored picture
-
 
 def first_frame(frame: RgbdFrame) -> dict[str, Any]:
     """Facts of a camera's first training frame for ``run.json``.
@@ -110,7 +108,9 @@ def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
 
 def _tiles(color: UInt8) -> list[float]:
     rows, columns = (
-        np.linspace(0, size, num + 1).astype(int) for size, num in zip(color.shape[:2], TILES, strict=True)
+        # the picture is stored as 6 rows and 8 columns of tiles
+        np.linspace(0, size, num + 1).astype(int)
+        for size, num in zip(color.shape[:2], (6, 8), strict=True)
     )
     return [
         float(value)

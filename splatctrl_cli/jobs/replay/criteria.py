@@ -49,15 +49,6 @@ def events_of(replay: Replay, kind: EventKind, source: str = "") -> Sequence[Eve
     return [event for event in replay.events if event.kind is kind and event.source == source]
 
 
-def least_of(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float | None:
-    there = values[~np.isnan(values)]
-    return float(there.min()) if len(there) else None
-
-
-def time_of_least(judged: Judged, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
-    return seconds_at(judged, int(np.nanargmin(values)))
-
-
 def seconds_at(judged: Judged, index: int) -> float:
     """Time [s] since the first state."""
     stamps = judged.replay.audit.stamp_ns

@@ -15,6 +15,7 @@ from splatctrl_cli.config.fixed import (
     UNSEEN,
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
+from splatctrl_cli.evaluate.metrics import lowest
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
 from splatctrl_cli.jobs.reconstruct.verdict import displaced_camera
 from splatctrl_cli.jobs.replay.criteria import (
@@ -24,7 +25,6 @@ from splatctrl_cli.jobs.replay.criteria import (
     clocks,
     evidence_age,
     judged_time,
-    least_of,
     map_age,
     mm,
     nearby,
@@ -228,7 +228,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
     With a smaller clearance no contact was seen, but the map cannot exclude one: not evaluable, unless another
     criterion fails. The same holds for too little evidence.
     """
-    found, surface = judged.replay.map_error, least_of(judged.replay.between["surface"])
+    found, surface = judged.replay.map_error, lowest(judged.replay.between["surface"])
     if found is None:
         if judged.request.require_evidence:
             yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")

@@ -340,9 +340,9 @@ def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:
     stamp, worst = int(audit.stamp_ns[state]), int(audit.clearance["exact"].sphere[state])
     centers = model.sphere_centers(np.asarray(audit.position[state]))
     (obstacle,) = inputs.scene.at(stamp).obstacles(np.ascontiguousarray(centers[[worst]]))
-    figures = [f"{NAMES.get(name, name)} {_cm(float(of.distance[state]))}" for name, of in audit.clearance.items()]
+    figures = [f"{NAMES.get(name, name)} {100 * of.distance[state]:.2f} cm" for name, of in audit.clearance.items()]
     if replay.true_clearance is not None:
-        figures.append(f"truth {_cm(float(replay.true_clearance[state]))}")
+        figures.append(f"truth {100 * float(replay.true_clearance[state]):.2f} cm")
     step = replay.steps[state] if replay.steps else None
     rung = "" if step is None else f"   step: {step.rung}" + (f", scaled by {step.scale:g}" if step.scale < 1 else "")
     seconds = (stamp - int(audit.stamp_ns[0])) * 1e-9
@@ -358,7 +358,3 @@ def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:
             f"nearest: {obstacle}",
         ),
     )
-
-
-def _cm(metres: float) -> str:
-    return f"{100 * metres:.2f} cm"

@@ -1,7 +1,6 @@
 """The controller of a replay and its goal."""
 
 import csv
-import math
 import re
 import shlex
 import tomllib
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.ranges import POSE, checked_pose
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import TwistTrack
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController, class_command
@@ -41,7 +41,6 @@ TWIST_FIGURES = {
         Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02),
     ),
 }
-POSE = "x,y,z,qx,qy,qz,qw"
 POSE_COLUMNS = tuple(POSE.split(","))
 
 
@@ -142,18 +141,6 @@ def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, list[float]]]:
         yield kind, [float(value) for value in values]
 
 
-def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
-    """Return the pose `POSE` unchanged. Raises ValueError for a wrong length or quaternion norm."""
-    if len(values) != 7:
-        raise ValueError(f"expected 7 numbers {POSE}, got {len(values)}")
-    if not all(math.isfinite(value) for value in values):
-        raise ValueError(f"expected finite numbers, got {','.join(map(str, values))}")
-    length = math.hypot(*values[3:])
-    if abs(length - 1.0) > 0.01:
-        raise ValueError(f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}")
-    return tuple(values)
-
-
 def check_twists(request: ReplayRequest) -> None:
     """Raise UsageError for twists without a controller, or a frame without twists."""
     if request.twist_topic is not None and request.mode == "audit":
@@ -164,10 +151,8 @@ def check_twists(request: ReplayRequest) -> None:
         raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
 
 
-def twist_track(
-    request: ReplayRequest, model: RobotModel, span_ns: tuple[int, int], console: Progress
-) -> TwistTrack | None:
-    """Read the twists of --twist-topic, None without it; span_ns: first and last joint state.
+def twist_track(request: ReplayRequest, model: RobotModel, states_ns: Stamps, console: Progress) -> TwistTrack | None:
+    """Read the twists of --twist-topic, None without it; states_ns (T,): of the joint states.
 
     Raises InputError for an unknown frame, or no overlap in time.
     """
@@ -181,13 +166,13 @@ def twist_track(
             remedy=f"give --twist-frame, one of: world, {', '.join(model.frame_names)}",
         )
     first, last = int(logged.stamp_ns[0]), int(logged.stamp_ns[-1])
-    if last < span_ns[0] or first > span_ns[1]:
+    if last < states_ns[0] or first > states_ns[-1]:
         raise InputError(
-            f"{logged.where}: mixed clocks: expected twists between the joint states' stamps {span_ns[0]} and "
-            f"{span_ns[1]} ns, got {first} to {last} ns",
+            f"{logged.where}: mixed clocks: expected twists between the joint states' stamps {states_ns[0]} and "
+            f"{states_ns[-1]} ns, got {first} to {last} ns",
             remedy="record both by one clock",
         )
-    from_s, to_s = ((stamp - span_ns[0]) * 1e-9 for stamp in (first, last))
+    from_s, to_s = ((stamp - states_ns[0]) * 1e-9 for stamp in (first, last))
     console.log(f"replay: {len(logged.stamp_ns)} twists in {frame}, {from_s:.2f} to {to_s:.2f} s of the log")
     for note in logged.notes:
         console.log(f"replay: {request.twist_topic}: {note}")

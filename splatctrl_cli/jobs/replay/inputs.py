@@ -18,7 +18,7 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
-from splatctrl_cli.geometry import transform_from, transform_points
+from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.robot.logged_robot import other_frame, urdf_of, with_self_model
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
@@ -51,10 +51,6 @@ LOG_FIGURES = {  # they describe the log
     "max_pose_rest_rotation": ANGLE,
     **dict.fromkeys(("clock_offset_s", "clock_uncertainty_s"), TIME),
 }
-FR3_LIMITS = (
-    "an FR3 refuses speeds near its position limits that its URDF allows; set control.velocity_limits = fr3 to keep "
-    "the published ones"
-)
 
 
 def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[RobotModel, FrameSource | StateSource]:
@@ -65,10 +61,7 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
     urdf = urdf_of(request.urdf, (request.log,), progress)
     if urdf is None:
         raise UsageError(f"replay: {request.log} does not describe the robot", remedy="give it with --urdf FILE")
-    T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
-    model = RobotModel.from_urdf(
-        urdf, request.spheres, T_world_base=T_world_base, locked=request.locked, packages=request.packages
-    )
+    model = request.posed(urdf)
     source = open_states(request.log, request.options, model.joint_names)
     if not source.joint_names:
         raise InputError(
@@ -120,10 +113,14 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
     model = robot.model
     if request.mode == "audit":
         return list(model.doubts)
+    of_fr3 = (
+        "an FR3 refuses speeds near its position limits that its URDF allows; set control.velocity_limits = fr3 to"
+        " keep the published ones"
+    )
     is_fr3 = all(name.startswith("fr3_joint") for name in model.joint_names)
     return [
         *model.doubts,
-        *([FR3_LIMITS] if is_fr3 and config.velocity_limits == "urdf" else []),
+        *([of_fr3] if is_fr3 and config.velocity_limits == "urdf" else []),
         *(
             f"{' and '.join(pair.links)}: their spheres overlap in every posture sampled, and nothing tells whether "
             "they touch: fit finer spheres (splatctrl robot spheres), or leave the pair out (--srdf)"

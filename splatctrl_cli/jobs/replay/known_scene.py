@@ -3,7 +3,7 @@
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,8 +60,7 @@ class KnownScene:
     stamps_ns: of consecutive scenes, each known `latency_ns` after its stamp; empty for one scene for all times.
     `advance` to a stamp makes the scenes up to it; call `finish` after the replay. box: of a grid's cell centres.
     moment_ns: the time of a baked field. seen_at: when space was last seen, as known at a stamp; without
-    has_seen_times only if it ever was. figures: of the reconstruction, complete after the replay. has_people_margin:
-    people keep another margin than objects.
+    has_seen_times only if it ever was. figures: of the reconstruction, complete after the replay.
     """
 
     at: Callable[[int], KnownFields]
@@ -78,8 +77,6 @@ class KnownScene:
     seen_at: Callable[[int], Seen | None] = lambda stamp_ns: None
     has_seen_times: bool = True
     figures: Callable[[], Mapping[str, Any]] = dict
-    has_people_margin: bool = False
-    made_from: Mapping[str, Any] = field(default_factory=dict)
 
     def age_s(self, stamp_ns: int) -> float:
         """Age [s] of the scene in use; for a field, time from its moment; NaN without times."""
@@ -164,7 +161,6 @@ def from_grid(path: Path) -> KnownScene:
         moment_ns=moment if isinstance(moment := grid.header.get("stamp_ns"), int) else None,
         box=barrier.box,
         figures=lambda: made_from,
-        made_from=made_from,
     )
 
 
@@ -209,7 +205,6 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
         latency_ns=latency_ns,
         seen_at=seen_at,
         figures=lambda: scene.run.get("metrics", {}),
-        has_people_margin=config.control.human_margin > config.control.margin,
     )
 
 

@@ -18,8 +18,8 @@ from splatctrl_cli.files.output import Stopwatch, write_run
 from splatctrl_cli.formats.scene.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.formats.splat.splats import read_ply
 from splatctrl_cli.jobs.check import refuse_errors
+from splatctrl_cli.jobs.reconstruct.reconstruct import arm_seen
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest
-from splatctrl_cli.jobs.reconstruct.self_model import arm_seen
 from splatctrl_cli.jobs.recordings.open_recording import check_pose_jumps
 from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replay.known_scene import (
@@ -83,11 +83,6 @@ def _latency_ns(request: ReplayRequest) -> int:
     return int(request.latency * 1e9 + 0.5)
 
 
-def reads_whole_log(request: ReplayRequest, source: RecordSource) -> bool:
-    """True if a lockstep reads every frame of the log: none of its cameras is evidence."""
-    return request.lockstep and request.evidence not in source.cameras
-
-
 def from_log(
     request: ReplayRequest,
     model: RobotModel,
@@ -107,7 +102,7 @@ def from_log(
     check_pose_jumps(source, request.max_pose_jump)
     allowed = ("agreement", *(("views-agreement", "views-scale", "alignment") if request.allow_disagreement else ()))
     jumps = () if request.max_pose_jump == POSE_JUMP else ("pose-jump",)
-    refuse_errors(request.log, request.options, "reconstruct", (*allowed, *jumps))
+    refuse_errors(request.log, request.options, (*allowed, *jumps))
     place = folder / FOLDER
     place.mkdir()
     asked = ReconstructRequest(
@@ -201,7 +196,6 @@ class Lockstep:
             digests={},
             stamps_ns=self._stamps_ns,
             latency_ns=self._latency_ns,
-            has_people_margin=self._config.control.human_margin > self._config.control.margin,
             advance=self._advance,
             finish=self._finish,
         )
@@ -231,7 +225,6 @@ class Lockstep:
             self._take()
         num_taken, known = self._known
         if num_taken != len(self._fitted.rows):
-            assert self._fitted.fitter is not None
             known = known_space(self._fitted.fitter.occupancy.grid())
             self._known = len(self._fitted.rows), known
         return known(points)

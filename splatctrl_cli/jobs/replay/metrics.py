@@ -46,7 +46,6 @@ from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.voxels import EvidenceClass
 
 Metrics = dict[str, float | None]
-Counts = dict[str, int]
 Declared = tuple[Metric[Replay], ...]
 
 
@@ -104,7 +103,6 @@ SPEED = Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02)
 SLACK = Scale(unit="m/s", better=Better.HIGHER, absolute=1e-3, relative=0.02)  # or rad/s, by the row
 AT_GOAL = Scale(unit="m", better=Better.LOWER, absolute=ControlConfig().goal_position)  # within it, it is reached
 TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_rotation)
-RESIDUAL = Scale(better=Better.LOWER, absolute=1e-6)
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
 NEAREST = least_of("clearance_exact")
 AUDIT = partial(_of, "audit.figures")
@@ -199,13 +197,12 @@ OF_STATES: Declared = (
 
 
 LARGEST_DIFFERENCE, LEAST_SLACK = largest_of("velocity_difference"), least_of("barrier_margin_logged")
-FULFILLED_STEPS = Scale(better=Better.HIGHER, relative=0.05)
 STEPS, ASKED = partial(_of, "kept_steps.figures"), partial(_of, "open_loop.figures")
 
 
 def _rung(rung: Rung) -> Metric[Replay]:
     name, shown = "num_" + rung.value.replace("-", "_"), Shown(column="rung", pick=rung.value)
-    scale = FULFILLED_STEPS if rung is Rung.SOLVED else FAULTS
+    scale = Scale(better=Better.HIGHER, relative=0.05) if rung is Rung.SOLVED else FAULTS
     return counted(name, STEPS("rung"), lambda _, values: values == RUNGS.index(rung), scale=scale, shown=shown)
 
 
@@ -217,7 +214,13 @@ OF_STEPS: Declared = (
     *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
     folded("num_refused", TOTAL, STEPS("refused"), scale=FAULTS),
     counted("num_scaled_back", STEPS("scale"), lambda _, values: values < 1, shown=least_of("scale")),
-    folded("max_residual", LARGEST, STEPS("residual"), scale=RESIDUAL, shown=largest_of("residual")),
+    folded(
+        "max_residual",
+        LARGEST,
+        STEPS("residual"),
+        scale=Scale(better=Better.LOWER, absolute=1e-6),
+        shown=largest_of("residual"),
+    ),
 )
 OF_OPEN_LOOP: Declared = (
     folded("mean_velocity_difference", MEAN, ASKED("size"), scale=SPEED, shown=LARGEST_DIFFERENCE),
@@ -283,16 +286,10 @@ def _declared_of(replay: Replay) -> Declared:
     return _declared(replay.mode, tuple(replay.audit.clearance))
 
 
-def metric_names(
-    mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
-) -> tuple[str, ...]:
-    """Names of `metrics_of` and of the log's own figures."""
-    return tuple(metric_scales(mode, of_fields, has_truth=has_truth, has_twists=has_twists))
-
-
 def metric_scales(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
+    """Comparison scales of `metrics_of` and of the log's own figures, by name."""
     scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)} | LOG_FIGURES
     scales |= TWIST_FIGURES if has_twists else {}
     if has_truth:
@@ -316,7 +313,7 @@ def metrics_of(replay: Replay) -> Metrics:
     return metrics
 
 
-def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
+def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
     """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
     found = dict.fromkeys(metrics, num_states(replay))
     found |= {metric.name: metric.count(replay) for metric in _declared_of(replay)}

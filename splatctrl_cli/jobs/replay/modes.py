@@ -17,7 +17,7 @@ from splatctrl_cli.jobs.recordings.provenance import times_apart
 from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, twist_figures, twist_track
 from splatctrl_cli.jobs.replay.inputs import check_inside
 from splatctrl_cli.jobs.replay.known_scene import Certified, KnownScene, certified_distance
-from splatctrl_cli.jobs.replay.request import FIRST_MAP, Replay, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
 from splatctrl_cli.jobs.replay.state_store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.jobs.running.progress import Progress
@@ -46,7 +46,7 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
     scene, model, states = inputs.scene, inputs.model, inputs.states
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     frame = request.frame or model.frame_names[-1]
-    twists = twist_track(request, model, _span(inputs), console)
+    twists = twist_track(request, model, inputs.states.stamp_ns, console)
     task = OpenLoopTask(frame=frame, twists=twists)
     if any(given is not None for given in (request.goal, request.goal_joints, request.waypoints)):
         goals = goal_waypoints(request, model, frame, states.position[-1])
@@ -93,7 +93,7 @@ def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -
 def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
     motion = inputs.motion()
-    twists = twist_track(request, model, _span(inputs), console)
+    twists = twist_track(request, model, inputs.states.stamp_ns, console)
     task = _task(request, inputs, motion, twists, config.control.limit_tolerance)
     start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
     limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
@@ -211,7 +211,7 @@ def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
         )
     if request.start_time is None:
         return int(stamps[0])
-    if request.start_time == FIRST_MAP:
+    if request.start_time == "first-map":
         return max(int(stamps[0]), int(stamps[0]) if scene.first_ns is None else scene.first_ns)
     start = int(stamps[0]) + round(float(request.start_time) * 1e9)
     if start > stamps[-1]:
@@ -227,10 +227,6 @@ def _first_judged(request: ReplayRequest, inputs: ReplayInputs) -> int:
     scene, stamps = inputs.scene, inputs.states.stamp_ns
     earliest = _requested_ns(request, inputs)
     return int(np.searchsorted(stamps, earliest if scene.first_ns is None else max(earliest, scene.first_ns)))
-
-
-def _span(inputs: ReplayInputs) -> tuple[int, int]:
-    return int(inputs.states.stamp_ns[0]), int(inputs.states.stamp_ns[-1])
 
 
 def _task(

@@ -7,6 +7,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.evaluate.metrics import lowest
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replay.criteria import (
     BROKEN,
@@ -20,10 +21,9 @@ from splatctrl_cli.jobs.replay.criteria import (
     controller,
     events_of,
     goal,
-    least_of,
     mm,
     scene_hits,
-    time_of_least,
+    seconds_at,
 )
 from splatctrl_cli.jobs.replay.inputs import bare_moving_links, recorded_postures
 from splatctrl_cli.robot.self_margins import least_gap
@@ -31,7 +31,7 @@ from splatctrl_cli.robot.self_margins import least_gap
 
 def clearance(judged: Judged) -> Iterator[Reason]:
     """The exact distance of every moving sphere to the splats keeps the margin."""
-    represented = least_of(judged.replay.between["represented"])
+    represented = lowest(judged.replay.between["represented"])
     if represented is not None and represented >= judged.threshold:
         yield from _unrepresented(judged, represented)
     else:
@@ -43,7 +43,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
     clearance = judged.replay.audit.clearance
     if "certified" not in clearance:
         return
-    least, exact = (least_of(clearance[name].distance) for name in ("certified", "exact"))
+    least, exact = (lowest(clearance[name].distance) for name in ("certified", "exact"))
     if least is None or exact is None or not least < judged.threshold <= exact:
         yield from _by_source(judged, "certified")
         return
@@ -61,7 +61,8 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
 
 def clearance_of_people(judged: Judged) -> Iterator[Reason]:
     """The arm keeps `control.human_margin` from people; judged if that exceeds the margin."""
-    if judged.inputs.scene.has_people_margin:
+    control = judged.request.config.control
+    if control.human_margin > control.margin:
         yield from _by_source(judged, "barrier")
 
 
@@ -74,7 +75,7 @@ def true_clearance(judged: Judged) -> Iterator[Reason]:
 def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     replay = judged.replay
     values = replay.true_clearance if source == "true" else replay.audit.clearance[source].distance
-    least = least_of(np.asarray(values))
+    least = lowest(np.asarray(values))
     if least is None:
         return
     if least >= judged.threshold:
@@ -103,7 +104,7 @@ def _apart(least: float) -> str:
 
 def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
     replay = judged.replay
-    least = least_of(replay.audit.clearance["exact"].distance)
+    least = lowest(replay.audit.clearance["exact"].distance)
     assert least is not None
     if least >= judged.threshold:
         yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
@@ -139,7 +140,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     table of the URDF. Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their
     largest gap) unless the recording was. Measured by collision surfaces, or by spheres if these cannot be read.
     """
-    least = least_of(judged.replay.audit.figures["self_clearance"])
+    least = lowest(judged.replay.audit.figures["self_clearance"])
     events = events_of(judged.replay, EventKind.SELF_COLLISION)
     if least is None or not np.isfinite(least):
         return
@@ -233,10 +234,8 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
 
 def position_limits(judged: Judged) -> Iterator[Reason]:
     """Joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise."""
-    least, tolerance = (
-        least_of(judged.replay.audit.figures["limit_margin"]),
-        judged.request.config.control.limit_tolerance,
-    )
+    least = lowest(judged.replay.audit.figures["limit_margin"])
+    tolerance = judged.request.config.control.limit_tolerance
     if least is None:
         return
     if least < -tolerance:
@@ -317,7 +316,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             value=surface,
             threshold=judged.replay.margin,
             unit="m",
-            time_s=time_of_least(judged, judged.replay.between["surface"]),
+            time_s=seconds_at(judged, int(np.nanargmin(judged.replay.between["surface"]))),
             remedy="use spheres that cover the robot: splatctrl robot spheres",
             count=judged.num_states,
         )
@@ -339,7 +338,7 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
             value=between,
             threshold=judged.replay.margin,
             unit="m",
-            time_s=time_of_least(judged, columns["lower"]),
+            time_s=seconds_at(judged, int(np.nanargmin(columns["lower"]))),
             remedy=SLOW,
             count=judged.num_states,
         )
@@ -351,10 +350,10 @@ def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
     The last two are None if unknown. If the spheres break the margin, they are None and the first is NaN.
     """
     clearance = judged.replay.audit.clearance
-    spheres = least_of(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
+    spheres = lowest(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
     if spheres is None or spheres < judged.threshold:
         return np.nan, None, None
-    return spheres, least_of(judged.replay.between["surface"]), least_of(judged.replay.between["lower"])
+    return spheres, lowest(judged.replay.between["surface"]), lowest(judged.replay.between["lower"])
 
 
 OF_MOTION: tuple[Criterion[Judged], ...] = (

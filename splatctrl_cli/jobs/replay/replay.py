@@ -37,8 +37,8 @@ from splatctrl_cli.jobs.replay.inputs import (
     words_of,
 )
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
-from splatctrl_cli.jobs.replay.lockstep import check_lockstep, opened_scene, reads_whole_log
-from splatctrl_cli.jobs.replay.metrics import Metrics, metric_names, metrics_of
+from splatctrl_cli.jobs.replay.lockstep import check_lockstep, opened_scene
+from splatctrl_cli.jobs.replay.metrics import Metrics, metric_scales, metrics_of
 from splatctrl_cli.jobs.replay.modes import replayed
 from splatctrl_cli.jobs.replay.request import MODES, Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.verdict import ASKED, replay_verdict
@@ -117,7 +117,7 @@ def check_request(request: ReplayRequest) -> None:
     """Raise UsageError for gates on missing figures, and options of another mode."""
     fields = ("exact", "barrier", *(("certified",) if request.field is not None else ()))
     has_truth, has_twists = request.truth is not None, request.twist_topic is not None
-    names = {mode: metric_names(mode, fields, has_truth=has_truth, has_twists=has_twists) for mode in MODES}
+    names = {mode: metric_scales(mode, fields, has_truth=has_truth, has_twists=has_twists) for mode in MODES}
     check_gate_names(request.require, names[request.mode], {f"--mode {mode}": names[mode] for mode in names})
     check_lockstep(request)
     check_evidence(request)
@@ -161,7 +161,8 @@ def _read(
     declared = replace(declared, expected_contact=meant)
     evidence = open_evidence(request, model)
     source = logged.source
-    observe = motion.add if reads_whole_log(request, source) else None
+    reads_all = request.lockstep and request.evidence not in source.cameras  # none of them is evidence
+    observe = motion.add if reads_all else None
     if source.cameras and observe is None:
         for frame in frames_of(source):
             motion.add(frame)
@@ -188,7 +189,7 @@ def _mismatches(
     request: ReplayRequest, known: KnownScene, logged: LoggedStates, model: RobotModel
 ) -> tuple[Mismatch, ...]:
     if request.field is not None:
-        return tuple(made_from_mismatches(request.field, known.made_from, logged.source, model))
+        return tuple(made_from_mismatches(request.field, known.figures(), logged.source, model))
     if request.scene is None:
         return ()
     return tuple(scene_mismatches(open_scene(request.scene), logged.source, logged.states, model))

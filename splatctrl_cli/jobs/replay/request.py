@@ -30,7 +30,6 @@ from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces
 from splatctrl_cli.simulate.truth import Truth
 
 MODES = ("audit", "open-loop", "closed-loop")
-FIRST_MAP = "first-map"  # a start time: that of the first map
 JUDGE, OCCUPIED = "judge", "occupied"  # space that no camera saw free: judged by a table, or an obstacle
 
 
@@ -39,7 +38,8 @@ class ReplayRequest(RobotOptions, RunOptions):
     """One replay: the options of ``splatctrl replay``, by name.
 
     log: read by `options`. urdf: None for the robot of the log. The scene is `scene` (a reconstruction), `field` (a
-    baked grid) or `lockstep` (reconstruct meanwhile, on `device`). Times are in seconds; start_time may be FIRST_MAP.
+    baked grid) or `lockstep` (reconstruct meanwhile, on `device`). Times are in seconds; start_time may be
+    "first-map".
     evidence: a held-out camera, or k for each k-th frame set, to bound the map's error. require_evidence,
     require_proof: no pass without evidence, or with space about the arm assumed free. unseen: `JUDGE` or `OCCUPIED`.
     controller: a user's class ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the

@@ -23,7 +23,6 @@ STEP_FIGURES = (
     *(f"shaped {kind}" for kind in RowKind),
 )
 AUDITED = ("position", "limit_margin", "limit_joint", "self_clearance", "self_pair", "unknown_share")
-STEP_BLANK = (np.nan,) * len(STEP_FIGURES)
 T = TypeVar("T")
 
 
@@ -194,7 +193,7 @@ class StoredSteps:
     def extend(self, steps: Sequence[ControlStep | None], num_joints: int) -> None:
         blank = np.full(num_joints, np.nan)
         self.stored.extend(steps)
-        rows = np.array([STEP_BLANK if step is None else _figures_of(step) for step in steps])
+        rows = np.array([(np.nan,) * len(STEP_FIGURES) if step is None else _figures_of(step) for step in steps])
         self.figures.append(
             velocity=np.array([blank if step is None else step.velocity for step in steps]),
             **dict(zip(STEP_FIGURES, rows.T, strict=True)),

@@ -5,7 +5,7 @@ from dataclasses import replace
 from operator import attrgetter
 
 from splatctrl_cli.control.line_process import shown
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Verdict, gate_reasons, verdict_of
 from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words, displaced
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
@@ -33,7 +33,12 @@ def replay_verdict(judged: Judged) -> Verdict:
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     if displaced(judged) is not None:
         by_map = (*BY_MAP, *(() if replay.outside else BY_OUR_CONTROLLER))
-        reasons = [_doubted(reason) if reason.criterion in by_map else reason for reason in reasons]
+        reasons = [  # what failed may be the robot itself, as an obstacle of the map
+            replace(reason, outcome=Outcome.NOT_EVALUABLE, label="")
+            if reason.criterion in by_map and reason.outcome is Outcome.FAILED
+            else reason
+            for reason in reasons
+        ]
         reasons.sort(key=lambda reason: reason.criterion != "calibration")
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # contact by any measure precedes a broken margin
     counts = counts_of(replay, judged.logged, judged.metrics)
@@ -57,12 +62,6 @@ def replay_verdict(judged: Judged) -> Verdict:
         is_damaged=bool(judged.inputs.source.loss.damaged),
         counts=counts,
     )
-
-
-def _doubted(reason: Reason) -> Reason:
-    """Make a failure not evaluable if the map may contain the robot as an obstacle."""
-    is_failure = reason.outcome is Outcome.FAILED
-    return replace(reason, outcome=Outcome.NOT_EVALUABLE, label="") if is_failure else reason
 
 
 def _how(judged: Judged) -> str:

@@ -27,12 +27,8 @@ from splatctrl_cli.jobs.runs.run_folder import (
 from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, packed, picture, rendered
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
-PICTURES = {True: (3, 800), False: (1, 640)}  # number and width [px] for a batch's run with and without a scene
-LOG_LINES = 12  # of a job that ended in an error
 MOST_ROWS = 40  # of recordings that are shown at once
-WITHOUT_A_RUN = ("skipped", "to do")  # states of jobs
 WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
-MAP = "reconstruct"
 WITH_PICTURES = {  # by command: part of a picture's name, and its caption
     "score": ("_best_worst", "photo, render and depth error of the best and the worst view"),
     "sdf-bake": ("slices", "slices of the distance"),
@@ -213,9 +209,9 @@ def _job(batch: BatchFolder, ran: Run, is_changed: bool) -> _Job:
 
 def _is_told(job: _Job, *, is_seen: bool) -> bool:
     """True for jobs with a section: replays, unexpected or changed results, and maps to show."""
-    if is_seen and job.ran.command == MAP and job.run is not None:
+    if is_seen and job.ran.command == "reconstruct" and job.run is not None:
         return True
-    if job.ran.state in WITHOUT_A_RUN:
+    if job.ran.state in ("skipped", "to do"):  # without a run
         return job.is_changed
     return job.ran.command == REPLAY or job.ran.state != DONE or job.is_changed
 
@@ -233,7 +229,7 @@ def _section(
             lines=[f"expected: {ran.expect}", *([job.why] if job.why else [])],
             details=[_log(batch, ran)],
         )
-    most, width = PICTURES[has_space]
+    most, width = (3, 800) if has_space else (1, 640)  # number, and width [px]
     section = section_of(run, anchor=ran.node, title=ran.node, most_pictures=most, width=width)
     if ran.state != DONE:
         lines = [f"expected: {ran.expect}", *([ran.cause] if ran.cause else []), *section.lines]
@@ -284,7 +280,7 @@ def _log(batch: BatchFolder, ran: Run) -> Table:
         lines = batch.inside(ran.log).read_text(encoding="utf-8", errors="replace").splitlines()
     except (OSError, InputError):
         lines = ["no log"]
-    return Table(title="Log", text="\n".join(lines[-LOG_LINES:]))
+    return Table(title="Log", text="\n".join(lines[-12:]))
 
 
 @dataclass(frozen=True, kw_only=True)

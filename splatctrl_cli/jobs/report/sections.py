@@ -15,7 +15,6 @@ from splatctrl_cli.report.page import Cell, Row, RunSection, Table, picture
 from splatctrl_cli.report.timeline import legend, timeline
 
 PASSED = "passed"
-MOST_METRICS = 400  # rows of a table
 WIDTH = 900  # pixels of a picture at most
 PICTURES = {  # captions by start of file name
     "worst_": "a moment of least clearance: photo, and the arm's spheres as the replay had them",
@@ -57,7 +56,7 @@ def section_of(
         pictures=_pictures(run, most_pictures, width, has_timeline=states is not None),
         details=[
             *([replace(held, title=f"Criteria that hold ({len(held.rows)})")] if held.rows else []),
-            Table(title="Figures", header=("name", "value"), rows=figures[:MOST_METRICS]),
+            Table(title="Figures", header=("name", "value"), rows=figures[:400]),
             _settings(run),
             _provenance(run),
         ],

@@ -24,10 +24,7 @@ from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_o
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
-MOST_STATES = 240  # of a motion
-MOST_SETS = 5  # of splats over time
 MOST_UNKNOWN = 6000  # cubes of space never seen
-MOST_CELLS = 80  # along a side of a grid whose surface is drawn
 PLACE = re.compile(r"at \((-?[\d.]+), (-?[\d.]+), (-?[\d.]+)\)")
 
 
@@ -71,7 +68,7 @@ def space_of_grid(path: Path) -> Space:
     grid = read_npz(path)
     if "sdf" not in grid.channels:
         raise InputError(f"{path}: expected the channel sdf, got {', '.join(grid.channels)}")
-    step = -(-max(grid.channels["sdf"].shape) // MOST_CELLS)
+    step = -(-max(grid.channels["sdf"].shape) // 80)  # cells along a side at most
     channels = {"sdf": np.ascontiguousarray(grid.channels["sdf"][::step, ::step, ::step])}
     thinned = DistanceGrid(origin=grid.origin, voxel=step * grid.voxel, channels=channels, header=grid.header)
     try:
@@ -93,8 +90,7 @@ def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
         raise InputError(f"{run.path}: no steps.csv", remedy="replay again")
     robot = robot_of(run, states, roots)
     deciding = _deciding(run, states, robot)
-    space = replace(_scene_of(run, states, roots, deciding), deciding=deciding)
-    return replace(space, motion=_motion(run, states, robot))
+    return replace(_scene_of(run, states, roots, deciding), deciding=deciding, motion=_motion(run, states, robot))
 
 
 def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
@@ -182,12 +178,12 @@ def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple
 
 
 def spread(times: list[float], when: float) -> list[int]:
-    """Indices of at most MOST_SETS of `times`: first, last, the one at `when`, others evenly."""
+    """Indices of at most 5 of `times`: first, last, the one at `when`, others evenly."""
     if not times:
         return []
     count = len(times)
     at = max((i for i, time in enumerate(times) if time <= when), default=0)
-    most = min(count, MOST_SETS)
+    most = min(count, 5)
     even = np.linspace(0, count - 1, most).round().astype(int).tolist()
     nearest = min(range(most), key=lambda i: abs(even[i] - at))
     if 0 < nearest < most - 1:
@@ -206,7 +202,7 @@ def _with_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) 
 
 def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
     count = len(states.seconds)
-    chosen = set(np.linspace(0, count - 1, min(count, MOST_STATES)).round().astype(int).tolist())
+    chosen = set(np.linspace(0, count - 1, min(count, 240)).round().astype(int).tolist())
     worst = states.worst()
     which = sorted(chosen if worst is None else chosen | {worst})
     bodies = robot_bodies(robot)

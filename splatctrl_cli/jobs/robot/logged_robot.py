@@ -7,19 +7,19 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import DAMAGE, read_arrays
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
+from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.log.survey import NAME, RobotDescription
 from splatctrl_cli.recording.source import logged_descriptions
 from splatctrl_cli.recording.state.state_source import StateSource
-from splatctrl_cli.records import RecordSource
+from splatctrl_cli.records import RecordSource, SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.model_difference import model_difference
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 NO_SELF_MODEL = Path("none")  # as --self-model: neither learned nor taken from the scene
-LARGEST_SELF_MODEL = 2**30  # bytes
 TAKE = "leave --urdf out to take the log's own, or correct the file"
 
 
@@ -35,6 +35,14 @@ class RobotOptions:
     packages: tuple[Path, ...] = ()
     base: tuple[float, ...] | None = None
     locked: Mapping[str, float] = field(default_factory=dict)
+
+    def posed(self, urdf: UrdfFile, otherwise: SphereSet | None = None) -> RobotModel:
+        """Robot of a URDF, with the spheres `otherwise` if none are given. Raises InputError."""
+        T_world_base = None if self.base is None else transform_from(self.base[:3], self.base[3:])
+        spheres = otherwise if self.spheres is None else self.spheres
+        return RobotModel.from_urdf(
+            urdf, spheres, T_world_base=T_world_base, locked=self.locked, packages=self.packages
+        )
 
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
@@ -68,7 +76,7 @@ def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = 
     if path is None or path == NO_SELF_MODEL or (given is None and not path.is_file()):
         return model
     try:
-        found = SelfModel.from_arrays(read_arrays(path, most=LARGEST_SELF_MODEL))
+        found = SelfModel.from_arrays(read_arrays(path, most=2**30))  # bytes
     except (*DAMAGE, OSError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: not a self-model: {error}", remedy="write it with: splatctrl robot learn"

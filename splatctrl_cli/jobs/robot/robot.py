@@ -21,6 +21,7 @@ from splatctrl_cli.evaluate.verdict import (
 )
 from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.report.pictures import robot_picture
@@ -60,18 +61,14 @@ METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths [m],
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotRequest:
+class RobotRequest(RobotOptions):
     """A robot, and the options of its jobs.
 
-    spheres: None for the URDF's own. packages: folders of meshes. locked: values [rad or m] of fixed joints. Fit and
-    check: `picture`, and gates `require` on METRICS. Pairs: `srdf`, or `postures` to sample, and `drop_never` for
-    pairs that never come near.
+    Fit and check: `picture`, and gates `require` on METRICS. Pairs: `srdf`, or `postures` to sample, and `drop_never`
+    for pairs that never come near.
     """
 
     urdf: Path
-    spheres: Path | None = None
-    packages: tuple[Path, ...] = ()
-    locked: Mapping[str, float] = field(default_factory=dict)
     picture: Path | None = None
     require: tuple[str, ...] = ()
     out: Path = Path("spheres.yaml")

@@ -3,8 +3,6 @@
 import time
 from typing import Protocol, Self
 
-TELL_S = 10.0  # between two lines of one wait
-
 
 class Progress(Protocol):
     """Receiver of log lines; no bar is drawn if `is_quiet`."""
@@ -45,12 +43,12 @@ class Wait:
         self.at(self._done + 1)
 
     def at(self, done: int) -> None:
-        """Report `done` steps, at most every `TELL_S`."""
+        """Report `done` steps, at most every 10 s."""
         self._done, now = done, time.monotonic()
         self._first = self._first or ((now, done) if done else None)
         if self._total is not None and done > self._total:
             return  # of what comes after it
-        if now - self._told < TELL_S:
+        if now - self._told < 10.0:  # between two lines of one wait
             return
         self._told, left = now, ""
         if self._total is not None and self._first is not None and done > self._first[1]:

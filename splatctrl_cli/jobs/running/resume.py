@@ -26,7 +26,6 @@ DECIDING_OPTIONS: Mapping[str, object] = {  # defaults that decide a scene's byt
         "refine_exposure": False,
     },
 }
-DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their versions may change a bit
 
 
 def identity(
@@ -52,7 +51,8 @@ def deciding_versions() -> dict[str, str]:
     return {
         "splatctrl": __version__,
         "kernels": arithmetic(),
-        **{name: metadata.version(name) for name in DECIDING_PACKAGES},
+        # packages whose versions may change a bit
+        **{name: metadata.version(name) for name in ("numpy", "scipy", "opencv-python-headless", "pin")},
     }
 
 

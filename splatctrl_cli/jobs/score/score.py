@@ -27,14 +27,13 @@ from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, r
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.score.reference import (
-    Reference,
     cameras_to_score,
     check_times,
     check_training,
     open_reference,
     recording_check,
 )
-from splatctrl_cli.jobs.score.views import CloudSettings, Scorer, Scores, cloud_figures
+from splatctrl_cli.jobs.score.views import CloudSettings, Scorer, cloud_figures
 from splatctrl_cli.records import Label
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, view_picture
 
@@ -135,22 +134,22 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
     check_training(request.scene, scene, reference)
     digests = reference.source.digests()
     same = recording_check(request.scene, scene, reference, digests, allow_other=request.allow_other_recording)
-    scores = scorer.run(progress, stopwatch)
+    scorer.run(progress, stopwatch)
     surface: dict[str, float] = {}
     if cloud is not None:
         with stopwatch.stage("cloud"):
-            surface = cloud_figures(cloud, scene, scores.training, request.threads)
-    protocol = _protocol(reference, scene, scores)
+            surface = cloud_figures(cloud, scene, scorer.training, request.threads)
+    protocol = _protocol(scorer)
     definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
-    metrics = total_score(scores.views) | surface
-    metrics |= {"free_mass": _free_mass(request.scene, scene), "num_skipped": len(scores.skipped)}
-    metrics["num_warnings"] = len(scores.doubts) + len(same["differences"])
-    report = _report(request, scorer, scores, same, protocol | {"definitions": definitions}, as_json(metrics))
+    metrics = total_score(scorer.views) | surface
+    metrics |= {"free_mass": _free_mass(request.scene, scene), "num_skipped": len(scorer.skipped)}
+    metrics["num_warnings"] = len(scorer.doubts) + len(same["differences"])
+    report = _report(request, scorer, same, protocol | {"definitions": definitions}, as_json(metrics))
     result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
     if folder:
         _write_table(folder / "views.csv", report["views"])
         with stopwatch.stage("pictures"):
-            for (_, best), (_, worst) in scores.extremes.values() if request.images != "none" else ():
+            for (_, best), (_, worst) in scorer.extremes.values() if request.images != "none" else ():
                 comparison = [best] if worst.title == best.title else [best, worst]
                 comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
         config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
@@ -163,35 +162,34 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
 def _report(
     request: ScoreRequest,
     scorer: Scorer,
-    scores: Scores,
     recording: dict[str, Any],
     protocol: dict[str, Any],
     metrics: dict[str, Any],
 ) -> dict[str, Any]:
     other = [f"another recording: {line}" for line in recording["differences"]]
-    views = scores.views
     return {
         "scene": str(request.scene),
         "reference": str(scorer.reference.where),
         "cameras": list(scorer.cameras),
         "training_cameras": list(scorer.scene.cameras),
-        "has_clock": scores.has_clock,
-        "snapshots": "newest" if scores.has_clock and request.newest else "final",
+        "has_clock": scorer.has_clock,
+        "snapshots": "newest" if scorer.has_clock and request.newest else "final",
         "recording": recording,
         "protocol": protocol,
         "metrics": metrics,
-        "warnings": [*other, *scores.doubts],
-        "skipped_views": scores.skipped,
+        "warnings": [*other, *scorer.doubts],
+        "skipped_views": scorer.skipped,
         "views": [
-            {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in views
+            {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scorer.views
         ],
     }
 
 
-def _protocol(reference: Reference, scene: SceneFolder, scores: Scores) -> dict[str, Any]:
+def _protocol(scorer: Scorer) -> dict[str, Any]:
     """Facts a figure must be published with to be comparable."""
+    reference = scorer.reference
     named, split = reference.protocol, reference.split
-    sizes = sorted({view.size for view in scores.views})
+    sizes = sorted({view.size for view in scorer.views})
     return {
         "name": "none" if named is None else named.name,
         "source": "none" if named is None else named.source,
@@ -204,7 +202,7 @@ def _protocol(reference: Reference, scene: SceneFolder, scores: Scores) -> dict[
         "resolution": [f"{width}x{height}" for width, height in sizes],
         "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
         "published_scans": None if named is None or not named.scans else list(named.scans),
-        "background": [round(value, 4) for value in scene.background],
+        "background": [round(value, 4) for value in scorer.scene.background],
         "averaging": AVERAGING,
     }
 

@@ -25,35 +25,22 @@ from splatctrl_cli.formats.scene.scene_folder import SceneFolder
 from splatctrl_cli.jobs.reconstruct.correct_views import corrected, corrected_among
 from splatctrl_cli.jobs.running.progress import Progress, Wait
 from splatctrl_cli.jobs.score.reference import Reference
-from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, Label, RgbdFrame, SplatSet
+from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow
 from splatctrl_cli.scene.gaussians import render_gaussians
-from splatctrl_cli.scene.render import Rendering, render
+from splatctrl_cli.scene.render import Color, Rendering, render
 
 Ranked = tuple[float, ComparisonRow]
 """PSNR [dB] over what was seen, or over all, and the view."""
 
 
 @dataclass(kw_only=True)
-class Scores:
-    """Scored views; skipped: names before the first snapshot; extremes: best and worst by camera.
-
-    training: frames known at the last view.
-    """
-
-    has_clock: bool
-    views: list[ViewScore] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
-    extremes: dict[str, tuple[Ranked, Ranked]] = field(default_factory=dict)
-    training: tuple[RgbdFrame, ...] = ()
-    doubts: list[str] = field(default_factory=list)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Scorer:
     """Scorer of views of `reference`; `draw` gets every view's row of pictures.
 
-    newest: render from the newest snapshot not later than the view, else from the final splats.
+    newest: render from the newest snapshot not later than the view, else from the final splats. Filled by `run`:
+    views; skipped: names before the first snapshot; extremes: best and worst by camera; training: frames known at
+    the last view; doubts.
     """
 
     scene: SceneFolder
@@ -63,11 +50,19 @@ class Scorer:
     newest: bool = True
     allow_training: bool = False
     threads: int = 0
+    views: list[ViewScore] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    extremes: dict[str, tuple[Ranked, Ranked]] = field(default_factory=dict)
+    training: tuple[RgbdFrame, ...] = ()
+    doubts: list[str] = field(default_factory=list)
 
-    def run(self, progress: Progress, stopwatch: Stopwatch) -> Scores:
+    @property
+    def has_clock(self) -> bool:
+        return self.scene.has_clock and self.reference.source.has_clock
+
+    def run(self, progress: Progress, stopwatch: Stopwatch) -> None:
         """Score every view. Raises NotEvaluableError without views, or if no pixel was seen."""
-        scene, source = self.scene, self.reference.source
-        has_clock = scene.has_clock and source.has_clock
+        scene, has_clock = self.scene, self.has_clock
         off = scene.run.get("metrics", {}).get("displaced_cameras") or {}
         stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
 
@@ -76,9 +71,8 @@ class Scorer:
             splats = final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
             return splats, scene.shell_at(stamp_ns)
 
-        scores = Scores(has_clock=has_clock)
         views = views_to_score(
-            source,
+            self.reference.source,
             scoring=self.cameras,
             training=scene.cameras,
             has_clock=has_clock,
@@ -96,64 +90,56 @@ class Scorer:
                 )
             num_known = bisect_right(stamps, view.frame.stamp_ns)
             if has_clock and not num_known:
-                scores.skipped.append(view.name)
+                self.skipped.append(view.name)
                 continue
             with stopwatch.stage("score"):
                 shown = splats_at(stamps[num_known - 1] if has_clock and self.newest else None)
-                self._score_one(scores, doubts, view, *shown)
-            wait.at(len(scores.views))
-        self._check(scores)
-        scores.doubts += [*self.reference.doubts, *doubts.lines()]
+                self._score_one(doubts, view, *shown)
+            wait.at(len(self.views))
+        self._check()
+        self.doubts += [*self.reference.doubts, *doubts.lines()]
         if not scene.names_its_views:
-            scores.doubts.append(
+            self.doubts.append(
                 f"{scene.path}: does not say which views trained it, and figures of training views say nothing about"
                 " others; give the --cameras that did not train"
             )
-        return scores
 
-    def _check(self, scores: Scores) -> None:
+    def _check(self) -> None:
         where, cameras = self.reference.where, ", ".join(self.cameras)
-        if not scores.views:
+        if not self.views:
             raise NotEvaluableError(
-                f"{where}: no view of {cameras} to score; {len(scores.skipped)} lie before the first snapshot of the"
+                f"{where}: no view of {cameras} to score; {len(self.skipped)} lie before the first snapshot of the"
                 " scene",
                 remedy="give the recording that the scene was reconstructed from, or other --cameras",
             )
         has_training = self.scene.names_its_views
-        if has_training and self.reference.has_depth and not any(view.seen.share for view in scores.views):
+        if has_training and self.reference.has_depth and not any(view.seen.share for view in self.views):
             raise NotEvaluableError(
                 f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
                 remedy="is it the same world and the same scene? give the recording that reconstruct was given",
             )
 
-    def _score_one(
-        self, scores: Scores, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None
-    ) -> None:
+    def _score_one(self, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None) -> None:
         frame = view.frame
         score, row = self._compared(view, frame, splats, shell)
         doubts.look(view, row.render, row.mask)
         if self.scene.corrections:
             there = corrected_among(frame, view.training, self.scene.corrections)
             score = replace(score, corrected=self._compared(view, there, splats, shell)[0])
-        scores.views.append(score)
-        scores.training = view.training
+        self.views.append(score)
+        self.training = view.training
         rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
         if self.draw is not None:
             self.draw(row)
-        best, worst = scores.extremes.get(frame.camera, ((rank, row), (rank, row)))
+        best, worst = self.extremes.get(frame.camera, ((rank, row), (rank, row)))
         ends = max(best, (rank, row), key=itemgetter(0)), min(worst, (rank, row), key=itemgetter(0))
-        scores.extremes[frame.camera] = ends
+        self.extremes[frame.camera] = ends
 
     def _compared(
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
     ) -> tuple[ViewScore, ComparisonRow]:
         protocol = self.reference.protocol
-        camera = frame.intrinsics, frame.T_world_camera
-        rendering = rendered(splats, *camera, self.threads)
-        depth = rendering.normalised_depth()
-        if isinstance(splats, SplatSet) and shell is not None:  # which has colour and no depth
-            rendering = rendered(splats.joined(shell), *camera, self.threads)
-        rendering = rendering.before(self.scene.background)
+        rendering, depth = rendered_with_shell(splats, shell, frame, self.scene.background, self.threads)
         mask = None if self.reference.mask is None else self.reference.mask(frame)
         score = score_view(
             view=view.name,
@@ -182,8 +168,24 @@ def _figures(score: ViewScore) -> str:
     return "dB: " + ", ".join([*parts, f"{score.all.psnr:.1f} all"])
 
 
+def rendered_with_shell(
+    splats: SplatSet | GaussianSet,
+    shell: SplatSet | None,
+    frame: RgbdFrame,
+    background: Color,
+    threads: int,
+) -> tuple[Rendering, Float32]:
+    """Render splats at a frame's pose before a background; their depth (H, W) [m] is without the shell."""
+    camera = frame.intrinsics, frame.T_world_camera
+    rendering = rendered(splats, *camera, threads)
+    depth = rendering.normalised_depth()
+    if isinstance(splats, SplatSet) and shell is not None:
+        rendering = rendered(splats.joined(shell), *camera, threads)
+    return rendering.before(background), depth
+
+
 def rendered(
-    splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int
+    splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int = 0
 ) -> Rendering:
     """Render splats of either kind."""
     if isinstance(splats, GaussianSet):

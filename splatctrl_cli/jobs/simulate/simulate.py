@@ -83,7 +83,15 @@ class SimulateResult:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        return _metrics(self.truth, self.num_frames)
+        truth = self.truth
+        training = [camera.name for camera in truth.cameras if camera.is_training]
+        return {
+            "frames": self.num_frames,
+            "joint_states": len(truth.stamps),
+            "luminance_std": {name: round(value, 4) for name, value in truth.luminance_std.items()},
+            "min_luminance_std": round(min(truth.luminance_std[name] for name in training), 4),
+            "min_clearance": round(float(truth.clearance.min()), 4),
+        }
 
 
 def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateResult:
@@ -92,6 +100,7 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         with stopwatch.stage("log"):
             truth, num_frames = _record(folder, request, progress)
+        result = SimulateResult(out=request.out, truth=truth, num_frames=num_frames, sizes={})
         write_json(folder / "truth.json", truth_document(truth))
         if request.dtu:
             with stopwatch.stage("dtu"):
@@ -101,11 +110,11 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
             command="simulate",
             config=request.config,
             inputs={} if request.urdf is None else {request.urdf.name: sha256(request.urdf)},
-            metrics=_metrics(truth, num_frames),
+            metrics=result.metrics,
             stopwatch=stopwatch,
             seed=request.options.seed,
         )
-        return SimulateResult(out=request.out, truth=truth, num_frames=num_frames, sizes=_sizes(folder))
+        return replace(result, sizes=_sizes(folder))
 
 
 def _record(folder: Path, request: SimulateRequest, progress: Progress) -> tuple[Truth, dict[str, int]]:
@@ -124,7 +133,21 @@ def _record(folder: Path, request: SimulateRequest, progress: Progress) -> tuple
             num_frames[record.camera] += 1
             if record.camera == recording.cameras[-1].name and num_frames[record.camera] % 10 == 0:
                 progress.log(f"simulate: {(record.stamp_ns - recording.start_ns) / 1e9:.1f} s recorded")
-    return _truth(folder, recording, contrast), num_frames
+    stamps, clearance = recording.clearances()
+    truth = Truth(
+        path=folder / "truth.json",
+        primitives=recording.primitives,
+        cameras=recording.cameras,
+        luminance_std=contrast,
+        joint_names=recording.robot.joint_names,
+        robot_urdf=folder / "robot.urdf",
+        robot_spheres=folder / "robot_spheres.yaml",
+        T_world_base=recording.robot.T_world_base,
+        stamps=stamps,
+        clearance=clearance,
+        unmodelled=recording.unmodelled,
+    )
+    return truth, num_frames
 
 
 def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Recording:
@@ -143,23 +166,6 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
         progress.log("simulate: looking for a way through the scene")
         scene = replace(scene, motion=adapted_motion(scene, robot, surfaces))
     return Recording(options, robot, scene, request.unmodelled)
-
-
-def _truth(folder: Path, recording: Recording, contrast: Mapping[str, float]) -> Truth:
-    stamps, clearance = recording.clearances()
-    return Truth(
-        path=folder / "truth.json",
-        primitives=recording.primitives,
-        cameras=recording.cameras,
-        luminance_std=contrast,
-        joint_names=recording.robot.joint_names,
-        robot_urdf=folder / "robot.urdf",
-        robot_spheres=folder / "robot_spheres.yaml",
-        T_world_base=recording.robot.T_world_base,
-        stamps=stamps,
-        clearance=clearance,
-        unmodelled=recording.unmodelled,
-    )
 
 
 def _write_scan(folder: Path) -> None:
@@ -184,17 +190,6 @@ def _sizes(folder: Path) -> dict[str, int]:
         parts = [path] if path.is_file() else [part for part in path.rglob("*") if part.is_file()]
         sizes[path.name if path.is_file() else f"{path.name}/"] = sum(part.stat().st_size for part in parts)
     return sizes
-
-
-def _metrics(truth: Truth, num_frames: Mapping[str, int]) -> dict[str, Any]:
-    training = [camera.name for camera in truth.cameras if camera.is_training]
-    return {
-        "frames": num_frames,
-        "joint_states": len(truth.stamps),
-        "luminance_std": {name: round(value, 4) for name, value in truth.luminance_std.items()},
-        "min_luminance_std": round(min(truth.luminance_std[name] for name in training), 4),
-        "min_clearance": round(float(truth.clearance.min()), 4),
-    }
 
 
 LATE = 1e3  # [rad/s] a second longer than its time costs as much: every way in time is better

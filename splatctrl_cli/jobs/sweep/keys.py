@@ -18,7 +18,6 @@ from splatctrl_cli.simulate.tabletop import VISITOR
 
 SIMULATE, FIT, BAKE = "simulate", "reconstruct", "sdf-bake"
 MADE_BEFORE = {REPLAY: ("scene", "field"), BAKE: ("scene",)}  # options naming another command's output
-FITTED = ("scene", "occupancy", "human")  # configuration sections of the map
 PLACES = ("obstacle-x", "obstacle-y", "obstacle-radius")  # in the order of simulate --visitor
 
 
@@ -78,7 +77,7 @@ def key_of(name: str) -> Key:
         what = "a setting that is no number" if declared is not None else "unknown key"
         raise UsageError(f"--over {name}: {what}", remedy=did_you_mean(name, [*KEYS, *settings], known))
     at, whole = {REPLAY: f"set.{name}"}, type(getattr(table, setting)) is int
-    is_of_map = section in FITTED
+    is_of_map = section in ("scene", "occupancy", "human")
     options = {FIT: f"set.{name}"} if is_of_map else {BAKE: f"set.{name}", **at} if section == "field" else at
     return Key(name=name, unit=declared.unit, options=options, lockstep=at if is_of_map else {}, is_whole=whole)
 

@@ -10,9 +10,6 @@ from scipy.stats import qmc
 
 from splatctrl_cli.config.fixed import SWEEP_DIRECTIONS, SWEEP_SAMPLES, SWEEP_SEARCHED
 
-Judge = Callable[[Sequence[float]], Sequence[str]]  # outcomes of values, judged in parallel
-JudgeAt = Callable[[Sequence[Sequence[float]]], Sequence[str]]  # likewise of points in several values
-
 
 @dataclass(frozen=True, kw_only=True)
 class Flip:
@@ -30,12 +27,18 @@ class Flip:
 
 
 def find_flip(
-    judge: Judge, start: float, end: float, *, tolerance: float, is_whole: bool = False, is_monotone: bool = False
+    judge: Callable[[Sequence[float]], Sequence[str]],
+    start: float,
+    end: float,
+    *,
+    tolerance: float,
+    is_whole: bool = False,
+    is_monotone: bool = False,
 ) -> Flip:
     """Find the flip nearest to `start` within `tolerance` (1 for whole values).
 
-    It tries the ends and SWEEP_SAMPLES values evenly between; SWEEP_SEARCHED if the outcome is not declared monotone,
-    or turns back. Then it bisects the nearest pair with different outcomes.
+    judge: outcomes of values, in parallel. It tries the ends and SWEEP_SAMPLES values evenly between; SWEEP_SEARCHED
+    if the outcome is not declared monotone, or turns back. Then it bisects the nearest pair with different outcomes.
     """
     known: dict[float, str] = {}
 
@@ -92,7 +95,12 @@ class LeastChange:
     length: float
 
 
-def find_least(judge: JudgeAt, alone: Sequence[float | None], *, tolerance: float) -> LeastChange | None:
+def find_least(
+    judge: Callable[[Sequence[Sequence[float]]], Sequence[str]],
+    alone: Sequence[float | None],
+    *,
+    tolerance: float,
+) -> LeastChange | None:
     """Find the shortest joint change that flips the outcome of (0, ..., 0); None if no direction tried has one.
 
     Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and

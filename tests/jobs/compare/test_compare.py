@@ -16,7 +16,7 @@ from splatctrl_cli.evaluate.metrics import Better
 from splatctrl_cli.evaluate.verdict import Outcome
 from splatctrl_cli.jobs.compare import judged_runs
 from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareResult, compare
-from splatctrl_cli.jobs.replay.metrics import metric_names
+from splatctrl_cli.jobs.replay.metrics import metric_scales
 from splatctrl_cli.jobs.report.report import WriteReportRequest, write_report
 from tests.jobs.stage import Runs
 
@@ -350,7 +350,7 @@ def test_every_figure_of_a_replay_is_declared_with_a_direction_or_without_one() 
     declared = judged_runs.scales()["replay"]
     for mode in ("audit", "open-loop", "closed-loop"):
         fields = ("exact", "barrier", "certified")
-        names = metric_names(mode, fields, has_truth=True, has_twists=True)
+        names = metric_scales(mode, fields, has_truth=True, has_twists=True)
         assert set(names) <= set(declared)
     assert declared["min_clearance"].better is Better.HIGHER
     assert declared["num_in_collision"].better is Better.LOWER

@@ -12,8 +12,7 @@ from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter, read_checkpoint
 from splatctrl_cli.jobs.reconstruct import reconstruct
-from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructRequest
-from splatctrl_cli.jobs.reconstruct.self_model import LearnRequest, learn_robot
+from splatctrl_cli.jobs.reconstruct.reconstruct import LearnRequest, ReconstructRequest, learn_robot
 from splatctrl_cli.jobs.replay.inputs import grasp_contacts, open_log, read_states
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, with_self_model

@@ -13,7 +13,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.jobs.replay.goal import goal_waypoints
 from splatctrl_cli.jobs.replay.known_scene import certified_distance, splat_fields
-from splatctrl_cli.jobs.replay.metrics import metric_names
+from splatctrl_cli.jobs.replay.metrics import metric_scales
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
@@ -85,7 +85,9 @@ def test_the_recorded_commands_of_ours_make_the_same_steps(stage: Stage, mode: s
     assert unlike <= {"rung", "scale", "slack", "relaxed", "intervening", "multipliers", "residual", "num_rows"}
     assert {row["rung"] for row in theirs} == {"outside"}
     metrics = desk.metrics()
-    assert set(metrics) == set(metric_names(mode, ("exact", "barrier"), has_truth=False)) == set(desk.metrics("ours"))
+    assert (
+        set(metrics) == set(metric_scales(mode, ("exact", "barrier"), has_truth=False)) == set(desk.metrics("ours"))
+    )
     assert metrics["min_clearance"] == pytest.approx(desk.metrics("ours")["min_clearance"], abs=1e-6)
     assert metrics["intervention_share"] is None and metrics["num_solved"] == 0
 
