@@ -10,9 +10,10 @@ from typing import Any
 from splatctrl_cli.cli.check import show_described, show_ingested
 from splatctrl_cli.cli.common import Console, names_of, request_of, table
 from splatctrl_cli.cli.export import show_exported
+from splatctrl_cli.cli.reconstruct import show_reconstructed
 from splatctrl_cli.cli.replay import show_replayed
-from splatctrl_cli.cli.scene import show_baked, show_reconstructed
 from splatctrl_cli.cli.score import show_scored
+from splatctrl_cli.cli.sdf_bake import show_baked
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.jobs.demo import DemoRequest, StepResult, demo

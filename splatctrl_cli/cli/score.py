@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from splatctrl_cli.cli.common import Console, request_of, table
-from splatctrl_cli.cli.scene import recording_of
+from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.score_report import PREFIX
 from splatctrl_cli.evaluate.verdict import counted

@@ -7,7 +7,7 @@ import trimesh
 
 from splatctrl_cli.cli import scene_options
 from splatctrl_cli.cli.parser import words
-from splatctrl_cli.cli.scene import split_cameras
+from splatctrl_cli.cli.sdf_bake import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_scales

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.cli import runs as command
+from splatctrl_cli.cli import report as command
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import part_digests

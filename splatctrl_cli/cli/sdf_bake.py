@@ -1,96 +1,26 @@
-"""``splatctrl reconstruct``, ``sdf-bake``: a log into splats, and splats as a distance grid."""
+"""``splatctrl sdf-bake``: splats as a distance grid, with its accuracy."""
 
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from splatctrl_cli.cli.common import Console, format_cell, names_of, request_of, source_options, table
-from splatctrl_cli.cli.export import labels_of
+from splatctrl_cli.cli.common import Console, format_cell, names_of, request_of, table
 from splatctrl_cli.config import load_config
 from splatctrl_cli.config.fixed import PROBABILITY_NEAR
-from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, TruthComparison
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.formats.grid.grid_formats import FORMATS
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
-from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
-from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
-from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.running.device import shown
-from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
-from splatctrl_cli.kernels import native
-from splatctrl_cli.records import Box
-
-
-def run_reconstruct(args: argparse.Namespace) -> int:
-    native.keep_freed_memory()
-    config = load_config(args.config, args.set)  # refused before the source is opened
-    if args.max_splats is not None:
-        config = replace(config, scene=replace(config.scene, max_splats=args.max_splats))
-    if (args.source is None) == (args.dtu is None):
-        raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
-    allowed = {"views-agreement", "views-scale"} if args.allow_disagreement or args.refine_poses else set()
-    source = open_to_train(
-        recording_of(args, args.source),
-        max_pose_jump=args.max_pose_jump,
-        needs_depth=args.points is None,
-        allowed=allowed | ({"alignment"} if args.allow_disagreement else set()),
-    )
-    request = request_of(
-        ReconstructRequest,
-        args,
-        config=config,
-        source=source,
-        recording=args.source,
-        out=args.out or Path("scene"),
-        box=None if args.box is None else Box.from_text(args.box),
-        corrections=Corrections(poses=args.refine_poses, exposure=args.refine_exposure),
-        options={name: getattr(args, name) for name in DECIDING_OPTIONS},
-    )
-    console = Console(args)
-    return show_reconstructed(console, reconstruct(request, console))
-
-
-def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
-    """The recording at `path`, or at --dtu."""
-    is_dtu = args.dtu is not None
-    given = {"path": args.dtu or path, "is_dtu": is_dtu, "options": source_options(args), "masks": masks}
-    return request_of(RecordingRequest, args, **given)
-
-
-def show_reconstructed(console: Console, result: ReconstructResult) -> int:
-    found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
-    return console.concluded(result.verdict, found, [*_scene_lines(result), f"wrote {result.out}"])
-
-
-def _scene_lines(result: ReconstructResult) -> list[str]:
-    metrics, removed = result.metrics, result.removed
-    psnr = metrics["psnr"]
-    columns = {
-        **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
-        "robot": metrics["robot_splats"],
-        "shell": metrics["shell_splats"],
-        **{name: metrics[name] for name in ("added", "relocated", "unmet")},
-        "training dB": "-" if psnr is None else f"{psnr:.2f}",
-        "seconds": f"{sum(result.seconds.values()):.1f}",
-    }
-    reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
-    return [
-        *table(list(columns), [list(columns.values())]),
-        f"removed: {', '.join(reasons) or 'none'}",
-        f"computed on {', then '.join(map(shown, metrics['devices']))}",
-    ]
-
+from splatctrl_cli.records import Box, Label
 
 SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options
 ERRORS = ("mean", "rmse", "over_95", "over_max")
 COLUMNS = ("count", "mean mm", "rmse mm", "95 % mm", "max mm")
 
 
-def run_bake(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     console = Console(args)
     return show_baked(console, bake(_request(args), console))
 
@@ -99,7 +29,7 @@ def show_baked(console: Console, result: BakeResult) -> int:
     console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
     compared = result.accuracy.as_dict()
     printed = {**result.summary, **({"accuracy": compared} if compared else {})}
-    return console.concluded(result.verdict, printed, _bake_lines(result))
+    return console.concluded(result.verdict, printed, _lines(result))
 
 
 def _request(args: argparse.Namespace) -> BakeRequest:
@@ -129,7 +59,7 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
     return Path(path), tuple(name.strip() for name in cameras.split(",") if name.strip())
 
 
-def _bake_lines(result: BakeResult) -> Iterator[str]:
+def _lines(result: BakeResult) -> Iterator[str]:
     shown_values = {**result.summary, "shape": " x ".join(map(str, result.summary["shape"]))}
     rows = [(name.replace("_", " "), format_cell(value)) for name, value in shown_values.items()]
     yield from table(("field", ""), rows)
@@ -200,3 +130,9 @@ def _errors(band: BandAccuracy, figures: Sequence[str] = ERRORS) -> list[object]
     """Count and errors [mm]."""
     values = (getattr(band, name) for name in figures)
     return [band.count, *("-" if value is None else f"{value * 1e3:.1f}" for value in values)]
+
+
+def labels_of(text: str) -> frozenset[Label]:
+    """Labels in a field: objects and those of ``--include``. Raises UsageError for others."""
+    names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
+    return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})

@@ -1,0 +1,55 @@
+"""``splatctrl query``: distances, gradients, bounds, probabilities and nearest splats at points."""
+
+import argparse
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.cli.sdf_bake import labels_of
+from splatctrl_cli.config import load_config
+from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run; without an output answers go to stdout, figures to stderr."""
+    console = Console(args)
+    request = request_of(
+        QueryRequest,
+        args,
+        points=sys.stdin if str(args.points) == "-" else args.points,
+        config=load_config(args.config, args.set),
+        labels=labels_of(args.include),
+    )
+    if args.out is not None or console.is_json:
+        result = query(request, console)
+        out = None if result.out is None else str(result.out)
+        found = {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}
+        return console.result(found, _lines(result))
+    with tempfile.TemporaryDirectory() as folder:  # a table with a wrong line is refused before anything is printed
+        answers = Path(folder) / "answers.csv"
+        result = query(replace(request, out=answers), console)
+        with answers.open(encoding="utf-8", newline="") as stream:
+            shutil.copyfileobj(stream, sys.stdout)
+    for line in _lines(replace(result, out=None)):
+        console.log(line)
+    return 0
+
+
+def _lines(result: QueryResult) -> Iterator[str]:
+    rows = [(name.replace("_", " "), _shown(name, value)) for name, value in result.metrics.items()]
+    yield from table((result.kind, ""), rows)
+    yield from (f"note: {note}" for note in result.notes)
+    rate = (result.metrics["num_points"] or 0) / max(result.seconds["answer"], 1e-9)
+    wrote = [] if result.out is None else [f"wrote {result.out}"]
+    # a rate of fewer points says nothing
+    yield from [*([f"{rate:,.0f} points/s"] if (result.metrics["num_points"] or 0) >= 1000 else []), *wrote]
+
+
+def _shown(name: str, value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if name.startswith("num_") else f"{value * 1e3:.1f} mm"

@@ -1,0 +1,77 @@
+"""``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from splatctrl_cli.cli.common import Console, request_of, source_options, table
+from splatctrl_cli.config import load_config
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
+from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.running.device import shown
+from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
+from splatctrl_cli.kernels import native
+from splatctrl_cli.records import Box
+
+
+def run(args: argparse.Namespace) -> int:
+    native.keep_freed_memory()
+    config = load_config(args.config, args.set)  # refused before the source is opened
+    if args.max_splats is not None:
+        config = replace(config, scene=replace(config.scene, max_splats=args.max_splats))
+    if (args.source is None) == (args.dtu is None):
+        raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
+    allowed = {"views-agreement", "views-scale"} if args.allow_disagreement or args.refine_poses else set()
+    source = open_to_train(
+        recording_of(args, args.source),
+        max_pose_jump=args.max_pose_jump,
+        needs_depth=args.points is None,
+        allowed=allowed | ({"alignment"} if args.allow_disagreement else set()),
+    )
+    request = request_of(
+        ReconstructRequest,
+        args,
+        config=config,
+        source=source,
+        recording=args.source,
+        out=args.out or Path("scene"),
+        box=None if args.box is None else Box.from_text(args.box),
+        corrections=Corrections(poses=args.refine_poses, exposure=args.refine_exposure),
+        options={name: getattr(args, name) for name in DECIDING_OPTIONS},
+    )
+    console = Console(args)
+    return show_reconstructed(console, reconstruct(request, console))
+
+
+def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
+    """The recording at `path`, or at --dtu."""
+    is_dtu = args.dtu is not None
+    given = {"path": args.dtu or path, "is_dtu": is_dtu, "options": source_options(args), "masks": masks}
+    return request_of(RecordingRequest, args, **given)
+
+
+def show_reconstructed(console: Console, result: ReconstructResult) -> int:
+    found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
+    return console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"])
+
+
+def _lines(result: ReconstructResult) -> list[str]:
+    metrics, removed = result.metrics, result.removed
+    psnr = metrics["psnr"]
+    columns = {
+        **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
+        "robot": metrics["robot_splats"],
+        "shell": metrics["shell_splats"],
+        **{name: metrics[name] for name in ("added", "relocated", "unmet")},
+        "training dB": "-" if psnr is None else f"{psnr:.2f}",
+        "seconds": f"{sum(result.seconds.values()):.1f}",
+    }
+    reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
+    return [
+        *table(list(columns), [list(columns.values())]),
+        f"removed: {', '.join(reasons) or 'none'}",
+        f"computed on {', then '.join(map(shown, metrics['devices']))}",
+    ]
