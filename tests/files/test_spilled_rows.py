@@ -13,7 +13,7 @@ from splatctrl_cli.recording.log.state_columns import StateCollector
 from splatctrl_cli.recording.log.state_topics import checked_stamps
 from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, differentiated, smoothed_seconds
 from splatctrl_cli.recording.source import SourceOptions
-from splatctrl_cli.recording.state import state_csv
+from splatctrl_cli.recording.state import state_table
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64, JointState, LossReport
 from tests.recording.log.make_states import START_NS, STEP_NS, states_of, write_mcap
@@ -24,7 +24,7 @@ JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 @pytest.fixture(params=[1, 7, 10_000])
 def block(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
     """So many states at once, everywhere."""
-    for module in (spilled_rows, arrays, state_columns, state_csv):
+    for module in (spilled_rows, arrays, state_columns, state_table):
         monkeypatch.setattr(module, "BLOCK", request.param)
     return int(request.param)
 

@@ -86,7 +86,8 @@ class McapLog:
         header = self._header(frame.stamp_ns, f"{frame.camera}_optical_frame")
         jpeg = cv2.imencode(".jpg", frame.color[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
         color = self._new("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=jpeg.reshape(-1))
-        millimetres = np.rint(frame.depth.astype(np.float64) * MILLIMETRES).astype("<u2")
+        millimetres = np.rint(frame.depth.astype(np.float64) * MILLIMETRES)
+        millimetres = np.where(millimetres < np.iinfo(np.uint16).max, millimetres, 0).astype("<u2")  # else no return
         self._add(f"/{frame.camera}/color/camera_info", self._camera_info(header, frame.intrinsics), frame.stamp_ns)
         self._add(f"/{frame.camera}/color/image_raw/compressed", color, frame.stamp_ns)
         self._add(f"/{frame.camera}/depth/image_raw", self._image(header, "16UC1", millimetres), frame.stamp_ns)

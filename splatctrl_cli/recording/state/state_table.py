@@ -53,45 +53,44 @@ class CsvTable:
         chosen = {name: [self.index(column) for column in columns] for name, columns in groups.items()}
         at, stamps = self.index(time), array("q")
         files = {name: RowFile((len(columns),)) for name, columns in groups.items()}
-        for number, rows in self._blocks():
-            stamps.extend(self._stamp(row, number + i, at, unit_ns) + epoch_ns for i, row in enumerate(rows))
+        for rows in self._blocks():
+            stamps.extend(self._stamp(row, number, at, unit_ns) + epoch_ns for number, row in rows.items())
             for name, columns in chosen.items():
-                files[name].append(self._numbers(rows, number, columns))
+                files[name].append(self._numbers(rows, columns))
         if not stamps:
             raise InputError(f"{self.path}: expected joint states, got none", remedy="record them again")
         return np.array(stamps, dtype=np.int64), {name: Rows(file) for name, file in files.items()}
 
-    def _blocks(self) -> Iterator[tuple[int, list[list[str]]]]:
-        """Yield a first line's number and rows; empty lines do not count."""
+    def _blocks(self) -> Iterator[dict[int, list[str]]]:
+        """Yield rows by line number, without empty lines."""
         with self.path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = (line for line in csv.reader(stream) if line)
+            reader = csv.reader(stream)
+            lines = ((reader.line_num, row) for row in reader if row)
             next(lines, None)
-            number, num = 2, len(self.names)
             while True:
                 try:
-                    rows = list(islice(lines, BLOCK))
+                    rows = dict(islice(lines, BLOCK))
                 except (OSError, UnicodeDecodeError, csv.Error) as error:
                     raise _unreadable(self.path, error) from None
                 if not rows:
                     return
-                for i, row in enumerate(rows):
-                    if len(row) != num:
+                for number, row in rows.items():
+                    if len(row) != len(self.names):
                         raise InputError(
-                            f"{self.path}:{number + i}: expected {num} columns, got {len(row)}",
+                            f"{self.path}:{number}: expected {len(self.names)} columns, got {len(row)}",
                             remedy="the file was cut there; leave the line out",
                         )
-                yield number, rows
-                number += len(rows)
+                yield rows
 
-    def _numbers(self, rows: list[list[str]], number: int, columns: Sequence[int]) -> Float64:
+    def _numbers(self, rows: dict[int, list[str]], columns: Sequence[int]) -> Float64:
         values = np.empty((len(rows), len(columns)))
-        for i, row in enumerate(rows):
+        for i, (number, row) in enumerate(rows.items()):
             for k, column in enumerate(columns):
                 cell = row[column].strip()
                 try:
                     values[i, k] = float(cell) if cell else np.nan
                 except ValueError:
-                    raise self._no_number(row, number + i, column) from None
+                    raise self._no_number(row, number, column) from None
         return values
 
     def _stamp(self, row: list[str], number: int, column: int, unit_ns: int) -> int:

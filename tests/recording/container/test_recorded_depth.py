@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.recording.capture.capture_writer import write_capture
-from splatctrl_cli.recording.container.raw_log import RawMessage
+from splatctrl_cli.recording.container.log_formats import open_raw_log
+from splatctrl_cli.recording.container.mcap_writer import mcap_log
+from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 from splatctrl_cli.recording.log.decoder import COMPRESSED_IMAGE, IMAGE, MessageDecoder
 from splatctrl_cli.recording.log.messages import read_image
 from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.records import JointState
+from splatctrl_cli.records import Intrinsics, JointState
+from tests.plain import plain_frame
 from tests.recording.log.make_log import HEIGHT, WIDTH, LogRecipe, built, encoded, frames_of, make_log, rewritten
 from tests.refused import expect_refusal
 
@@ -128,3 +131,12 @@ def test_depth_in_another_unit_than_its_cameras_is_counted_again(tmp_path: Path)
     write_capture(tmp_path / "x.capture", Mixed())
     depths = [frame.depth[1, 1] for frame in frames_of(tmp_path / "x.capture")]
     assert depths == pytest.approx([1.25] * 4 + [0.625], abs=1e-6)
+
+
+def test_depth_beyond_sixteen_bits_of_millimetres_is_written_as_no_return(tmp_path: Path) -> None:
+    depth = np.array([[65.534, 65.535], [66.0, 1000.0]])
+    with mcap_log(tmp_path / "far.mcap") as log:
+        log.add_frame(plain_frame(depth, Intrinsics(fx=2.0, fy=2.0, cx=0.5, cy=0.5, width=2, height=2)))
+    sent = open_raw_log(tmp_path / "far.mcap").messages(Damage())
+    image = next(MessageDecoder().decode(message) for message in sent if "depth" in message.topic.name)
+    assert read_image(image, IMAGE).pixels.tolist() == [[65534, 0], [0, 0]]

@@ -170,6 +170,8 @@ def test_a_cell_that_is_no_number_is_named(tmp_path: Path) -> None:
     assert "run.csv:3: column qa: expected a number, got 'zero'" in refusal(described(tmp_path))
     (tmp_path / "run.csv").write_text("t,qa,qb\n0,0,0\nnan,0,0\n")
     assert "run.csv:3: column t: expected a number, got 'nan'" in refusal(described(tmp_path))
+    (tmp_path / "run.csv").write_text("t,qa,qb\n\n0,0,0\n\n10,zero,0\n")
+    assert "run.csv:5: column qa: expected a number, got 'zero'" in refusal(described(tmp_path))
 
 
 def test_an_npz_without_the_array_lists_those_there(tmp_path: Path) -> None:
