@@ -240,7 +240,7 @@ class SceneStep:
 
 
 SceneStepAt = Callable[[int], SceneStep | None]
-"""What was known at a stamp [ns], None where there was only one scene; never anything later."""
+"""Stamp [ns] -> the two newest scenes known then; None if there was only one."""
 
 
 def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:

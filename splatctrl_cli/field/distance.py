@@ -289,23 +289,23 @@ class OnDevice:
         """Distance and gradient, as in `DistanceField.query`."""
         if not len(points):
             return np.zeros(0), np.zeros((0, 3))
-        found = self._asked(points, "gradient")
+        found = self._answer(points, "gradient")
         assert found.gradient is not None
         return found.distance.astype(np.float64), found.gradient.astype(np.float64)
 
     def distance(self, points: Float64) -> Float64:
         """points (Q, 3) [m] -> distance (Q,) [m]."""
-        return self._asked(points).distance.astype(np.float64) if len(points) else np.zeros(0)
+        return self._answer(points).distance.astype(np.float64) if len(points) else np.zeros(0)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the exact distance."""
         if not len(points):
             return np.zeros(0, np.int64)
-        found = self._asked(points, "entry")
+        found = self._answer(points, "entry")
         assert found.entry is not None
         return self.spheres.source[found.entry]
 
-    def _asked(self, points: Float64, *wanted: str) -> Answers:
+    def _answer(self, points: Float64, *wanted: str) -> Answers:
         return self.field.query(checked_points(points), self.spheres.anchor, wanted)
 
     def close(self) -> None:

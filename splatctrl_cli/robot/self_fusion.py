@@ -78,7 +78,8 @@ def learn(
 
     T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
     link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
-    `NUM_CONFIGURATIONS` show it as a surface and at most `FREE_SHARE` see through it. It must also leave its place in
+    `NUM_CONFIGURATIONS` show it as a surface and at most `FREE_SHARE` see through it; most of a configuration's views
+    decide. It must also leave its place in
     the world with the link, and move against each nearer link. Raises InputError where no link can be learned.
     """
     boxes = _boxes(surface)

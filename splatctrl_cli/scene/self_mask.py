@@ -28,6 +28,7 @@ from splatctrl_cli.config.fixed import (
 from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
 from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
+from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.surface_steps import surface_steps
 from splatctrl_cli.scene.time_steps import AuditRow
@@ -138,9 +139,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0).astype(np.float64)
     is_object, is_edge = kinds == PixelKind.OBJECT, np.isfinite(nearest_at_edge)
     steps = surface_steps(is_object, depth, is_edge, edge, tolerance, config.depth_error)
-    fixed = [number for number, name in enumerate(surface.links) if name in surface.fixed]
-    foot = (is_robot & np.isin(link, fixed)).view(np.uint8)
-    steps[(foot > 0) & (cv2.erode(foot, _window(1)) == 0)] = 0.0  # else a table would run on into the foot
+    steps[_fixed_outline(surface, is_robot, link)] = 0.0  # else a table would run on into the foot on it
     _judge(kinds, depth, beside, area, steps)
     offset = depth - rendered
     is_told = is_core & has_depth & (np.abs(offset) <= MASK_FAR_OFF)
@@ -165,6 +164,13 @@ def _is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, f
     apart = np.maximum(np.float32(MASK_STEP), np.float32(MASK_STEEP * reach / fx) * depth)
     is_behind = depth - nearest_within(depth, is_object, reach) > apart
     return np.asarray(is_object & is_behind & (farthest_within(depth, reach) - depth > tolerance))
+
+
+def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: NDArray[np.int16]) -> Bool:
+    """Outermost robot pixels (H, W) of links that no joint moves."""
+    fixed = [number for number, name in enumerate(surface.links) if name in surface.fixed]
+    shown = (is_robot & np.isin(link, fixed)).view(np.uint8)
+    return np.asarray((shown > 0) & (cv2.erode(shown, _window(1)) == 0))
 
 
 def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Float32) -> None:

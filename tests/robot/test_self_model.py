@@ -118,6 +118,18 @@ def test_a_cable_narrower_than_a_thinned_pixel_is_found_whole(monkeypatch: pytes
     assert np.ptp(triangles[..., 0]) > 0.19
 
 
+def test_a_cable_that_one_of_three_cameras_looks_past_is_found() -> None:
+    """A laser measures what is behind a thin cable; the other two outvote it."""
+    along = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
+    cable = Shape(link="arm", kind="capsule", size=(0.005, 0.2), T_link_shape=pose_at((0.2, 0.0, 0.065), along))
+    bare = RobotSurface.from_parts(shapes(has_bracket=False))
+    frames, poses_seen = recorded(MOVES, RobotSurface.from_parts([*shapes(has_bracket=False), cable]))
+    past, _ = recorded(MOVES, bare)
+    mixed = [other if one.camera == "0" else one for one, other in zip(frames, past, strict=True)]
+    ((link, triangles),) = learn(ROBOT, LINKS, mixed, poses_seen).pieces()
+    assert link == "arm" and np.ptp(triangles[..., 0]) > 0.19
+
+
 def test_what_two_fingers_hold_between_them_is_robot() -> None:
     """Each cell is nearer to one of two links that move as one; neither lets go of its half for the other's."""
     fingers = [

@@ -174,7 +174,7 @@ def look(grid: OccupancyMap, view: RgbdFrame, cameras: str) -> None:
 
 @pytest.mark.parametrize(("cameras", "cls"), [("A", EvidenceClass.HIDDEN_BY_THING), ("AB", EvidenceClass.FREE)])
 def test_behind_an_object_that_arrived_no_earlier_view_counts(cameras: str, cls: int) -> None:
-    """But those of cameras that expose in turn since the last round; and 25 cm behind it all of them."""
+    """Views of the last round count if cameras expose in turn. Views of space 25 cm behind it always count."""
     grid = OccupancyMap(WORKSPACE, CONFIG, 1)
     behind = np.array([[0.0, 0.0, 0.27], [0.0, 0.0, 0.05], [0.2, 0.0, 0.3]])  # the last stays in view
     look(grid, frame(1), cameras)
@@ -186,7 +186,7 @@ def test_behind_an_object_that_arrived_no_earlier_view_counts(cameras: str, cls:
 
 
 def test_behind_an_object_that_stands_still_earlier_views_count() -> None:
-    """As where the robot hides the space beside a table."""
+    """The robot may hide the space beside a table for a while."""
     grid = OccupancyMap(WORKSPACE, CONFIG, 1)
     for stamp in range(1, 9):
         look(grid, frame(stamp, block=0.3), "A")
