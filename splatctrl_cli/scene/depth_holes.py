@@ -20,6 +20,7 @@ from splatctrl_cli.scene.self_mask import PixelKind, SelfMask
 from splatctrl_cli.scene.stereo_shadow import shadowed
 from splatctrl_cli.voxels import LostEdges
 
+BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
 BESIDE_ROBOT = np.ones((9, 9), np.uint8)  # its outline is fattened, too
 MOST_POINTS = 1 << 18  # per batch: fine voxels and a large hole may need a hundred million
 
@@ -28,14 +29,15 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
     Some repeat. Rays are about a voxel apart, from `min_range` to the depth of the nearest pixel with depth. Holes
-    up to `NARROW_HOLE` voxels wide do not count, nor those at the robot, where background may show. robot_depth (H,
-    W) [m]: rendered, 0 = none.
+    up to `NARROW_HOLE` voxels wide do not count, nor those at the robot or its stereo shadow, where background may
+    show. robot_depth (H, W) [m]: rendered, 0 = none.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return iter(())
-    is_blank &= ~shadowed(frame.depth, frame.intrinsics.fx)
-    is_end = cv2.dilate(robot_depth, BESIDE_ROBOT) > 0
+    is_shadow = is_blank & shadowed(frame.depth, frame.intrinsics.fx)
+    is_blank &= ~is_shadow
+    is_end = _with_shadow(cv2.dilate(robot_depth, BESIDE_ROBOT) > 0, is_shadow)
     if frame.valid is not None:
         is_end |= ~frame.valid
     holes = _holes(is_blank, is_end)
@@ -44,6 +46,13 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     behind = _nearest_depth(frame.depth)
     width = _voxel_width(frame, behind[holes], config)
     return _on_rays(frame, _wide(holes, NARROW_HOLE * width), behind, max(int(width), 1), config)
+
+
+def _with_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
+    """Robot pixels (H, W) and the stereo shadows that touch them, with their neighbours."""
+    _, groups = cv2.connectedComponents(is_shadow.view(np.uint8), connectivity=8)
+    is_beside = is_shadow & np.isin(groups, np.unique(groups[is_robot & is_shadow]))
+    return np.asarray(is_robot | (cv2.dilate(is_beside.view(np.uint8), BESIDE) > 0))
 
 
 def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:
@@ -85,7 +94,6 @@ def _nearest_depth(depth: Float32) -> Float32:
     return np.asarray(of_label[which])
 
 
-BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
 NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its own outline loses depth, too
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 
 import numpy as np
@@ -55,13 +56,15 @@ from splatctrl_cli.scene.self_mask import (
     audited,
     object_mask,
     of_label,
+    pixels_at,
     self_mask,
     settled,
+    tolerance_at,
     voted,
     without,
 )
 from splatctrl_cli.scene.shell import Shell
-from splatctrl_cli.scene.steady_depth import steadied
+from splatctrl_cli.scene.steady_depth import object_twice, steadied
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
 from splatctrl_cli.scene.unseen import explain_unseen
@@ -169,7 +172,13 @@ class SceneFitter:
         self.buffer.parameters[hidden] = as_they_were[hidden]
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen, steady)
-        filled += self._fill_gaps(views, masks, removed, half=self.num_steps % 2 if self.num_steps else None)
+        half, is_lasting = None, None  # of the first frames nothing lasts yet
+        if self.num_steps:
+            lasting = [
+                object_twice(f, before.get(f.camera), pixels) for f, pixels in zip(frames, steady, strict=True)
+            ]
+            half, is_lasting = self.num_steps % 2, partial(self._is_lasting, robot, views, lasting)
+        filled += self._fill_gaps(views, masks, removed, half, is_lasting)
         self._keep_to_surface(robot, views, seen)
         if self.shell is not None:
             self.shell.step(self.window, self.mounted, self.descent.background)
@@ -362,7 +371,12 @@ class SceneFitter:
         return filled
 
     def _fill_gaps(
-        self, views: Sequence[View], masks: Sequence[SelfMask], removed: dict[str, int], half: int | None = None
+        self,
+        views: Sequence[View],
+        masks: Sequence[SelfMask],
+        removed: dict[str, int],
+        half: int | None = None,
+        is_lasting: Callable[[Float32], Bool] | None = None,
     ) -> Filled:
         """Add splats where measured surfaces are far from all spheres, in alternate halves per step.
 
@@ -386,6 +400,8 @@ class SceneFitter:
                 each=self._each,
             )
             seeds = seeds.select(self._is_grounded(seeds.centers, views, label))
+            if label == Label.OBJECT and is_lasting is not None:
+                seeds = seeds.select(is_lasting(seeds.centers))
             num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
             if label == Label.OBJECT and num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
                 shown, gap = self.descent.misfits(views)[1], self.config.max_gap
@@ -394,6 +410,24 @@ class SceneFitter:
                 removed["evicted"] += int(is_evicted.sum())
             filled += self.buffer.fill(seeds, self.config.initial_opacity, label=label)
         return filled
+
+    def _is_lasting(
+        self, robot: RobotPosture | None, views: Sequence[View], lasting: Sequence[Bool], points: Float32
+    ) -> Bool:
+        """Points (K,) that a `lasting` pixel (H, W) shows, or that are not near a link that no joint moves.
+
+        Stereo gives pixels outside of an outline the link's depth in some frames: splats there would float.
+        """
+        if robot is None:
+            return np.ones(len(points), bool)
+        distance = robot.distance(points)
+        is_lasting = (distance > ROBOT_REACH) | (distance >= robot.distance_to_moving(points))
+        for view, pixels in zip(views, lasting, strict=True):
+            pixel, z = pixels_at(view.frame, points)
+            depth = view.frame.depth.ravel()[pixel]
+            is_there = np.abs(z - depth) <= tolerance_at(depth, self.occupancy.config)
+            is_lasting |= (pixel >= 0) & pixels.ravel()[pixel] & is_there
+        return np.asarray(is_lasting)
 
     def _standing_for(self, label: Label) -> Bool:
         is_robot: Bool = self.buffer.labels == Label.ROBOT

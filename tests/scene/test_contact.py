@@ -74,6 +74,42 @@ def test_what_the_robot_hides_of_an_object_is_not_fitted_to_the_robot() -> None:
         assert hidden_objects(slots, posture, [seen_and_masked(robot)], OccupancyConfig()).tolist() == hidden
 
 
+@pytest.mark.parametrize(
+    ("is_fixed", "place", "lasts", "is_kept"),
+    [
+        pytest.param(True, (0.15, 0.0, 0.03), True, False, id="before what a lasting pixel shows"),
+        pytest.param(True, (0.15, 0.0, 0.0), True, True, id="where a lasting pixel shows it"),
+        pytest.param(True, (0.15, 0.0, 0.0), False, False, id="where no pixel lasts"),
+        pytest.param(False, (0.15, 0.0, 0.03), False, True, id="at a link that moves"),
+        pytest.param(True, (0.5, 0.4, 0.03), False, True, id="far from the robot"),
+    ],
+)
+def test_gaps_at_a_fixed_link_are_filled_where_a_surface_lasts(
+    is_fixed: bool, place: tuple[float, float, float], lasts: bool, is_kept: bool
+) -> None:
+    target, robot, view = robot_over_the_floor()
+    assert robot.surface is not None
+    base = replace(robot, surface=replace(robot.surface, fixed=("arm",) if is_fixed else ()))
+    lasting = np.full(view.depth.shape, lasts)
+    found = target._is_lasting(base, [target.view(view)], [lasting], np.array([place], np.float32))
+    assert found.tolist() == [is_kept]
+
+
+def test_the_first_map_is_filled_before_anything_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = list[np.ndarray]()
+
+    def record(self: SceneFitter, *given: Any) -> np.ndarray:
+        calls.append(given[2][0])
+        return np.zeros(len(given[3]), bool)
+
+    monkeypatch.setattr(SceneFitter, "_is_lasting", record)
+    target, robot, view = robot_over_the_floor()
+    assert not calls
+    target.step([view], robot)
+    assert len(calls) == 1
+    assert calls[0].any()
+
+
 def robot_over_the_floor() -> tuple[SceneFitter, RobotPosture, RgbdFrame]:
     """A fitter that has seen the floor, a ball 5 cm over it, and what a camera then sees."""
     target, robot = SceneFitter(CONFIG, OccupancyConfig(), WORKSPACE), ball(0.15)

@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Bool, Float32, Intrinsics, RgbdFrame
-from splatctrl_cli.scene.steady_depth import steadied
+from splatctrl_cli.scene.steady_depth import object_twice, steadied
 from tests.plain import plain_frame
 
 LENS = Intrinsics(fx=150.0, fy=150.0, cx=79.5, cy=59.5, width=160, height=120)
@@ -87,3 +87,15 @@ def test_a_surface_that_the_robot_bares_is_where_it_is_measured_not_halfway_to_t
     shown, is_steady = steady(table, frame_of(1.0), was_object)
     np.testing.assert_array_equal(shown.depth[:, 80:], table.depth[:, 80:])
     assert (shown.depth[:, :80] < 1.002).all() and is_steady.all()
+
+
+def test_a_pixel_lasts_that_is_a_steady_object_in_two_images() -> None:
+    """All pixels do if the camera moved."""
+    was_object = EVERYWHERE.copy()
+    was_object[:, :80] = False
+    first = frame_of(1.0)
+    _, is_steady = steady(frame_of(1.0), first, was_object)
+    assert is_steady.all()
+    np.testing.assert_array_equal(object_twice(frame_of(1.0), (first, was_object), is_steady), was_object)
+    assert object_twice(frame_of(1.0, x=0.1), (first, was_object), is_steady).all()
+    assert object_twice(frame_of(1.0), None, is_steady).all()

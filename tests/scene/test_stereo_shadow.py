@@ -75,3 +75,15 @@ def test_a_shadow_is_no_place_without_an_answer(is_dark: bool) -> None:
     nobody = np.zeros((HEIGHT, WIDTH), np.float32)
     found = list(unanswered_points(plain_frame(depth, lens), nobody, OccupancyConfig(voxel=0.01)))
     assert (sum(map(len, found)) > 0) == is_dark
+
+
+def test_background_between_the_robots_shadow_and_an_object_is_no_hole() -> None:
+    """The same gap at another object's shadow is one."""
+    robot, config = slice(100, 130), OccupancyConfig()
+    seen = as_stereo(plates(slice(40, 50), robot))
+    seen[DARK, 50:91] = 0.0  # background without depth, as far as the shadow
+    drawn = np.zeros_like(seen)
+    drawn[5:35, robot] = PLATE
+    frame = plain_frame(seen, Intrinsics(fx=FOCAL, fy=FOCAL, cx=80.0, cy=20.0, width=WIDTH, height=HEIGHT))
+    assert not list(unanswered_points(frame, drawn, config))
+    assert sum(map(len, unanswered_points(frame, np.zeros_like(seen), config))) > 100
