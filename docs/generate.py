@@ -71,14 +71,17 @@ def _general(name: str, names: Container[str]) -> str:
 
 
 Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Limit | Compared
-REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[Entry]]] = {
-    "splat_formats": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),
-    "grid_formats": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
-    "datasets": (("layout", "known by", "poses", "depth", "intrinsics"), LAYOUTS),
+Registry = tuple[tuple[str, ...], Iterable[Entry]]
+TABLES: dict[str, Registry] = {
     "criteria": (("criterion", "holds where", "broken:"), CRITERIA),
     "limits": (("evidence", "allowed", "why"), (*LIMITS, PROOF)),
     "metrics": (("command", "figures", "unit", "better", "tolerance"), [*documented()]),
-    "checks": ((), CHECKS.values()),  # without a header: a list
+}
+LISTS: dict[str, Registry] = {  # with the words before what follows an entry's first sentence
+    "splat_formats": (("rounding", "without"), SPLAT_FORMATS.values()),
+    "grid_formats": (("for",), GRID_FORMATS.values()),
+    "datasets": (("poses", "depth", "intrinsics"), LAYOUTS),
+    "checks": ((), CHECKS.values()),
 }
 
 
@@ -96,11 +99,18 @@ def pages() -> dict[str, str]:
 
 def _filled(found: re.Match[str]) -> str:
     """A mark in a page, and the table, or list, of the registry that it names."""
-    header, entries = REGISTRIES[found[2]]
+    titles, entries = (TABLES | LISTS)[found[2]]
     texts = [text for entry in entries for text in entry.docs.split("\n\n") if text]
     rows = [tuple(cell.strip() for cell in " ".join(text.split()).split("|")) for text in texts]
-    lines = _table(header, rows) if header else [f"- {name}: {meaning}" for name, meaning in rows]
+    lines = _table(titles, rows) if found[2] in TABLES else [_line(titles, *row) for row in rows]
     return found[1] + "\n".join(lines) + "\n"
+
+
+def _line(titles: tuple[str, ...], name: str, meaning: str, *cells: str) -> str:
+    """An entry of a list."""
+    return "; ".join(
+        [f"- {name}: {meaning}", *(f"{title} {cell}" for title, cell in zip(titles, cells, strict=False))]
+    )
 
 
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
