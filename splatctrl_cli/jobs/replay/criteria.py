@@ -66,9 +66,8 @@ def nearby(judged: Judged, values: Float64) -> tuple[float, float, int] | None:
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """The depth about the arm is at most `--max-map-age` old and not newer than the state it judges. After half a
-    second without any, the next depth shows nothing where the arm was. Frames without depth do not count; a baked
-    field has no times (a note).
+    """The depth about the arm is at most `--max-map-age` old and not newer than the state. After half a second
+    without any, the next depth shows nothing where the arm was. A baked field has no times (a note).
     """
     first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
     for found in judged.replay.unwatched:
@@ -125,8 +124,7 @@ def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
 
 def map_age(judged: Judged) -> Iterator[Reason]:
     """The map is at most `--max-map-age` old (a baked field: from its moment). Newer depth shows nothing within the
-    margin: depth of a state's own time that a late map (`--latency`) did not contain, or the next after the last
-    state.
+    margin: of a state's own time that a late map (`--latency`) did not contain, or the next after the last state.
     """
     yield from _overtaken(judged)
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age

@@ -146,9 +146,8 @@ PROOF = Limit(
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """Every point within the margin of the arm has one class of evidence, and each class keeps its limit (the table
-    below); at most `--max-unknown` of the sphere centres are in unobserved space. A baked field needs its channel
-    `observed`.
+    """Every class of evidence within the margin of the arm keeps its limit (the table below); at most `--max-unknown`
+    of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
     for limit in LIMITS:
         yield from _within(judged, limit)

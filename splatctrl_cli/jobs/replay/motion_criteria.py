@@ -136,9 +136,9 @@ def _at_worst(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links overlap. No moving link comes within the margin of a fixed one that carries no joint, such as a
-    table of the URDF. Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their
-    largest gap) unless the recording was. Measured by collision surfaces, or by spheres if these cannot be read.
+    """No two links overlap. No moving link comes within the margin of a fixed one without joints, such as a table.
+    Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap) unless
+    the recording was. By collision surfaces, or by spheres if these cannot be read.
     """
     least = lowest(judged.replay.audit.figures["self_clearance"])
     events = events_of(judged.replay, EventKind.SELF_COLLISION)
@@ -210,9 +210,8 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
-    """No new obstacle comes within the margin of a fixed link's surface in two scenes in a row. New is what lies 1 cm
-    or more (at its mount 3 cm) from all that stood there when a camera first looked. What stands there from the start
-    is a note.
+    """No new obstacle comes within the margin of a fixed link's surface in two scenes in a row. New is 1 cm or more (at
+    its mount 3 cm) from all that stood there when a camera first looked; the old is a note.
     """
     broken = {
         name: (first, least)
