@@ -24,8 +24,7 @@ class ArmAgreement:
 
     median [m]: within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance from it (from 0
     if negative, from `ARM_COVER` if more), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR` behind.
-    num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one factor fits
-    most pixels.
+    num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one fits most.
     """
 
     median: float

@@ -59,7 +59,6 @@ class ImageWatch:
         return is_next
 
     def add_bad(self, stamp_ns: int, reason: str) -> None:
-        """Count an undecodable image."""
         self.count += 1
         self.num_bad += 1
         if self.first_bad_ns is None:
@@ -124,7 +123,6 @@ class ImageWatch:
         return self.scale if self.scale is not None else None if self.is_float else MILLIMETRE
 
     def add_undecoded(self, encoding: str, width: int, height: int) -> None:
-        """Count an image without its pixels."""
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
@@ -146,7 +144,6 @@ def _constant(depth: Float32) -> list[float]:
 
 
 def stride_of(height: int) -> int:
-    """Number of rows per kept row."""
     return max(1, -(-height // limits.KEPT_ROWS))
 
 
@@ -157,7 +154,6 @@ def thumbnail_size(width: int, height: int) -> tuple[int, int]:
 
 
 def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
-    """The camera of a thumbnail."""
     width, height = thumbnail_size(lens.width, lens.height)
     across, down = width / lens.width, height / lens.height
     cx, cy = (lens.cx + 0.5) * across - 0.5, (lens.cy + 0.5) * down - 0.5
@@ -165,7 +161,6 @@ def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
 
 
 def image_findings(images: ImageWatch) -> Iterator[Finding]:
-    """Findings on the images, except depth."""
     where = images.where
     if images.num_bad:
         severity = error if images.num_bad == images.count else warning
@@ -202,7 +197,6 @@ def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
 
 
 def depth_findings(images: ImageWatch) -> Iterator[Finding]:
-    """Findings on missing or implausible depth."""
     where = images.where
     if images.num_without_depth:
         every = images.num_without_depth == images.num_decoded

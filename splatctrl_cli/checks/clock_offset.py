@@ -37,7 +37,6 @@ class ImageMotion:
     _last: dict[str, tuple[Float32, UInt8]] = field(default_factory=dict)
 
     def add(self, frame: RgbdFrame) -> None:
-        """Take the next frame."""
         camera = self.cameras.get(frame.camera)
         if camera is None:
             camera = CameraMotion(intrinsics=thumbnail_lens(frame.intrinsics), T_world_camera=frame.T_world_camera)
@@ -125,7 +124,6 @@ class ClockOffset:
 
     @property
     def sentence(self) -> str:
-        """One line for a report."""
         if self.offset_s is None or self.uncertainty_s is None:
             return f"clocks of cameras and robot: cannot tell their offset: {self.reason}"
         return (
@@ -140,7 +138,7 @@ def estimate_clock_offset(
     """The offset at which robot and image motion correlate best.
 
     states: by stamp. With `robot` and stationary cameras, pixel changes are compared with the spheres' silhouette;
-    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras. It is
+    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras; it is
     unknown without motion, at low correlation, with a rival peak, or at the end of the search.
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]

@@ -74,7 +74,6 @@ def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: st
 
 
 def pose(text: str) -> tuple[float, ...]:
-    """Parse a pose as POSE, for argparse."""
     try:
         return checked_pose(numbers(text))
     except ValueError as error:
@@ -337,7 +336,6 @@ class Console:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Aligned text columns, numbers to the right."""
     return list(long_table(header, lambda: rows))
 
 

@@ -161,7 +161,6 @@ def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
 
 
 def _places(output: Path) -> set[Path]:
-    """Output path and its partial."""
     target = Path(os.path.realpath(output))  # resolve() raises RuntimeError for a link to itself
     return {target, target.with_name(target.name + PARTIAL)} if target.name else {target}
 
@@ -170,8 +169,7 @@ def _places(output: Path) -> set[Path]:
 def refuse_endless_files() -> None:
     """Make reading a FIFO, socket or device raise OSError from now on, anywhere.
 
-    A FIFO among images would wait for its writer; a link to /dev/zero would fill the memory. Files are opened in many
-    places, so the interpreter checks each one.
+    A FIFO among images would wait for its writer; a link to /dev/zero would fill the memory.
     """
     sys.addaudithook(_look)
 

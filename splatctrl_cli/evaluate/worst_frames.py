@@ -72,7 +72,7 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
 def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
     """Each moment's image: of the cameras' newest up to then, the one that best shows its worst sphere, or None.
 
-    One pass over frames (by stamp), one kept per camera.
+    One pass over frames, by stamp.
     """
     found: list[Sight | None] = [None] * len(moments)
     waiting = sorted(range(len(moments)), key=lambda i: -moments[i].stamp_ns)

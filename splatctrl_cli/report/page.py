@@ -2,7 +2,7 @@
 
 A scene holds splats by time, a moving arm, and the deciding event; trimesh brings the viewer's three.js. Packed, it
 is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64, and each array's type, first byte and count. Points
-are 16-bit integers within their box: 0.05 mm at three metres.
+are 16-bit integers within their box.
 """
 
 import base64

@@ -147,7 +147,6 @@ class Scheduler:
 
 
 def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
-    """Build a run from its end and output."""
     place = folder / node.name
     verdict = verdict_in(Path(f"{place}.json")) if end.exit_code is not None else {}
     code, outcome, label = end.exit_code, verdict.get("outcome", ""), verdict.get("label", "")

@@ -1,7 +1,7 @@
 """One node's run in a forked child under limits, with log, result and end.
 
-A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time in one
-thread, and reads each as a line of JSON from stdin. When stdin ends, so does the run.
+A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time, each a
+line of JSON from stdin, and ends with stdin.
 """
 
 import contextlib

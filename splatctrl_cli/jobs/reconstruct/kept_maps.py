@@ -1,7 +1,4 @@
-"""Time steps that leave a map: those due, and those with a new obstacle.
-
-An obstacle present only between two maps would otherwise escape a replay.
-"""
+"""Time steps that leave a map: those due, and those with a new obstacle that could escape a replay."""
 
 from pathlib import Path
 

@@ -159,8 +159,8 @@ def made_from_mismatches(
 ) -> Iterator[Mismatch]:
     """Mismatches of a scene or field, by its `SceneFolder.made_from`, with a log and robot.
 
-    Compares digests of files and calibration, each training camera's first frame, and the segmented robot's joints
-    and links; also finds corrected depth.
+    Compares digests of files and calibration, training cameras' first frames, and the segmented robot's joints and
+    links; also finds corrected depth.
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")

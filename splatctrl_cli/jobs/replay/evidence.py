@@ -182,9 +182,9 @@ class Misses:
 def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
     """Largest miss of each held-out frame set near the motion, without the robot.
 
-    Near is within `reach` [m]; sets count within the audited time. One at a time is in memory. Each is compared with
-    the map that judged the states just before it, when that map is oldest. The next map contains other cameras of
-    the same moment, so it misses less than the one that judges.
+    Near is within `reach` [m]; sets count within the audited time, one in memory at a time. Each is compared with the
+    map that judged the states just before it, when that map is oldest: the next one contains other cameras of the
+    same moment, and misses less.
     """
     swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])

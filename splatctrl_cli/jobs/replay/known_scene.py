@@ -60,7 +60,7 @@ class KnownScene:
     stamps_ns: of consecutive scenes, each known `latency_ns` after its stamp; empty for one scene for all times.
     `advance` to a stamp makes the scenes up to it; call `finish` after the replay. box: of a grid's cell centres.
     moment_ns: the time of a baked field. seen_at: when space was last seen, as known at a stamp; without
-    has_seen_times only if it ever was. figures: of the reconstruction, complete after the replay.
+    has_seen_times only if it ever was.
     """
 
     at: Callable[[int], KnownFields]
@@ -209,7 +209,6 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
 
 
 def seen_of(voxels: SeenVoxels) -> Seen:
-    """Convert seen voxels for `NearSpace`."""
     edges = np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64)
     return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel)
 

@@ -142,7 +142,6 @@ class FitDevice:
         return automatic(progress, too_little, name=last or CUDA, needed=bytes_needed(num_splats, sizes))
 
     def close(self) -> None:
-        """Free the card's memory."""
         if self._fit is not None:
             with suppress(DeviceError):  # its failure was reported already
                 self._fit.close()

@@ -9,9 +9,7 @@ class Progress(Protocol):
 
     is_quiet: bool
 
-    def log(self, line: str) -> None:
-        """Show one line."""
-        ...
+    def log(self, line: str) -> None: ...
 
 
 class Silent:

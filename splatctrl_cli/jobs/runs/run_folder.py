@@ -100,7 +100,6 @@ class RunFolder:
             raise InputError(f"{file}: is not JSON: {error}") from None
 
     def pictures(self) -> list[Path]:
-        """PNG files of the run, by name."""
         found = [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
         return [self.parts.checked(path) for path in found if self.parts.has(path)]
 

@@ -49,7 +49,6 @@ class Reference:
 
     @property
     def scores_training(self) -> bool:
-        """True if the protocol scores training views."""
         return self.protocol is not None and self.protocol.scores_training
 
 

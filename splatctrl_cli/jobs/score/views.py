@@ -187,14 +187,12 @@ def rendered_with_shell(
 def rendered(
     splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int = 0
 ) -> Rendering:
-    """Render splats of either kind."""
     if isinstance(splats, GaussianSet):
         return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
     return render(splats, intrinsics, T_world_camera, threads=threads)
 
 
 def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:
-    """Final splats, of either kind."""
     return scene.gaussians() if scene.is_anisotropic else scene.splats()
 
 

@@ -106,7 +106,6 @@ class SweepResult:
     num_new: int = 0
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, equal for equal settings."""
         return {
             "before": {name: self.before[name] for name in ("outcome", "label", "sentence")},
             "keys": {

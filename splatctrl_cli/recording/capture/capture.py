@@ -1,7 +1,4 @@
-"""``X.capture/``: a plain folder of images, poses and joints (docs/capture.md).
-
-Its index is capture.json, frames.csv and SHA256SUMS, in some fifty bytes of memory a file.
-"""
+"""``X.capture/``: a plain folder of images, poses and joints (docs/capture.md)."""
 
 import csv
 import hashlib
@@ -97,7 +94,6 @@ _ENTRIES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
 
 
 def is_capture(path: Path) -> bool:
-    """True for a capture folder."""
     return (path / "capture.json").is_file()
 
 
@@ -225,8 +221,7 @@ _NOT_FOR_CAPTURES = (
 class CaptureSource(FrameSource):
     """Records of a capture folder; files with a wrong checksum are skipped and counted as damage.
 
-    joints: a robot's, merged from the kept topics as from the log; if None, or no topic was kept, the states are
-    joints.npz's.
+    joints: a robot's, merged from the kept topics; if None, or no topic was kept, the states are joints.npz's.
     """
 
     def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:

@@ -76,19 +76,16 @@ class Journal:
         return Entry(**found)
 
     def add(self, entry: Entry) -> None:
-        """Add a written frame."""
         self.num_entries += 1
         self._stream.write(json.dumps(vars(entry)) + "\n")
         self._stream.flush()
 
     def entries(self) -> Iterator[Entry]:
-        """All entries in order."""
         lines = _lines(self._path)
         next(lines, None)
         yield from (Entry(**line) for line in lines)
 
     def remove(self) -> None:
-        """Delete the finished journal."""
         self._stream.close()
         self._path.unlink()
 

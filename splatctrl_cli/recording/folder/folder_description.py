@@ -114,7 +114,6 @@ class ImagePart:
         return self.file.is_file()
 
     def absolute(self) -> Path:
-        """The whole file."""
         return self.file.absolute()
 
     def relative_to(self, root: Path) -> Path:
@@ -151,9 +150,9 @@ class ListedView:
 class Description:
     """A whole description; transforms.json may give camera and frames, --camera-pose the poses.
 
-    listed: a layout's views, instead of frames. is_depth_resized: depth is resized to colour by nearest pixels.
-    unpaired: colour and depth files without partner. num_damaged: views lost to damage. supply: how to add depth if
-    no view has it. notes: assumptions on what the layout leaves open.
+    listed: a layout's views, instead of frames. is_depth_resized: to colour, by nearest pixels. unpaired: colour and
+    depth files without partner. num_damaged: views lost to damage. supply: how to add depth if no view has it. notes:
+    assumptions on what the layout leaves open.
     """
 
     path: Path

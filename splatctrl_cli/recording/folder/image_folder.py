@@ -90,7 +90,6 @@ class ImageFolderSource(FrameSource):
         return any(view.depth is not None for view in self._views)
 
     def no_depth(self) -> InputError:
-        """The error for missing depth."""
         return InputError(
             f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
             remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
@@ -147,7 +146,6 @@ class ImageFolderSource(FrameSource):
         return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
 
     def count_views(self) -> dict[str, int]:
-        """Views by camera."""
         return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
 
     def digests(self) -> dict[str, str]:

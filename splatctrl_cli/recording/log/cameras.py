@@ -61,7 +61,7 @@ def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraT
     """Pair colour and depth topics that share a namespace, deepest first, into named cameras.
 
     /cam0/color/image_raw and /cam0/depth/image_raw make `cam0`. Prefers registered depth, colour to grey, rectified
-    to raw, uncompressed images. Skips topics `without`.
+    to raw, uncompressed images.
     """
     colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
     depths = image_topics(survey, "depth")
@@ -200,7 +200,7 @@ def _parts(name: str) -> tuple[str, ...]:
 def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
     """Name cameras by the namespace's last part if unique, else all of it; `camera` if empty.
 
-    Names are folders: characters but letters, digits, ``_``, ``-``, ``.`` become ``_``; the last two cannot be first.
+    Names are folders: other characters than letters, digits, ``_``, ``-``, ``.`` become ``_``.
     """
     short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
     long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
@@ -339,7 +339,6 @@ def join_pose_topics(
 
 
 def pose_topics(survey: Survey) -> list[str]:
-    """Topics of pose messages."""
     return [topic.topic.name for topic in survey.of_type(*POSE_TYPES)]
 
 

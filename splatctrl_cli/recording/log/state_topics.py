@@ -45,8 +45,8 @@ def joint_records(
 ) -> tuple[tuple[str, ...], StateColumns]:
     """Joint names and states by stamp; both empty if the log has none.
 
-    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states that do not name
-    the same joints as its fullest (a gripper that publishes alone) are left out with a note.
+    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states that do not name the
+    same joints as its fullest are left out with a note.
     """
     topics = state_topics(survey, options, loss)
     if not topics:
