@@ -215,7 +215,7 @@ def motion_findings(
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
 ) -> tuple[dict[str, float], list[Finding]]:
-    """Clock offsets [s] of cameras that then show the arm better, and findings on the arm."""
+    """Clock offsets [s] of cameras that then show the arm better, and findings."""
     posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
     timings: dict[str, tuple[float, float]] = {}
@@ -243,7 +243,7 @@ def _arm_findings(
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
-    """Offsets that fit much better than the median's; others have other causes, as a misplaced camera."""
+    """Offsets that fit much better than the median's; others have other causes."""
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():

@@ -121,7 +121,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
-    """Log brightness (N, B) by bands of rows, less a parabola; 0 if bands explain little.
+    """Log brightness (N, B) by bands of rows, less a parabola, or 0.
 
     Shadows and pose errors do not follow rows; gloss and vignetting vary slowly, lamps on mains within 10 or 8 ms.
     """

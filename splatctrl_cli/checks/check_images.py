@@ -20,7 +20,10 @@ SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """Depth (h, w) [m] at every `stride`-th pixel, or colour (h, w, 3) averaged between; full width, height [px]."""
+    """Depth (h, w) [m] at every `stride`-th pixel, or colour (h, w, 3) averaged.
+
+    width, height [px]: of the whole image.
+    """
 
     stamp_ns: int
     stride: int
@@ -364,7 +367,7 @@ def _correlation(color: Float64, depth: Float64) -> Float64:
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:
-    """Rows and columns of the best shift, its correlation, and the best one away from it."""
+    """Rows and columns of the best shift, its correlation, and the best away from it."""
     height, width = surface.shape
     rows, columns = height // limits.EDGE_SEARCHED, width // limits.EDGE_SEARCHED
     near = surface[

@@ -201,7 +201,7 @@ def _world(model: RobotModel, state: JointState) -> Float64:
 
 
 def _explained(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
-    """X (4, 4) of logged = poses X, by mean rotation and median position, and rest."""
+    """X (4, 4) of logged = poses X, by mean rotation and median position; rest."""
     relative = _inverse(poses) @ logged
     U, _, Vt = np.linalg.svd(relative[:, :3, :3].sum(axis=0))
     X = pose_at(np.median(relative[:, :3, 3], axis=0), U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)

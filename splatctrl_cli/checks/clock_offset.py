@@ -20,7 +20,7 @@ _NEAR = 0.05  # [m] in front of the camera
 
 @dataclass(kw_only=True)
 class CameraMotion:
-    """A camera's stamps (K + 1) [ns], and K changes (h, w) in [0, 1] between them."""
+    """A camera's stamps (K + 1) [ns], and changes (K, h, w) in [0, 1]."""
 
     intrinsics: Intrinsics
     T_world_camera: Float64
@@ -65,7 +65,7 @@ def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) ->
 
 
 def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) -> Float32:
-    """Depth (T, h, w) [m] of spheres (T, S, 3) in a camera; 0 = none.
+    """Depth (T, h, w) [m] of spheres (T, S, 3); 0 = none.
 
     A sphere is a disc of its radius (S,) at its distance, exact on the optical axis.
     """
@@ -86,7 +86,7 @@ def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) ->
 
 
 def predicted_change(depth_a: Float32, depth_b: Float32) -> Float32:
-    """Change (K, h, w) in [0, 1] of silhouettes; 1 where only one has the robot."""
+    """Change (K, h, w) of silhouettes; 1 where only one has the robot."""
     a, b = depth_a > 0, depth_b > 0
     of_depth = np.minimum(np.abs(depth_b - depth_a) / np.float32(limits.MOTION_DEPTH_STEP), np.float32(1.0))
     return np.where(a & b, of_depth, (a ^ b).astype(np.float32)).astype(np.float32)

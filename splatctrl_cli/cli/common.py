@@ -277,7 +277,7 @@ _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
 class Console:
-    """Output of a command: results to stdout, log lines to stderr unless --quiet, verdicts to CI.
+    """Output of a command: results to stdout, log lines to stderr, verdicts to CI.
 
     is_step: a step of another command; CI gets no verdict.
     """

@@ -87,7 +87,7 @@ def autocorrelation_time(misses: Float64) -> int:
 
 
 def stretches(num_sets: int, length: int) -> Index:
-    """The stretch (T,) of each set: `length` sets, which begin `length` sets after the previous one's last.
+    """The stretch (T,) of each set; `length` sets lie between two stretches.
 
     Sets between count to the previous stretch, which only raises its score.
     """

@@ -215,7 +215,7 @@ REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
 @dataclass(frozen=True, kw_only=True)
 class TrueCells:
-    """Q sampled cells, world: centres and nearest surface points (Q, 3) [m], `FIELDS` and true distance (Q,) [m]."""
+    """Q sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]."""
 
     points: Float64
     fields: Mapping[str, Float64]

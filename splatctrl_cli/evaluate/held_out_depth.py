@@ -313,7 +313,7 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
 
 
 def depth_edges(depth: NDArray[np.float32]) -> Bool:
-    """(H, W) True where a neighbour's depth differs by more than a share of the smaller."""
+    """(H, W) True where a neighbour's depth differs by more than a share."""
     is_edge = np.zeros(depth.shape, dtype=np.bool_)
     for axis in (0, 1):
         here, there = [slice(None)] * 2, [slice(None)] * 2

@@ -92,7 +92,7 @@ class Metric(Generic[R]):
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """A column (T,) folded to a value; accumulate: up to each state, from `start` on, None if undefined."""
+    """A column (T,) folded to a value; accumulate: up to each state, from `start` on."""
 
     of: Callable[[Float64], float | None]
     start: float = np.nan

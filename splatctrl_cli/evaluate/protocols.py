@@ -65,7 +65,7 @@ class ScoreProtocol:
         return not (self.scored or self.every)
 
     def split(self, numbers: Sequence[int], where: str) -> Split:
-        """Split the views `numbers` of a scan, named `where` in errors; unnamed views are left out.
+        """Split the views `numbers` of a scan, named `where` in errors.
 
         Raises InputError if named views are missing, or if none train or are scored.
         """
@@ -196,7 +196,7 @@ class ObservedSpace:
     plane: Float64
 
     def near(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] in or near the box: only these are compared."""
+        """(Q,) True for points (Q, 3) [m] in or near the box, which are compared."""
         return np.asarray(((points >= self.low - BEFORE) & (points < self.high + BEYOND)).all(axis=1))
 
     def observed(self, points: Float64) -> Bool:

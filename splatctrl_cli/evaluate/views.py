@@ -102,7 +102,7 @@ def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float 
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
-    """Indices (K,) of points (Q, 3) in the image, their own depth (K,) [m], and the depth measured there (K,) [m]."""
+    """Indices (K,) of points (Q, 3) in the image; their and measured depth [m]."""
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
     landing = np.flatnonzero(points_camera[:, 2] > 1e-6)
     pixels = np.floor(project(frame.intrinsics, points_camera[landing]) + 0.5)

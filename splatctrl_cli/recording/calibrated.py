@@ -214,7 +214,7 @@ class CalibratedSource(FrameSource):
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-    """Interpolate the pose (4, 4) on a path; outside it, the end if within the tolerance, else None."""
+    """Interpolate the pose (4, 4) on a path; beyond it, the end within the tolerance."""
     after = int(np.searchsorted(stamps, stamp_ns))
     if after in (0, len(stamps)):
         end = min(after, len(stamps) - 1)

@@ -28,7 +28,7 @@ class CameraTopics:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseTopic:
-    """A topic of poses; frame: what it poses, "" for the frame that its messages name, else the camera's."""
+    """A topic of poses; frame: what it poses, "" for the messages' or the camera's."""
 
     topic: str
     frame: str = ""

@@ -250,7 +250,7 @@ def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> N
 
 
 def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping[str, str]) -> list[str]:
-    """A workflow command for each of the most severe cases; its file is the recording, if in the repository."""
+    """A workflow command for each of the most severe cases."""
     level = "error" if is_fatal else "warning"
     lines = []
     # GitHub shows ten of a level for a step

@@ -1,4 +1,4 @@
-"""Pictures of a replay: clearance and events, commands, and divergence; long curves as their range per column."""
+"""Pictures of a replay: clearance, events, commands, divergence; long curves as ranges."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -65,7 +65,7 @@ class BakeRequest(RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class BakeSource:
-    """Splats with the occupancy of the same moment; a bare splat file leaves the other fields None or empty.
+    """Splats with the occupancy of the same moment, None for a bare splat file.
 
     unrepresented: occupied voxels without a splat. workspace: the box outside which no splats are kept.
     """
@@ -212,7 +212,7 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
 
 
 def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
-    """Box of the grid: as given, else of the robot's reach, the previous field, or the splats with padding."""
+    """Box of the grid: given, else of the reach, the previous field, or the splats."""
     if request.box is not None:
         return request.box
     if request.urdf is not None:

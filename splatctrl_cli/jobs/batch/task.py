@@ -128,7 +128,7 @@ def read_end(path: Path, key: str) -> End | None:
 
 
 def stamp_of(out: Path) -> str:
-    """Size and time of an output's run.json or capture.json, or of the file; empty if there is no output."""
+    """Size and time of an output's run.json, capture.json or file; empty without output."""
     for place in (out / "run.json", out / "capture.json", out):
         with contextlib.suppress(OSError):
             found = place.stat()

@@ -47,7 +47,7 @@ Splats = SplatSet | GaussianSet
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest:
-    """One export of a scene folder or splat file; the suffix of `out` is the format.
+    """One export of a scene or splat file; the suffix of `out` is the format.
 
     out: None for a PLY next to the scene. labels: None for all. layout: of a PLY, "short" or "full", None for the
     lossless one. isotropic: make anisotropic Gaussians round.

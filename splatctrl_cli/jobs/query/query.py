@@ -45,12 +45,12 @@ _DECIMALS = 7  # of a length [m]: finer than float32
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Answers at Q points, world; None if unavailable, NaN or -1 where a point has none.
+    """Answers at Q points, world; None if unavailable, NaN or -1 without one.
 
     in_box (Q,): in the source's box. distance (Q,) [m], gradient (Q, 3). bound (Q,) [m]: lower bound of the exact
     distance to the splats. probability (Q,) of collision. label (Q,) `Label` and splat (Q,), file index, of the
-    nearest sphere. observed (Q,) `VoxelState`. surface (Q, 3) [m]: end of sphere marching, where the field reads
-    rest (Q,) [m].
+    nearest sphere. observed (Q,) `VoxelState`. surface (Q, 3) [m]: end of sphere marching, where the field reads rest
+    (Q,) [m].
     """
 
     in_box: Bool | None = None

@@ -168,7 +168,7 @@ class Reconstruction:
             self._save_if_due()
 
     def take(self, step: TimeStep, console: Progress) -> AuditRow | None:
-        """Process the next time step, with a snapshot if due; None while the workspace is unknown."""
+        """Process the next time step; None while the workspace is unknown."""
         index, self.num_read = self.num_read, self.num_read + 1
         needs_depth = self.request.box is None and self.robot is None and self.cloud is None  # for the workspace
         if self._fitter is None and not step.has_depth and needs_depth:
@@ -222,7 +222,7 @@ class Reconstruction:
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Enlarge a default budget that the first step exceeded next to a robot; True if so.
+        """Enlarge a default budget that the first step exceeded next to a robot.
 
         Without a splat, a whole voxel counts as occupied.
         """

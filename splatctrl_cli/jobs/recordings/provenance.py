@@ -226,7 +226,7 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
 
 
 def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
-    """Mismatch of states at stamps (T,) [ns], T > 0, and a scene's span; None if they (nearly) overlap."""
+    """Mismatch of stamps (T,) [ns] and a scene's span; None if they (nearly) overlap."""
     first, last = int(states_ns[0]), int(states_ns[-1])
     apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
     if apart_ns <= RECORDINGS_APART_NS:

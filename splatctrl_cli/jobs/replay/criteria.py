@@ -60,7 +60,7 @@ def mm(metres: float) -> str:
 
 
 def nearby(judged: Judged, values: Float64) -> tuple[float, float, int] | None:
-    """Largest of values (T,) about the arm, its time [s], and their count; None without any."""
+    """Largest of values (T,) about the arm, its time [s], and their count."""
     num = int(np.isfinite(values).sum())
     return (float(np.nanmax(values)), seconds_at(judged, int(np.nanargmax(values))), num) if num else None
 
@@ -114,7 +114,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
 
 
 def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
-    """First words and remedy if the evidence is too old because the log had ended; else empty."""
+    """First words and remedy if the evidence is old because the log ended."""
     lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""

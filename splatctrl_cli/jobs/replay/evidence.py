@@ -231,7 +231,7 @@ def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
 
 
 def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
-    """Largest distance [m] of points (Q, 3) to the map, and its point: (4,); NaN without points."""
+    """Largest distance [m] of points (Q, 3) to the map, and its point: (4,)."""
     if not len(points):
         return np.full(4, np.nan)
     values = distance(points)
@@ -240,7 +240,7 @@ def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
 
 
 class Swept:
-    """Space within `reach` [m] of an arm's moving spheres, or up to the diagonal of a SPHERE_CELL farther."""
+    """Space within `reach` [m] of an arm's moving spheres, plus a cell's diagonal at most."""
 
     def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
         """Enclose cells (K, 3), whole numbers of SPHERE_CELL, by radii (K,) [m], the largest in each."""
@@ -272,7 +272,7 @@ class Swept:
 
 
 class TrueSurfaces:
-    """True surface points (T, 3) [m] nearest to each state; `seen` (T,): by a camera by then."""
+    """True surface points (T, 3) [m] nearest to each state; `seen` (T,) by then."""
 
     def __init__(self, points: Rows, stamp_ns: Stamps, inputs: ReplayInputs) -> None:
         self._points, self._stamp_ns = points, stamp_ns

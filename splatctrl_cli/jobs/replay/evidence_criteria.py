@@ -38,7 +38,7 @@ from splatctrl_cli.voxels import EvidenceClass
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A row of the evidence table; column: of `NEAR_COLUMNS`, for `parts` the least of their classes.
+    """A row of the evidence table; column: of `NEAR_COLUMNS`, for `parts` the least.
 
     most: largest share allowed; least [m]: distance to exceed (0: the margin). For the documentation, asked: the
     quantity; why: the reason.

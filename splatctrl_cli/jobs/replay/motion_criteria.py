@@ -183,7 +183,7 @@ def _beside_fixture(judged: Judged) -> Reason | None:
 
 
 def _brought_together(judged: Judged) -> Reason | None:
-    """The worst pair that our controller brought below its lowered margin and nearer than the recording had it."""
+    """The worst pair that our controller brought below its margin and the recording's distance."""
     inputs, replay = judged.inputs, judged.replay
     if replay.outside is not None:
         return None

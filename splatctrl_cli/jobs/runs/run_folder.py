@@ -115,7 +115,7 @@ class RunFolder:
             raise InputError(f"{file}: expected the columns of a replay: {error}") from None
 
     def place_of(self, given: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
-        """Find a path of the command line: as typed, below a folder above the run, or below `roots`.
+        """Find a path of the command line: as typed, above the run, or below `roots`.
 
         None if missing, or of another `digest`.
         """
@@ -126,7 +126,7 @@ class RunFolder:
 
 @dataclass(frozen=True, kw_only=True)
 class FolderRequest:
-    """A file `out` made from `path`, None to name it alike; roots: folders with a replay's scene and robot."""
+    """A file `out` made from `path`; roots: folders with a replay's scene and robot."""
 
     path: Path
     out: Path | None = None

@@ -323,7 +323,7 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """Cost of a leg: length [rad], more if close to anything, most if slowed; infinite in collision.
+    """Cost of a leg: length [rad], more if close or slowed; infinite in collision.
 
     A slowed leg meets objects at other times: it must avoid all, and is refused if one moves.
     """

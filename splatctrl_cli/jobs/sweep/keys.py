@@ -1,4 +1,4 @@
-"""Keys that a sweep may vary, and the jobs of a run with values of them."""
+"""Keys that a sweep may vary, and a run's jobs with their values."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence

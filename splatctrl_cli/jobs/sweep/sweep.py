@@ -58,7 +58,7 @@ class Tried:
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFlip:
-    """Effect of one key alone: runs at both ends, and at both sides of the flip."""
+    """Effect of one key alone: runs at both ends, and around the flip."""
 
     key: Key
     start: Tried

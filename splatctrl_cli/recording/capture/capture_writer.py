@@ -310,7 +310,7 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
-    """Suffix and bytes of the depth image: the recorded PNG if it counts in the camera's unit."""
+    """Suffix and bytes of the depth image: the recorded PNG if its unit fits."""
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)

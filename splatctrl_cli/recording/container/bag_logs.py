@@ -1,4 +1,4 @@
-"""The messages of ROS bags: ROS 1, and ROS 2 sqlite3; damage is skipped and counted.
+"""The messages of ROS 1 and ROS 2 (sqlite3) bags; damage is skipped and counted.
 
 A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body, read in order in bounded
 memory. Tables of rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions. rosbags refuses a damaged
@@ -35,7 +35,7 @@ Fields = dict[str, bytes]
 
 
 class BagRecord(NamedTuple):
-    """A record; the body of a cut one is what the file still has of it."""
+    """A record; of a cut one the body that is left."""
 
     offset: int
     kind: int
@@ -303,7 +303,7 @@ class Db3Log(RawLog):
         os.truncate(self._database, size)
 
     def _merge(self, size: int) -> None:
-        """Merge the journal into the copy; one that cannot be merged is left out of a new copy."""
+        """Merge the journal into the copy, or leave it out."""
         try:
             with closing(sqlite3.connect(self._database)) as database:
                 self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]

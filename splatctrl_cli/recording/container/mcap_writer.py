@@ -195,7 +195,7 @@ class FoxgloveLog:
         self.counts: dict[str, int] = {}  # messages by topic
 
     def add_cloud(self, topic: str, stamp_ns: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Add a PointCloud of columns (N,) by name, float32 or uint8, among them x, y, z [m]."""
+        """Add a PointCloud of float32 or uint8 columns (N,), with x, y, z [m]."""
         kind = np.dtype([(name, column.dtype) for name, column in columns.items()])
         packed = np.zeros(len(columns["x"]), kind)
         for name, column in columns.items():
@@ -208,7 +208,7 @@ class FoxgloveLog:
     def add_voxels(
         self, topic: str, stamp_ns: int, name: str, values: NDArray[Any], origin: Float64, voxel: float
     ) -> None:
-        """Add (X, Y, Z), uint8 or float32; voxel (0, 0, 0) is centred at `origin` (3,) [m]."""
+        """Add (X, Y, Z), uint8 or float32, centred from `origin` (3,) [m] on."""
         columns, rows, _ = values.shape
         size = values.dtype.itemsize
         message = _new(
@@ -243,7 +243,7 @@ class FoxgloveLog:
     def add_mesh(
         self, topic: str, stamp_ns: int, frame: str, vertices: NDArray[np.floating], faces: NDArray[np.integer]
     ) -> None:
-        """Add a SceneUpdate: vertices (V, 3) [m] and faces (F, 3) that move with a frame."""
+        """Add a SceneUpdate: vertices (V, 3) [m], faces (F, 3), in a frame."""
         message = _new("SceneUpdate")
         entity = message.entities.add(id=frame, frame_id=frame, frame_locked=True)
         entity.timestamp.FromNanoseconds(stamp_ns)

@@ -58,7 +58,7 @@ class DtuScan:
 def read_dtu(
     root: Path, scan: str | None = None, masks: Path | None = None, shrink: Shrink = lambda view: view
 ) -> DtuScan:
-    """Read scan `scan` (default: the only one) of a DTU folder; `masks` contains NNN.png by view number.
+    """Read scan `scan` (default: the only one) of a DTU folder; `masks` has NNN.png.
 
     `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or a
     quarter). Depth of another size is sampled, not blended; a smaller one sets only the pixels it was made for. Drops

@@ -59,7 +59,7 @@ class FramesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthTable:
-    """``[depth]``: encoding, metres per count, and the count that is invalid in addition to 0 (-1: no other)."""
+    """``[depth]``: encoding, metres per count, and a further invalid count (-1: none)."""
 
     encoding: str = "uint16"
     scale: float = 1e-3
@@ -203,7 +203,7 @@ def read_table(
     beside: Collection[str] = (),
     fill: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> T:
-    """Read table [name] of a TOML file with no others but `beside`; `fill` adds keys left out.
+    """Read table [name] of a TOML file; `fill` adds keys left out.
 
     Raises as `read_description`.
     """

@@ -268,7 +268,7 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """Stamp by the layout, the file name, frame number and rate, or (no clock) one second a frame."""
+    """Stamp by layout, file name, frame number and rate, or one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

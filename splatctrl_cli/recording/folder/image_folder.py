@@ -236,7 +236,7 @@ class ImageFolderSource(FrameSource):
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
-        """Pixels that the lens saw and the mask keeps (None: all); none if the mask is unreadable."""
+        """Pixels that the lens saw and the mask keeps (None: all)."""
         seen = None if lens.undistortion is None else lens.undistortion.valid
         if view.valid is None:
             return seen
@@ -352,7 +352,7 @@ def layout_of(path: Path) -> Layout | None:
 
 
 def has_views(path: Path) -> bool:
-    """True for a folder that is no ROS 2 bag, or a file with a layout."""
+    """True for a folder but a ROS 2 bag, or a layout's file."""
     return layout_of(path) is not None if path.is_file() else path.is_dir() and not is_bag_folder(path)
 
 
@@ -377,7 +377,7 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
 
 
 def unknown_folder(folder: Path, what: str, remedy: str) -> InputError:
-    """The error for a folder that is not read: it names readable parts, else missing depth."""
+    """The error for an unread folder: it names readable parts, else missing depth."""
     inside = _readable_in(folder)
     if not inside and (found := _bare_images(folder)):
         return InputError(

@@ -168,7 +168,7 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
-    """The colour images' frame; a video file names none and takes that of its depth, which is aligned to it."""
+    """The colour images' frame; a video file takes its depth's."""
     return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 
@@ -198,7 +198,7 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
-    """Name cameras by the namespace's last part if unique, else all of it; `camera` if empty.
+    """Name cameras by the namespace's last part if unique, else all of it.
 
     Names are folders: other characters than letters, digits, ``_``, ``-``, ``.`` become ``_``.
     """

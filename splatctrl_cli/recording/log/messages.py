@@ -294,7 +294,7 @@ def depth_of(image: ImageMessage, scale: float | None) -> Float32:
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
-    """Count recorded depths (H, W) that are negative, NaN, a no-return code, or floats from `FARTHEST` on."""
+    """Count depths (H, W) that are negative, NaN, a no-return code, or beyond `FARTHEST`."""
     is_invalid = depth == NO_RETURN
     if depth.dtype.kind != "u":
         is_invalid |= ~(depth >= 0) | (np.abs(depth - NO_RETURN_M) < 1e-4) | (depth >= FARTHEST)

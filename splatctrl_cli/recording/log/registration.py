@@ -103,7 +103,7 @@ class TfTree:
         static: bool,
         holds: bool = False,
     ) -> None:
-        """Add T_parent_child at a time; one that `holds` is valid always while it is the only one.
+        """Add T_parent_child at a time; one that `holds` is valid always while alone.
 
         A frame keeps its first parent; edges that would close a loop are left out. Differing static transforms are
         valid from their stamps on, the first also before; of one stamp the last. All is noted. Raises ValueError if

@@ -177,7 +177,7 @@ class HeldMessages:
 def planned_images(
     log: RawLog, plan: FramePlan, damage: Damage, held: HeldMessages
 ) -> Iterator[tuple[Planned, list[RawMessage]]]:
-    """Yield frames in plan order with their colour, depth and mask messages, whatever the log's order.
+    """Yield frames in plan order with colour, depth and mask messages.
 
     `held` keeps waiting ones; missing frames go to `damage`.
     """

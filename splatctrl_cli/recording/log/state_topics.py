@@ -244,7 +244,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
 
 
 def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
-    """Map a log's joint names to the robot's by a prefix on either side; empty unless one prefix fits best."""
+    """Map a log's joint names to the robot's by the best prefix, else empty."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(found):
         for meant in wanted:

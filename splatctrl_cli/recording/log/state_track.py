@@ -71,7 +71,7 @@ class _Sums:
         self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
 
     def means(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> Float64:
-        """Means (4, T) over the states from each first up to, but not with, its last."""
+        """Means (4, T) over the states from each first to before its last."""
         return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
 
     def forget(self, before: int) -> None:

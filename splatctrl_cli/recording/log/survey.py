@@ -96,7 +96,7 @@ def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
 
 
 def dropped(stamps_ns: Stamps) -> tuple[int, int, float]:
-    """Number of gaps, images missing in them, and the period [ns]; no gaps if unsteady, all 0 with few stamps.
+    """Number of gaps, images missing in them, and the period [ns].
 
     The period is the median interval; three of four must be within a quarter of it.
     """
@@ -141,7 +141,7 @@ class Calibration:
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """A topic; stamps_ns and clock (images only) are of the headers, or log times, in file order."""
+    """A topic; stamps_ns and clock (images only) are headers', or log times."""
 
     topic: Topic
     count: int = 0

@@ -1,4 +1,4 @@
-"""Joint states in CSV, NPZ, HDF5 or Parquet, described in TOML (docs/replay.md, Logs), and libfranka's logs.
+"""Joint states in CSV, NPZ, HDF5, Parquet, by a TOML (docs/replay.md, Logs); libfranka's logs.
 
 LeRobot datasets are a preset of [states]. Versions 2 and 3 (huggingface/lerobot, lerobot_dataset.py, utils.py) list
 features in ``meta/info.json``. v2 has ``data/chunk-000/episode_000000.parquet`` per episode; v3 shares
