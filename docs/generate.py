@@ -31,6 +31,7 @@ from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS, PROOF, Limit
 from splatctrl_cli.jobs.replay.verdict import CRITERIA
 from splatctrl_cli.recording.folder.image_folder import LAYOUTS
 from splatctrl_cli.recording.folder.layout import Layout
+from splatctrl_cli.voxels import EvidenceClass
 
 DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"
@@ -42,6 +43,7 @@ TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n
 WORDS = {  # of a name in the documentation, for those that it stands for
     "FIELD": ("exact", "barrier", "certified"),
     "REGION": ("seen", "all", "masked"),
+    "CLASS": tuple(kind.name.lower() for kind in EvidenceClass),
 }
 
 
@@ -74,7 +76,8 @@ def documented() -> Iterator[Compared]:
 
 
 def _general(name: str, names: Container[str]) -> str:
-    """A name with a word for what is one of several among `names`: ``seen.FIELD.BAND.rmse``, ``METHOD_success``."""
+    """A name with a word for what is one of several among `names`: ``seen.FIELD.BAND.rmse``, ``psnr_REGION``."""
+    name = name.removesuffix("_corrected")
     if name.startswith(("everywhere.", "seen.")):
         where, *_, figure = name.split(".")
         return f"{where}.FIELD.BAND.{figure}"
