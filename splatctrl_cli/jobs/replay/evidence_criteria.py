@@ -289,7 +289,7 @@ def displaced(judged: Judged) -> tuple[str, float] | None:
 
 
 def calibration(judged: Judged) -> Iterator[Reason]:
-    """Each camera sees the robot, and all cameras together each link, within 5 mm of where its joints put it."""
+    """Each camera sees the robot, and all together each link, within 5 mm of where its joints put it."""
     figures = judged.inputs.scene.figures()
     if (camera := displaced(judged)) is not None:
         yield lacking(
@@ -327,8 +327,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
-    """The map's voxels are at most 25 mm, since an obstacle without a splat may be that large. The robot's mask
-    reaches at most the margin, since an obstacle touching the robot may go unseen that far.
+    """The map's voxels are at most 25 mm, the size of an obstacle without a splat. The robot's mask reaches at most
+    the margin: an obstacle touching the robot may go unseen that far.
     """
     figures, margin = judged.inputs.scene.figures(), judged.replay.margin
     voxel, by_link = figures.get("voxel"), figures.get("self_mask")

@@ -256,9 +256,7 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
-    """Velocities of the motion, and those that a user's controller commands, exceed the URDF's limits by at most one
-    percent.
-    """
+    """Velocities of the motion, and a user's commands, exceed the URDF's limits by at most one percent."""
     too_fast = commanded(judged)
     yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST) if too_fast is None else (too_fast,)
 
@@ -324,7 +322,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
-    """A lower bound by the spheres' lever arms keeps the margin; intervals where it is too low are halved."""
+    """A lower bound by the spheres' lever arms keeps the margin; intervals with too low a bound are halved."""
     model, columns = judged.replay.model, judged.replay.between
     _, surface, between = _of_body(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
