@@ -45,7 +45,7 @@ def test_assignments_win_over_the_file_and_the_file_over_the_defaults(tmp_path: 
         ("occupancy.max_range=0.2", "occupancy.max_range: expected above occupancy.min_range = 0.2 m, got 0.2"),
         (
             "field.length_scale=-1",
-            "field.length_scale: expected 1e-10 to 1000 m, got -1.0; see splatctrl help config",
+            "field.length_scale: expected 1e-10 to 1000 m, got -1.0; see splatctrl config --template",
         ),
         (
             "occupancy.free_below=0.9",
@@ -78,7 +78,7 @@ def test_what_cannot_be_or_contradicts_is_named(assignments: str, words: str) ->
 
 
 def test_an_unknown_key_that_is_near_none_is_told_a_few_of_the_known() -> None:
-    with pytest.raises(UsageError, match=r"\.\.\. \(splatctrl help config has all\)$") as refused:
+    with pytest.raises(UsageError, match=r"\.\.\. \(splatctrl config --template has all\)$") as refused:
         load_config(None, ["scene.zzz=9"])
     assert str(refused.value).count(",") == 8
 

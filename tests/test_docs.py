@@ -1,4 +1,4 @@
-"""The documentation says what the code does: generated pages, names of functions, commands and links are checked."""
+"""The documentation says what the code does: tables, help, names of functions, commands and links are checked."""
 
 import argparse
 import ast
@@ -53,46 +53,40 @@ RUN_BY_GOLDEN = ("README.md", "start.md")  # all their commands: tests/tools/tes
 SETTING = re.compile(r"((?:scene|occupancy|human|field|control|planner|verdict)\.\w+)(?: = (.+))?")
 
 
-def generated() -> dict[str, str]:
+def test_every_table_of_a_registry_is_what_make_docs_writes_now() -> None:
     spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
     assert spec is not None
     assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    pages: dict[str, str] = module.pages()
-    return pages
+    generate = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(generate)
+    pages: dict[str, str] = generate.pages()
+    for name, text in pages.items():
+        assert (ROOT / "docs" / name).read_text(encoding="utf-8") == text, f"{name}: run: make docs"
+    filled = {name for text in pages.values() for _, name, _ in generate.TABLE.findall(text)}
+    assert filled == {*generate.TABLES, *generate.LISTS}
 
 
-@pytest.mark.parametrize(
-    "name", ["cli.md", "config.md", "artefacts.md", "check.md", "compare.md", "input.md", "verdict.md"]
-)
-def test_generated_pages_are_what_make_docs_writes_now(name: str) -> None:
-    assert (ROOT / "docs" / name).read_text(encoding="utf-8") == generated()[name], "run: make docs"
-
-
-def test_generated_pages_do_not_depend_on_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "40")
-    narrow = generated()
-    monkeypatch.setenv("COLUMNS", "200")
-    assert generated() == narrow
-
-
-def test_every_option_that_help_shows_is_in_the_page() -> None:
-    page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
-    page, _, shared = page.partition("\n## Options of several commands\n")
-    of_kind = dict(re.findall(r"^### ([^\n]+)\n(.*?)(?=^### |\Z)", shared, flags=re.DOTALL | re.MULTILINE))
-    sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", page, flags=re.DOTALL | re.MULTILINE))
-    assert list(sections) == list(COMMANDS)
-    subparsers = next(a for a in build_parser()._actions if a.dest == "command")
-    assert isinstance(subparsers.choices, dict)
-    for command, parser in subparsers.choices.items():
-        linked = [text for kind, text in of_kind.items() if f"[{kind.lower()}]" in sections[command]]
-        explained = "".join([sections[command], of_kind["Of every command"], *linked])
-        for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", parser.format_full_help())) - {
-            "--help",
-            "--help-all",
-        }:
-            assert option in explained, f"{command} {option}"
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_every_option_of_a_command_at_any_width(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parsers = {parser.prog: parser for parser in leaves(build_parser()) if parser.prog.split()[1] == command}
+    for name, parser in parsers.items():
+        shown = set()
+        for columns in ("40", "200"):
+            monkeypatch.setenv("COLUMNS", columns)
+            with pytest.raises(SystemExit):
+                main([*name.split()[1:], "--help-all"])
+            shown.add("".join(capsys.readouterr().out.split()))
+        (text,) = shown  # only the line breaks depend on the terminal
+        for action in parser._actions:
+            assert all(option in text for option in action.option_strings)
+            meaning = parser._get_formatter()._expand_help(action)
+            assert "".join(meaning.split()) in text, f"{name}: {meaning}"
+    if not (ROOT / "docs" / f"{command}.md").exists():
+        (parser,) = parsers.values()
+        assert main(["help", command]) == 0
+        assert capsys.readouterr().out == parser.format_full_help()
 
 
 def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:

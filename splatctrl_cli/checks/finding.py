@@ -43,98 +43,88 @@ _TABLE = """
 # code | severities | commands that an error blocks | meaning | what to do, where a finding does not say
 damaged | warning |  | a part of the file cannot be read; the rest is judged | copy the file again; if it stays,
     look at what wrote these messages
-remark | note |  | what is no damage: messages of a form that is not read, or how something was read
-loss | note |  | topics and frames that the source leaves out
-missing | error | all | what `ingest` needs is not there, or cannot be joined (depth, CameraInfo, tf)
+remark | note |  | how something was read, or messages that are not
+loss | note |  | topics and frames that are left out
+missing | error | all | depth, CameraInfo or tf that `ingest` needs
 refused | error | all | the capture or folder cannot be read as described
-gap | warning |  | an image or state topic pauses for over 0.1 s and three median intervals; topics and transforms
-    that pause together are one finding | record fewer topics or to a faster disk; what moved meanwhile is unknown
+gap | warning |  | a topic pauses for over 0.1 s and three median intervals | record fewer topics or to a faster disk;
+    what moved meanwhile is unknown
 part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log |
     start and stop all drivers with the recorder, or cut the log there
-files-apart | warning |  | over 60 s between two files of one recording | are they one recording? if not, give each
-    alone
-stamp-repeats | warning |  | header stamps that repeat the one before | look for a driver that publishes twice, or a
-    topic recorded twice
+files-apart | warning |  | over 60 s between two files | are they one recording? if not, give each alone
+stamp-repeats | warning |  | header stamps that repeat | look for a driver that publishes twice, or a topic recorded
+    twice
 stamp-back | warning |  | header stamps that go back | two publishers on one topic, a clock that was set, or a loop
     of a played log: record again
-stamp-zero | warning, error | all | header stamps of 0 (use `--stamps log`); an error where all of an image topic
-    are | give --stamps log to take the times of logging, and let the driver stamp the next recording
-clock | note |  | the stamps of all topics are shifted alike against the log's clock (a played log)
-clock-offset | warning |  | stamps over 20 ms after or 1 s before their log time, or whose shift against it differs by
-    over 0.2 s from most topics, or by over 60 ms from the other cameras (three or more)
-clock-drift | warning |  | the time from stamp to log changes by over 20 ms (and six times its spread) over the log
-    | synchronise the clocks (chrony, PTP) and record again
-robot-clock | note, warning |  | the offset of cameras and robot: with `--urdf` from where depth shows the arm (a
-    warning beyond 40 ms, for one camera if only it is off), else from when both show motion (beyond 30 ms plus twice
-    its uncertainty)
+stamp-zero | warning, error | all | header stamps of 0; an error where all are | give --stamps log to take the times
+    of logging, and let the driver stamp the next recording
+clock | note |  | all stamps are shifted alike against the log's clock
+clock-offset | warning |  | stamps over 20 ms after or 1 s before their log time, or 0.2 s off most topics, or 60 ms
+    off other cameras
+clock-drift | warning |  | stamps drift by over 20 ms against the log's clock | synchronise the clocks (chrony, PTP)
+    and record again
+robot-clock | note, warning |  | the offset of cameras and robot: a warning beyond 40 ms with `--urdf`, else beyond 30
+    ms and twice its uncertainty
 sampled | note |  | not every image was decoded
 undecodable | note, warning, error | all | images that do not decode; an error where none does | they are left out;
     record a form that is read, or copy the file again where it is named as damaged too
-encoding | note, warning |  | an encoding that is not read, or that changes
-image-size | note, warning |  | images of one topic of several sizes | record one size; frames of another than the
+encoding | note, warning |  | not read, or changing
+image-size | note, warning |  | images of several sizes on one topic | record one size; frames of another than the
     camera's are left out
-pairing | warning, error | all | less than 95 % of the images of colour or depth find a partner; an error where none
-    is found
-rates-differ | note |  | one of colour and depth has 1.5 times as many images as the other | record both at one
-    rate; more frames show more, and what moves is seen sooner
+pairing | warning, error | all | under 95 % of the images find a partner; an error where none does
+rates-differ | note |  | colour and depth differ in number by a factor of 1.5 | record both at one rate; more frames
+    show more, and what moves is seen sooner
 pair-offset | note |  | depth over 10 ms from its colour image | let the driver synchronise colour and depth: what
     moves is in two places
-depth-scale | note, error | all | median depth outside 0.05 to 20 m (metres stored as integers, millimetres as floats,
-    another unit); a note outside 0.15 to 8 m
-depth-share | note, warning |  | less than half of the pixels have depth; a warning below a tenth | the rest stays
-    unseen: dark or shiny things, too near, or warped depth with holes
-depth-empty | warning, error | later | depth images without any depth; an error where all are | is the projector on,
-    and the scene within its range?
-depth-invalid | note |  | pixels that are NaN, infinite, negative or a code for no return: 65535, the largest count of
-    16 bits, 65.535 m, or 100 km and more
-depth-constant | warning |  | the largest depth is one exact value in many pixels, and far behind all others: a code
-    for no return that nothing declares | let the driver write 0 or NaN for no return; as it stands, it is a surface
-depth-repeats | warning |  | depth images that equal the one before to the bit | look for a driver that publishes its
-    last image again; repeated depth is no new evidence, and only depth that was made without noise may repeat
-principal-point | warning, error | later | cx or cy over 15 % of the size off the middle; an error, naming the size,
-    where both fit another image size
+depth-scale | note, error | all | median depth outside 0.05 to 20 m; a note outside 0.15 to 8 m
+depth-share | note, warning |  | under half of the pixels have depth; a warning below a tenth | the rest stays unseen:
+    dark or shiny things, too near, or warped depth with holes
+depth-empty | warning, error | later | images without depth; an error where all are | is the projector on, and the
+    scene within its range?
+depth-invalid | note |  | pixels that are NaN, infinite, negative or a code for no return
+depth-constant | warning |  | the largest depth is one value in many pixels, far behind the others: an undeclared code
+    for no return | let the driver write 0 or NaN for no return; as it stands, it is a surface
+depth-repeats | warning |  | depth images equal to the one before | look for a driver that publishes its last image
+    again; repeated depth is no new evidence, and only depth that was made without noise may repeat
+principal-point | warning, error | later | over 15 % of the size off the middle; an error where it fits another image
+    size
 focal-ratio | warning |  | fx and fy differ by over 5 %
-field-of-view | warning |  | horizontal field of view outside 20 to 140 degrees
-uncalibrated | note, warning |  | a CameraInfo whose K is zero | calibrate it, or record the driver's factory values
-camera-info-size | error | all | a CameraInfo of another size than its images | record the CameraInfo of this
-    stream, or name it with --camera
-camera-info-changes | warning |  | a CameraInfo that changes within the log | split the log there, or record with
-    one setting
-camera-info-two | warning |  | a second CameraInfo for the same frame and size, with another K
-distortion | note, warning, error | all | distorted images (note); a wrong number of coefficients (warning); a number
-    that cannot be read, or a model that is not known (error)
+field-of-view | warning |  | outside 20 to 140 degrees, horizontally
+uncalibrated | note, warning |  | K is zero | calibrate it, or record the driver's factory values
+camera-info-size | error | all | another size than the images | record the CameraInfo of this stream, or name it with
+    --camera
+camera-info-changes | warning |  | a CameraInfo that changes | split the log there, or record with one setting
+camera-info-two | warning |  | a second K for the same frame and size
+distortion | note, warning, error | all | distorted images (note); a wrong number of coefficients (warning); an
+    unknown model (error)
 tf-gap | warning |  | a moving transform pauses
 tf-ends | warning |  | a moving transform ends over 1 s before the last image | record /tf to the end; if it stands
     still, publish it on /tf_static or give --camera-pose
-tf-roots | note, error | all | separate trees; an error where the cameras are in several
+tf-roots | note, error | all | separate trees; an error where cameras are in several
 tf-parents | warning |  | a frame with two parents
-pose-missing | warning, error | all | images without a known pose; an error where all are | tf starts late, ends
-    early, or has a gap of more than 1 s; if it stands still give --camera-pose
-pose-jump | error | later | a camera moves over 0.2 m, and ten times its median step, from one frame to the next |
-    two publishers of one frame, or a localisation that was corrected; reconstruct refuses it
-alignment | error | later | edges of depth are over 1.5 % of the width from those of colour, or match another camera's
-    colour
-views-scale | warning, error | later | the factor on depths (of all cameras or one) that makes views fit together; a
-    warning where they hardly overlap at an unusual depth
-views-pose | warning |  | how far a camera must be moved and turned for its views to fit the others' (from 12 mm or
-    0.8 deg, where depths then differ by at most 4 %)
-agreement | note, error | later | how far apart views place a surface that both see [mm]; an error beyond 30 mm (3 %
-    of depth above 1 m), which `reconstruct` refuses
-views-agreement | error | later | the same of views of one camera: is a pose that of another frame?
-exposure | note |  | one surface is over 5 % brighter or more coloured in one image of a camera than in another
-exposure-rows | note |  | rows of one image are over 20 % brighter than others, unlike in the camera's other images
-joints | note, error | replay | which topics and velocities are used; an error where the robot's joints are missing
+pose-missing | warning, error | all | images without a pose; an error where all are | tf starts late, ends early, or
+    has a gap of more than 1 s; if it stands still give --camera-pose
+pose-jump | error | later | a camera moves over 0.2 m and ten times its median step in one frame | two publishers of
+    one frame, or a localisation that was corrected; reconstruct refuses it
+alignment | error | later | edges of depth and colour are over 1.5 % of the width apart, or match across cameras
+views-scale | warning, error | later | the factor on depths that makes views fit; a warning where they hardly overlap
+views-pose | warning |  | how far a camera must move for its views to fit (from 12 mm or 0.8 deg)
+agreement | note, error | later | how far apart views place one surface [mm]; an error beyond 30 mm (3 % of depth
+    above 1 m)
+views-agreement | error | later | the same for views of one camera
+exposure | note |  | one surface differs by over 5 % in brightness or colour between images
+exposure-rows | note |  | rows of one image are over 20 % brighter than others
+joints | note, error | replay | the topics and velocities in use; an error where the robot's joints are missing
 joints-nan | warning |  | positions that are not finite | they are left out; look at the driver
 joints-degrees | error | replay | positions that no joint can reach in radians
-joints-velocity | note, warning |  | velocities that are missing (note) or zero throughout
+joints-velocity | note, warning |  | velocities that are missing (note) or zero
 joints-still | note |  | no joint moves
 joints-limits | warning |  | states beyond the URDF's limits | is it the right URDF, are the joints in its units, or
     were its limits lowered?
-end-effector | note, error | replay | logged end-effector poses against the robot's kinematics
-arm | note, warning |  | measured minus rendered depth of the robot's surface, per camera [mm]; a warning beyond 30
-    mm, beyond 25 mm in the mean, where a quarter of the pixels show the background, or where depth is 4 % off
-    throughout
-robot-model | warning |  | `--urdf` is another mechanism than the log's own robot_description
+end-effector | note, error | replay | logged poses against the robot's kinematics
+arm | note, warning |  | measured minus rendered depth of the robot [mm]; a warning beyond 30 mm (mean 25), at 4 %
+    throughout, or where a quarter shows the background
+robot-model | warning |  | `--urdf` is another mechanism than the log's
 quick | note |  | only the first images were read
 """
 _BLOCKED = {"": (), "all": ALL, "later": LATER, "replay": ("replay",)}

@@ -323,10 +323,10 @@ COMMANDS = {
         options=(option("SHELL", "whose script", SHELLS),),
     ),
     "help": Command(
-        summary="print a page of the documentation, or their list",
-        examples=("help", "help replay"),
+        summary="print a page of the documentation, their list, or all options of a command",
+        examples=("help replay", "help simulate"),
         run="config:run_help",
-        options=(option("TOPIC", "the page's name, such as ci", nargs="?"),),
+        options=(option("TOPIC", "a page, such as ci, or a command (default: the list of pages)", nargs="?"),),
     ),
     "demo": Command(
         summary="run the main job on a sample recording, with pictures",

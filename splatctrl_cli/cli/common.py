@@ -192,7 +192,7 @@ JUNIT = (  # which every command that judges has
 THREADS = of_run(
     option("--threads THREADS", "threads, at most 16 or one per core (default: one per core)", whole(0, 1024))
 )
-CONFIG_FILE = option("--config FILE.toml", "configuration, see splatctrl help config", Path)
+CONFIG_FILE = option("--config FILE.toml", "settings, see splatctrl config --template", Path)
 CONFIG = (CONFIG_FILE, *settings(), of_run(seed("everything random")), THREADS)
 DEVICE = of_run(
     option(

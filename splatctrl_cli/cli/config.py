@@ -33,14 +33,17 @@ def run_completion(args: argparse.Namespace) -> int:
 
 
 def run_help(args: argparse.Namespace) -> int:
+    """Print a page, or every option of a command without one."""
     roots = Path(__file__).parents[1:3]  # of a wheel, of the repository
     folder = next(place / "docs" for place in roots if (place / "docs" / "README.md").is_file())
-    names = sorted(page.stem for page in folder.glob("*.md"))
-    topic = args.topic or "README"
-    if topic not in names:
+    pages = {page.stem: page for page in folder.glob("*.md")}
+    commands, topic = build_parser().actions, args.topic or "README"
+    assert commands is not None
+    if topic not in {*pages, *commands.choices}:
+        names = sorted({*pages, *commands.choices})
         remedy = did_you_mean(topic, names, f"give one of: {', '.join(names)}")
         raise UsageError(f"help: no page {shown(topic)}", remedy=remedy)
-    text = (folder / f"{topic}.md").read_text(encoding="utf-8")
+    text = pages[topic].read_text(encoding="utf-8") if topic in pages else commands.choices[topic].format_full_help()
     return Console(args).result({"topic": topic, "text": text}, text.splitlines())
 
 

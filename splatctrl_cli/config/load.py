@@ -148,7 +148,7 @@ def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
 
 def _check_known(name: str, known: Collection[str], where: str, prefix: str) -> None:
     if name not in known:
-        first = ", ".join(list(known)[:8]) + (", ... (splatctrl help config has all)" if len(known) > 8 else "")
+        first = ", ".join(list(known)[:8]) + (", ... (splatctrl config --template has all)" if len(known) > 8 else "")
         choices = did_you_mean(name, known, f"known here: {first}", prefix=prefix, cutoff=0.4)
         raise UsageError(f"{where}: unknown key {prefix}{name}", remedy=choices)
 

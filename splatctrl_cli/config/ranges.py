@@ -101,7 +101,7 @@ def _declared(hint: Any) -> Declared:
 def check(holds: bool, name: str, expected: str, value: object) -> None:
     """Raise UsageError with key, expectation and value, unless `holds`."""
     if not holds:
-        raise UsageError(f"{name}: expected {expected}, got {shown(value)}", remedy="see splatctrl help config")
+        raise UsageError(f"{name}: expected {expected}, got {shown(value)}", remedy="see splatctrl config --template")
 
 
 def shown(value: object) -> str:

@@ -165,7 +165,7 @@ class GridFormat:
     `describe`: from a path and its first bytes; None for another kind. `needs`: the grid must have one
     of these channels. `holds_unknown`: cells can be without a distance. `bytes_per_cell`: on disk, None for all
     channels'. `check` raises UsageError if its library is missing. `docs`: row in docs/artefacts.md, cells between
-    bars: name, file, who opens it, checked, cost.
+    bars: name, file, who opens it.
     """
 
     name: str

@@ -115,8 +115,7 @@ def describe_mesh(path: Path, _head: bytes) -> Summary | None:
 
 
 _DOCS = """
-`ply`, `obj`, `stl` | the surface `sdf = 0`, normals outwards | mesh viewers | trimesh 5.2.0, every triangle | 2.6
-    s, 215 MiB (632,000 triangles)
+`ply`, `obj`, `stl` | the surface `sdf = 0`, normals outwards | mesh viewers, trimesh 5.2.0
 """
 ENTRIES = tuple(
     GridFormat(

@@ -105,9 +105,8 @@ ENTRIES = (
         describe=describe_nrrd,
         is_per_channel=True,
         docs="""
-`nrrd` | `field.CHANNEL.nrrd`: `data[x, y, z]`, a gradient `data[component, x, y, z]`; header entries are
-    `splatctrl.KEY`, JSON texts | 3D Slicer, ITK, `nrrd.read` | pynrrd 1.1.3, every value; Slicer, ITK not tried |
-    4.7 s, 48 MiB
+`nrrd` | `field.CHANNEL.nrrd`: `data[x, y, z]`, a gradient `data[component, x, y, z]` | pynrrd 1.1.3; 3D Slicer, ITK
+    not tried
 """,
     ),
 )

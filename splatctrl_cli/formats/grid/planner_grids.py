@@ -164,8 +164,8 @@ ENTRIES = (
         holds_unknown=False,
         bytes_per_cell=4,
         docs="""
-`curobo` | `field.curobo.npz`: `features`, `dims`, `voxel_size`, `pose`, `shape` | NVIDIA cuRobo, by the lines
-    below | its index arithmetic; cuRobo not tried | 1.1 s, 48 MiB (one channel)
+`curobo` | `field.curobo.npz`: `features`, `dims`, `voxel_size`, `pose`, `shape` | NVIDIA cuRobo, not tried, by the
+    lines below
 """,
     ),
     GridFormat(
@@ -177,8 +177,8 @@ ENTRIES = (
         needs=frozenset({"bound", "hard"}),
         bytes_per_cell=0,
         docs="""
-`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2 | a
-    reader that follows its source; MoveIt not tried | 0.4 s, 16 MiB (one channel)
+`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2, not
+    tried
 """,
     ),
 )

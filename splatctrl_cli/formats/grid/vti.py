@@ -204,8 +204,7 @@ ENTRIES = (
         describe=describe_vti,
         read=read_vti,
         docs="""
-`vti` | `field.vti`: ImageData, points at the cell centres; the header is a string in the field data | ParaView,
-    VTK | VTK 9.7.2, every value; ParaView not tried | 3.2 s, 48 MiB
+`vti` | `field.vti`: ImageData, points at the cell centres | VTK 9.7.2; ParaView not tried
 """,
     ),
 )

@@ -218,8 +218,8 @@ _PLY = SplatFormat(
     docs="""
 `.ply`, short | 3D-GS PLY with `label` and `density`, for isotropic splats | float32 | view-dependent colour
 
-`.ply`, full | 3D-GS PLY, the reference's 62 properties | float32 | density; labels (kept as a 63rd property
-    unless `--layout full`)
+`.ply`, full | 3D-GS PLY, the reference's 62 properties | float32 | density; labels are a 63rd property unless
+    `--layout full`
 """,
 )
 REFERENCE_PLY = replace(

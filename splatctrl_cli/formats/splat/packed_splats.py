@@ -316,9 +316,9 @@ ENTRIES = (
         held=held_by_spz,
         bound=spz_bound,
         docs="""
-`.spz` | version 3 (gzip); 2 to 4 are read | centre 0.12 mm (within 2 km), sigma 3.2 %, colour 0.0037, opacity 1/510,
-    rotation 0.28 degrees, harmonics 1/256 | labels, density, comments; sigmas below 0.045 mm, colours outside -0.44
-    to 1.44, harmonics outside -1 to 1
+`.spz` | version 3 (gzip); 2 to 4 are read | centre 0.12 mm (within 2 km), sigma 3.2 %, colour 0.0037, opacity
+    1/510, rotation 0.28 degrees, harmonics 1/256 | labels, density, comments, sigmas below 0.045 mm, colours
+    outside -0.44 to 1.44, harmonics outside -1 to 1
 """,
     ),
 )

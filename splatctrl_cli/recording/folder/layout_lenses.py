@@ -285,8 +285,8 @@ ENTRIES = (
         matches=lambda folder: _frames(folder) is not None,
         read=read_arkit,
         docs="""
-ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world to camera, interpolated | 1 mm, of
-    another size: nearest pixels | a `.pincam` per image
+ARKitScenes | `lowres_wide.traj`, `lowres_depth/` | world to camera, interpolated | 1 mm, of another size: nearest
+    pixels | a `.pincam` per image
 """,
     ),
     Layout(
@@ -295,8 +295,8 @@ ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world t
         matches=lambda folder: bool(_sensors(folder)),
         read=read_bop,
         docs="""
-BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1.json`, `depth_cam1/` |
-    `cam_R_w2c`, `cam_t_w2c`; else `--camera-pose` | `depth_scale` of each image | `cam_K` of each image
+BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1.json`, `depth_cam1/` | `cam_R_w2c`,
+    `cam_t_w2c`, else `--camera-pose` | `depth_scale` | `cam_K`
 """,
     ),
     Layout(
@@ -305,10 +305,9 @@ BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1
         matches=marked(_CAMERAS),
         read=read_mvsnet,
         docs="""
-MVSNet scene: DTU's test set, BlendedMVS, Tanks and Temples, colmap2mvsnet | `cams/*_cam.txt`, with `images/`,
-    `blended_images/` or images beside it | world to camera, of the camera file | `.pfm` in a folder with `depth` in
-    its name; metres, or millimetres where the files' least depth is over 20, or `--depth-scale` for poses and depth |
-    of the camera file, for the image or a quarter of it
+MVSNet scene (DTU, BlendedMVS, Tanks and Temples, colmap2mvsnet) | `cams/*_cam.txt`, images | world to camera |
+    `.pfm` in a folder with `depth` in its name; metres, millimetres where the least depth is over 20, or
+    `--depth-scale` | of the image or a quarter of it
 """,
     ),
 )

@@ -171,8 +171,8 @@ ENTRIES = (
         read=read,
         docs="""
 nerfstudio, instant-ngp, Blender | `transforms.json` or `transforms_train.json`, `depth_file_path` or `depth_path` |
-    `transform_matrix`, without `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` too; of another size: nearest
-    pixels | of the file or each frame; `mask_path` leaves pixels out
+    `transform_matrix`, without `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` | of the file or each
+    frame; `mask_path` leaves pixels out
 """,
     ),
 )

@@ -253,9 +253,8 @@ ENTRIES = (
         read=read,
         suffix=SUFFIX,
         docs="""
-organised point clouds (extra `pcd`) | `X.pcd` of HEIGHT over 1, or a folder of them; ascii, binary, compressed |
-    `VIEWPOINT` | z of the points in the camera; metres, or `--depth-scale` | fitted to the grid, to 0.5 px; so are
-    `--intrinsics` checked
+organised point clouds (extra `pcd`) | `X.pcd` of HEIGHT over 1, or a folder of them | `VIEWPOINT` | z in the
+    camera; metres, or `--depth-scale` | fitted to the grid, to 0.5 px
 """,
     ),
 )

@@ -214,8 +214,8 @@ ENTRIES = (
         read=read_sens,
         suffix=SUFFIX,
         docs="""
-ScanNet sensor file | `X.sens` of version 4, or a folder that holds one | camera to world of each frame, -inf = none |
-    `depthShift` counts per metre (zlib or plain words), registered to colour | of the file, extrinsics
+ScanNet sensor file | `X.sens` of version 4 | camera to world, -inf = none | `depthShift` counts per metre,
+    registered to colour | of the file
 """,
     ),
 )

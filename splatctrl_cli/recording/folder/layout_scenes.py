@@ -188,15 +188,13 @@ ENTRIES = (
         matches=marked(*(f"{sequence}frame-*.pose.txt" for sequence in _SEQUENCES)),
         read=read_frames,
         docs="""
-7-Scenes | `frame-*.pose.txt`, also in `seq-*/` | a file a frame, of the depth camera; moved to colour | 1 mm,
-    65535 = none, registered to colour | depth 585, 585, 320, 240; colour 525, 525, 320, 240 with another Kinect's
-    extrinsics; `--intrinsics` takes both as one
+7-Scenes | `frame-*.pose.txt`, also in `seq-*/` | of the depth camera | 1 mm, 65535 = none, registered to colour |
+    depth 585, 585, 320, 240; colour 525, 525, 320, 240; `--intrinsics` takes both as one
 
-3DMatch | the same, `camera-intrinsics.txt` | a file a frame | as above, not registered | that file; 585, 585,
-    320, 240 in it counts as 7-Scenes
+3DMatch | the same, `camera-intrinsics.txt` | a file a frame | as above, not registered | of that file; 585, 585,
+    320, 240 counts as 7-Scenes
 
-12-Scenes, BundleFusion, 3RScan | the same, also in `data/`, `sequence/`, and `info.txt` or `_info.txt` | by a
-    [description](#12-scenes) | of the description | of the description
+12-Scenes, BundleFusion, 3RScan | the same, `info.txt` or `_info.txt` | by a [description](#datasets-by-description)
 """,
     ),
     Layout(
@@ -206,8 +204,8 @@ ENTRIES = (
         read=read_redwood,
         docs="""
 Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.log` (`*_trajectory.log`,
-    `*-traj.txt`, ...) | by order; by number where there are more poses than images | 1 mm |
-    `camera_intrinsic.json` in the folder or above it, else `--intrinsics`
+    `*-traj.txt`) | by order; by number where there are more poses than images | 1 mm | `camera_intrinsic.json`,
+    else `--intrinsics`
 """,
     ),
     Layout(
@@ -217,7 +215,7 @@ Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.
         read=by_description("ScanNet export", "scannet.toml"),
         docs="""
 ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | by a
-    [description](#scannet-export) | of the description | of the description
+    [description](#datasets-by-description)
 """,
     ),
     Layout(
@@ -226,8 +224,7 @@ ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color
         matches=marked("rgb/ depth/ *.gt.freiburg"),
         read=by_description("ICL-NUIM", "icl_nuim.toml"),
         docs="""
-ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description](#icl-nuim) | of the description |
-    of the description
+ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description](#datasets-by-description)
 """,
     ),
     Layout(
@@ -237,7 +234,7 @@ ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description
         read=by_description("Replica", "replica_nice_slam.toml", "replica_semantic_nerf.toml"),
         docs="""
 Replica of NICE-SLAM or Semantic-NeRF | `traj.txt`, `results/frame*`; `traj_w_c.txt`, `rgb/rgb_*` | by a
-    [description](#replica) | of the description | of the description
+    [description](#datasets-by-description)
 """,
     ),
 )

@@ -188,12 +188,11 @@ ENTRIES = (
         matches=marked("rgb.txt depth.txt"),
         read=read_tum_folder,
         docs="""
-TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
-    within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
-    `--intrinsics`
+TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated | 1/5000 m, paired within 20 ms | by freiburg1,
+    2 or 3 in the folder's name or the lists, else `--intrinsics`
 
-Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to the camera | as TUM; the published
-    transform's scale of 1.059 is left out | of its page
+Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to the camera | without the published
+    scale of 1.059 | of its page
 
 ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
 """,
@@ -205,7 +204,7 @@ ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
         read=read_sun3d,
         docs="""
 SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,
-    bits rotated by three, paired within 20 ms | `intrinsics.txt`, the first pixel's centre at 1
+    bits rotated by three, paired within 20 ms | the first pixel's centre at 1
 """,
     ),
 )
