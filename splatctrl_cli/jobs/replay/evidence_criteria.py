@@ -146,7 +146,7 @@ PROOF = Limit(
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """Every class of evidence within the margin of the arm keeps its limit (the table below); at most `--max-unknown`
+    """Every class of evidence within the margin of the arm keeps its limit (listed below); at most `--max-unknown`
     of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
     for limit in LIMITS:
