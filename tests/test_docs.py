@@ -173,8 +173,8 @@ def test_the_preset_of_the_paper_is_what_the_page_of_departures_says() -> None:
     departures = re.sub(
         r"### The baseline.*?(?=^### )", "", text.split("## Departures")[1], flags=re.DOTALL | re.MULTILINE
     )
-    columns = [cells[2] for line in departures.splitlines() if len(cells := line.split(" | ")) > 3]
-    codes = [code for column in columns for code in CODE.findall(column)]
+    settings = re.findall(r"As\s+printed:\s(.+?)\s`(?:tests|experiments)/", departures, flags=re.DOTALL)
+    codes = [code for text in settings for code in CODE.findall(text)]
     said = {match[1]: match[2] for code in codes if (match := SETTING.fullmatch(code)) and match[2]}
     preset = load_config(None, ["preset=paper"])
     assert load_config(None, [f"{key}={value}" for key, value in said.items()]) == preset
