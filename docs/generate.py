@@ -76,7 +76,7 @@ def _general(name: str, names: Container[str]) -> str:
 Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Limit | Compared
 Registry = tuple[tuple[str, ...], Iterable[Entry]]
 LISTS: dict[str, Registry] = {  # with the words before what follows an entry's first sentence
-    "criteria": (("else",), CRITERIA),
+    "criteria": (("**else**",), CRITERIA),
     "limits": (("since",), (*LIMITS, PROOF)),
     "metrics": (("by",), [*documented()]),
     "splat_formats": (("rounding", "without"), SPLAT_FORMATS.values()),
