@@ -64,7 +64,7 @@ Entry = TypeVar("Entry", bound=Ordered)
 
 
 def entries_of(room: str, kind: type[Entry]) -> tuple[Entry, ...]:
-    """Return the entries of type `kind` in the ``ENTRIES`` of the modules of `room`, by order, then module."""
+    """Return the entries of type `kind` in the ``ENTRIES`` of a room's modules, in order."""
     modules = [import_module(f"{room}.{found.name}") for found in iter_modules(import_module(room).__path__)]
     found = [entry for module in modules for entry in getattr(module, "ENTRIES", ()) if isinstance(entry, kind)]
     return tuple(sorted(found, key=lambda entry: entry.order))

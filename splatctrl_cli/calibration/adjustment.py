@@ -19,7 +19,7 @@ ROBOT = "the robot"
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Residuals (M,) [m] and their sigma (M,) [m], of two views, or of a frame and the robot.
+    """Residuals (M,) and sigma (M,) [m] of two views, or of a frame and the robot.
 
     jacobian (M, 17): by the two cameras' unknowns and the clock, in `columns` (17,). clusters (M,): equal numbers of
     the same `alike` have correlated errors. num_laid: points that should lie on the other's surface, even beyond the
@@ -39,7 +39,7 @@ class Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class Widths:
-    """Limits of the residuals that count: reach [m], and cut [sigma] (by default the reach alone decides)."""
+    """Limits of residuals that count: reach [m], and cut [sigma] (default: the reach alone)."""
 
     reach: float
     cut: float = np.inf
@@ -71,7 +71,7 @@ class Adjustment:
     def solved(
         self, estimate: Estimate, schedule: Sequence[Widths], rounds: int = fixed.CALIBRATION_ROUNDS
     ) -> Estimate:
-        """The estimate after a round per width, and at most `rounds` more of the last one until convergence."""
+        """The estimate after a round per width, and `rounds` more at most."""
         start, step = estimate, np.zeros(self.unknowns.size)
         for number, widths in enumerate((*schedule, *(schedule[-1],) * rounds)):
             normal = self.normal(estimate, widths)
@@ -286,7 +286,7 @@ def _cells(points_world: Float64, depth: float) -> Index:
 
 
 def _carried(twist: Float64, T: Float64) -> Float64:
-    """The motion (6,) of a frame fixed at T (4, 4) to one with a small motion `twist` (6,), each in its own axes."""
+    """The motion (6,) of a frame fixed at T (4, 4) to one moving by `twist`, own axes."""
     if not twist.any():
         return twist
     turn, move = twist[:3], twist[3:]

@@ -48,7 +48,7 @@ class Board:
 
 @dataclass(frozen=True, kw_only=True)
 class Sighting:
-    """A board in a frame: T_camera_board (4, 4), and the ratio of measured to expected depth (None without depth)."""
+    """A board in a frame: T_camera_board (4, 4), and measured over expected depth (or None)."""
 
     camera: str
     stamp_ns: int
@@ -78,7 +78,7 @@ def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
 
 
 def other_size(frame: RgbdFrame) -> tuple[int, int] | None:
-    """Inner corners, larger number first, of any chessboard in view; None without one, or for a tiny one."""
+    """Inner corners, larger number first, of any other chessboard in view, or None."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     is_found, _, meta = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), cv2.CALIB_CB_LARGER)
     return (max(meta.shape), min(meta.shape)) if is_found and meta.size >= LEAST else None
@@ -183,7 +183,7 @@ class Rig:
 
 @dataclass(frozen=True, kw_only=True)
 class HandEye:
-    """X (4, 4) that keeps ``A X B`` constant; stays: that constant; distance [m]: the median deviation from it."""
+    """X (4, 4) that keeps ``A X B`` constant (stays); distance [m]: median deviation."""
 
     X: Float64
     stays: Float64

@@ -16,7 +16,7 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class Certainty:
-    """Covariance (P, P) of the unknowns; reach (P, P) maps them to displacements [m] of what the cameras see."""
+    """Covariance (P, P) of the unknowns; reach (P, P): to displacements [m] in view."""
 
     unknowns: Unknowns
     covariance: Float64
@@ -28,7 +28,7 @@ class Certainty:
         return np.zeros((POSE, POSE)) if columns[0] < 0 else self.covariance[np.ix_(columns, columns)]
 
     def displacement(self, camera: str) -> Float64:
-        """Covariance (6, 6) [m^2] of displacements: of the view's rim by rotation, then of its middle."""
+        """Covariance (6, 6) [m^2] of displacements: of the rim by rotation, of the middle."""
         columns = self.unknowns.columns(camera)[:POSE]
         if columns[0] < 0:
             return np.zeros((POSE, POSE))
@@ -123,7 +123,7 @@ Plane = tuple[str, Float64]  # name, and unit normal (3,), world
 
 
 def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
-    """The largest plane in a view; None if no plane has a quarter of the normals."""
+    """The largest plane in a view; None below a quarter of the normals."""
     normals = view.normals.reshape(-1, 3)
     normals = normals[np.any(normals != 0, axis=1)] @ T_world_camera[:3, :3].T
     if len(normals) < 100:

@@ -144,7 +144,7 @@ class Arm:
         return self._posture(stamp_ns) is not None
 
     def link_pose(self, link: str, stamp_ns: int) -> Float64 | None:
-        """T_world_link (4, 4) at a time [ns] of the joint states; None if no state is near."""
+        """T_world_link (4, 4) at a time [ns]; None if no joint state is near."""
         q = self._posture(stamp_ns)
         return None if q is None else self.model.frame_pose(q, link)
 

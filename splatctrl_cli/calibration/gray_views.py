@@ -60,7 +60,7 @@ def scaled(T: Float64, factor: float) -> Float64:
 def overlapping(
     views: Sequence[GrayView], poses: Sequence[Float64], among: Bool, is_free: Bool
 ) -> list[tuple[int, int]]:
-    """Pairs (i, j) of views `among` (N,): for each i those j that see most of its points; i or j is free."""
+    """Pairs (i, j) of views `among` (N,): those that see most of i's points."""
     chosen = np.flatnonzero(among).tolist()
     middles = np.array([transform_points(poses[i], np.median(views[i].depth.points, axis=0)[None])[0]
                         if len(views[i].depth.points) else np.full(3, np.inf) for i in chosen])  # fmt: skip

@@ -1,4 +1,4 @@
-"""Joint refinement of view poses of a still scene, and of the bends of their depths.
+"""Joint refinement of view poses of a still scene, and of their depths' bends.
 
 Gauss-Newton in float64, with Tukey's biweight, on point-to-plane distances and grey differences. Sources: Chen and
 Medioni, Object modelling by registration, 1992; Park, Zhou and Koltun, Colored point cloud registration revisited,
@@ -114,7 +114,7 @@ class BentViews:
         self._cross, self._own, self._slope = np.zeros((size, num)), np.zeros((num, num)), np.zeros(num)
 
     def add(self, i: int, j: int, rows: Rows, columns: Index, J: Float64) -> None:
-        """Add view i on view j to the round's equations, with pose derivatives J (R, F) in `columns` (F,)."""
+        """Add view i on view j to the round's equations; derivatives J (R, F) in `columns`."""
         by_offsets = self.by_offsets(i, j, rows)
         self._cross[columns] += (by_offsets.T @ J).T
         square = (by_offsets.T @ by_offsets).tocoo()

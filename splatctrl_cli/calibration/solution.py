@@ -1,4 +1,4 @@
-"""Solves a calibration from several starts, chooses its unknowns, and rejects it if two solutions fit alike."""
+"""Solves a calibration from several starts, and rejects it if two solutions fit alike."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -232,7 +232,7 @@ def _positive(covariance: Float64) -> Float64:
 
 
 def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """Least |scale - 1| and |bias| [m] that would be noticed, by camera; inf if not looked for."""
+    """Least |scale - 1| and |bias| [m] that would be noticed, by camera, or inf."""
     unknowns = tried.adjustment.unknowns
     held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
     found = {}

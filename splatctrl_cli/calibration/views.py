@@ -100,7 +100,7 @@ def surface_normals(surface: Float64, step: int = 1) -> Float64:
 
 
 def bend(depth: Float32, step: int = 1) -> Float64:
-    """Largest deviation (h, w) [m] of depth from the mean of those `step` pixels to either side."""
+    """Largest deviation (h, w) [m] of depth from the mean at `step` pixels."""
     bent = np.zeros(depth.shape)
     middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
     z = depth.astype(np.float64)
@@ -112,7 +112,7 @@ def bend(depth: Float32, step: int = 1) -> Float64:
 
 
 def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
-    """Return which points (K, 3), camera frame, land on depth (K,), and the surface and normals (K, 3) there."""
+    """Return which points (K, 3), camera frame, land on depth, its surface and normals."""
     is_ahead = points[:, 2] > fixed.PLAUSIBLE_DEPTH[0]
     pixels = np.round(project(view.lens, np.where(is_ahead[:, None], points, 1.0)))
     lands = is_ahead & np.all((pixels >= 0) & (pixels < view.surface.shape[1::-1]), axis=1)

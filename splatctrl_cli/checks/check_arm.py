@@ -24,8 +24,7 @@ class ArmAgreement:
 
     median [m]: within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance from it (from 0
     if negative, from `ARM_COVER` if more), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR` behind.
-    num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one factor fits
-    most pixels.
+    num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one fits most.
     """
 
     median: float
@@ -216,7 +215,7 @@ def motion_findings(
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
 ) -> tuple[dict[str, float], list[Finding]]:
-    """Clock offsets [s] of cameras that then show the arm better, and findings on the arm."""
+    """Clock offsets [s] of cameras that then show the arm better, and findings."""
     posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
     timings: dict[str, tuple[float, float]] = {}
@@ -244,7 +243,7 @@ def _arm_findings(
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
-    """Offsets that fit much better than the median's; others have other causes, as a misplaced camera."""
+    """Offsets that fit much better than the median's; others have other causes."""
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():

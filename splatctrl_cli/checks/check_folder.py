@@ -44,8 +44,8 @@ class Evidence:
     """Data that a check keeps of a recording, in bounded memory.
 
     frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
-    of the first images. states: in the model's order, if any. cut: says that not all was read. is_guessed: True if
-    the unit of lengths is.
+    of the first images. states: in the model's order. cut: says that not all was read. is_guessed: the unit of
+    lengths is.
     """
 
     frames: Sequence[RgbdFrame]
@@ -61,7 +61,7 @@ def judged(
 ) -> CheckReport:
     """Add findings on frames, and on frames against states, to a report.
 
-    only_errors: skip checks that yield only notes and warnings, four fifths of the work.
+    only_errors: skip checks that yield only notes and warnings.
     """
     findings = [*report.findings, *alignment_findings(evidence.frames)]
     frames, is_still = usable_frames(evidence.frames, findings), report.start_ns is None
@@ -121,7 +121,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
-    """Log brightness (N, B) by bands of rows, less a parabola; 0 if bands explain little.
+    """Log brightness (N, B) by bands of rows, less a parabola, or 0.
 
     Shadows and pose errors do not follow rows; gloss and vignetting vary slowly, lamps on mains within 10 or 8 ms.
     """

@@ -20,7 +20,10 @@ SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """Depth (h, w) [m] at every `stride`-th pixel, or colour (h, w, 3) averaged between; full width, height [px]."""
+    """Depth (h, w) [m] at every `stride`-th pixel, or colour (h, w, 3) averaged.
+
+    width, height [px]: of the whole image.
+    """
 
     stamp_ns: int
     stride: int
@@ -59,7 +62,6 @@ class ImageWatch:
         return is_next
 
     def add_bad(self, stamp_ns: int, reason: str) -> None:
-        """Count an undecodable image."""
         self.count += 1
         self.num_bad += 1
         if self.first_bad_ns is None:
@@ -124,7 +126,6 @@ class ImageWatch:
         return self.scale if self.scale is not None else None if self.is_float else MILLIMETRE
 
     def add_undecoded(self, encoding: str, width: int, height: int) -> None:
-        """Count an image without its pixels."""
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
@@ -146,7 +147,6 @@ def _constant(depth: Float32) -> list[float]:
 
 
 def stride_of(height: int) -> int:
-    """Number of rows per kept row."""
     return max(1, -(-height // limits.KEPT_ROWS))
 
 
@@ -157,7 +157,6 @@ def thumbnail_size(width: int, height: int) -> tuple[int, int]:
 
 
 def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
-    """The camera of a thumbnail."""
     width, height = thumbnail_size(lens.width, lens.height)
     across, down = width / lens.width, height / lens.height
     cx, cy = (lens.cx + 0.5) * across - 0.5, (lens.cy + 0.5) * down - 0.5
@@ -165,7 +164,6 @@ def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
 
 
 def image_findings(images: ImageWatch) -> Iterator[Finding]:
-    """Findings on the images, except depth."""
     where = images.where
     if images.num_bad:
         severity = error if images.num_bad == images.count else warning
@@ -202,7 +200,6 @@ def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
 
 
 def depth_findings(images: ImageWatch) -> Iterator[Finding]:
-    """Findings on missing or implausible depth."""
     where = images.where
     if images.num_without_depth:
         every = images.num_without_depth == images.num_decoded
@@ -370,7 +367,7 @@ def _correlation(color: Float64, depth: Float64) -> Float64:
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:
-    """Rows and columns of the best shift, its correlation, and the best one away from it."""
+    """Rows and columns of the best shift, its correlation, and the best away from it."""
     height, width = surface.shape
     rows, columns = height // limits.EDGE_SEARCHED, width // limits.EDGE_SEARCHED
     near = surface[

@@ -89,7 +89,6 @@ class LogWatch(JoinedLog):
         self._headed: dict[Topic, bool] = {}
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """The log's messages, each observed."""
         for message in super().messages(damage, names):
             self._take(message)
             yield message

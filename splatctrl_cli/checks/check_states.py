@@ -37,12 +37,10 @@ class Spread:
 
     @property
     def is_small(self) -> bool:
-        """True if the poses are the same."""
         return self.max_position < limits.POSES_POSITION and self.max_rotation < limits.POSES_ROTATION
 
     @property
     def words(self) -> str:
-        """Text for a sentence."""
         return (
             f"median {1e3 * self.median_position:.2f} mm and {np.degrees(self.median_rotation):.2f} deg, "
             f"largest {1e3 * self.max_position:.2f} mm and {np.degrees(self.max_rotation):.2f} deg"
@@ -66,7 +64,6 @@ class PoseAgreement:
 
     @property
     def sentence(self) -> str:
-        """One line for a report."""
         start = f"{self.num_poses} logged end-effector poses"
         x, y, z = self.offset[:3, 3]
         by = f"({x:.4f}, {y:.4f}, {z:.4f}) m and {np.degrees(_angle(self.offset[:3, :3])):.1f} deg"
@@ -204,7 +201,7 @@ def _world(model: RobotModel, state: JointState) -> Float64:
 
 
 def _explained(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
-    """X (4, 4) of logged = poses X, by mean rotation and median position, and rest."""
+    """X (4, 4) of logged = poses X, by mean rotation and median position; rest."""
     relative = _inverse(poses) @ logged
     U, _, Vt = np.linalg.svd(relative[:, :3, :3].sum(axis=0))
     X = pose_at(np.median(relative[:, :3, 3], axis=0), U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
@@ -251,7 +248,6 @@ class RobotStates:
 
 
 def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) -> RobotStates:
-    """The joint states of a log, with findings."""
     findings: list[Finding] = []
     for topic in found.of_type(*STATE_TYPES):
         if options.joint_topic in (None, topic.topic.name):

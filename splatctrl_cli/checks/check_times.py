@@ -32,14 +32,12 @@ class Thinned(Generic[T]):
         return is_kept
 
     def add(self, value: T) -> None:
-        """Keep a value."""
         self._kept.append(value)
         if len(self._kept) > self._limit:
             self._kept = self._kept[::2]
             self._step *= 2
 
     def change(self, by: Callable[[T], T]) -> None:
-        """Replace each value."""
         self._kept = [by(value) for value in self._kept]
 
     def __iter__(self) -> Iterator[T]:
@@ -64,7 +62,6 @@ class TimesWatch:
         self._latest_ns = 0
 
     def add(self, stamp_ns: int, log_ns: int) -> None:
-        """Take the next message."""
         self.count += 1
         self.num_zero += self.has_stamps and stamp_ns == 0
         interval = stamp_ns - self._latest_ns
@@ -112,7 +109,6 @@ class TimesWatch:
         return sorted(((i * _NS, at) for i, at in self._longest if i * _NS > limit), key=lambda gap: gap[1])
 
     def rate(self, *, is_read: bool) -> Rate:
-        """Its row of the table."""
         median = self.median_interval
         return Rate(
             topic=self.topic,
@@ -125,7 +121,6 @@ class TimesWatch:
 
 
 def time_findings(times: TimesWatch, what: str = "messages") -> Iterator[Finding]:
-    """Findings on one topic's times."""
     where = times.topic
     if times.num_zero:
         text = f"{times.num_zero} of {times.count} header stamps are 0"
@@ -165,7 +160,6 @@ def joined_gaps(findings: list[Finding]) -> list[Finding]:
 
 
 def _overlap(a: Finding, b: Finding) -> bool:
-    """True if the longest pauses coincide."""
     (a0, a1), (b0, b1) = (((f.stamp_ns or 0) * _NS, (f.stamp_ns or 0) * _NS + (f.value or 0.0)) for f in (a, b))
     return min(a1, b1) - max(a0, b0) > limits.PAUSED_TOGETHER * min(a1 - a0, b1 - b0)
 

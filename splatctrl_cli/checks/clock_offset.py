@@ -20,7 +20,7 @@ _NEAR = 0.05  # [m] in front of the camera
 
 @dataclass(kw_only=True)
 class CameraMotion:
-    """A camera's stamps (K + 1) [ns], and K changes (h, w) in [0, 1] between them."""
+    """A camera's stamps (K + 1) [ns], and changes (K, h, w) in [0, 1]."""
 
     intrinsics: Intrinsics
     T_world_camera: Float64
@@ -37,7 +37,6 @@ class ImageMotion:
     _last: dict[str, tuple[Float32, UInt8]] = field(default_factory=dict)
 
     def add(self, frame: RgbdFrame) -> None:
-        """Take the next frame."""
         camera = self.cameras.get(frame.camera)
         if camera is None:
             camera = CameraMotion(intrinsics=thumbnail_lens(frame.intrinsics), T_world_camera=frame.T_world_camera)
@@ -66,7 +65,7 @@ def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) ->
 
 
 def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) -> Float32:
-    """Depth (T, h, w) [m] of spheres (T, S, 3) in a camera; 0 = none.
+    """Depth (T, h, w) [m] of spheres (T, S, 3); 0 = none.
 
     A sphere is a disc of its radius (S,) at its distance, exact on the optical axis.
     """
@@ -87,7 +86,7 @@ def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) ->
 
 
 def predicted_change(depth_a: Float32, depth_b: Float32) -> Float32:
-    """Change (K, h, w) in [0, 1] of silhouettes; 1 where only one has the robot."""
+    """Change (K, h, w) of silhouettes; 1 where only one has the robot."""
     a, b = depth_a > 0, depth_b > 0
     of_depth = np.minimum(np.abs(depth_b - depth_a) / np.float32(limits.MOTION_DEPTH_STEP), np.float32(1.0))
     return np.where(a & b, of_depth, (a ^ b).astype(np.float32)).astype(np.float32)
@@ -125,7 +124,6 @@ class ClockOffset:
 
     @property
     def sentence(self) -> str:
-        """One line for a report."""
         if self.offset_s is None or self.uncertainty_s is None:
             return f"clocks of cameras and robot: cannot tell their offset: {self.reason}"
         return (
@@ -140,7 +138,7 @@ def estimate_clock_offset(
     """The offset at which robot and image motion correlate best.
 
     states: by stamp. With `robot` and stationary cameras, pixel changes are compared with the spheres' silhouette;
-    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras. It is
+    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras; it is
     unknown without motion, at low correlation, with a rival peak, or at the end of the search.
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]

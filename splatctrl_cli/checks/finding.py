@@ -250,7 +250,6 @@ class CheckReport:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Findings by severity."""
         return {str(s): sum(f.severity is s for f in self.findings) for s in ORDER}
 
     def seconds(self, finding: Finding) -> float | None:
@@ -260,7 +259,6 @@ class CheckReport:
         return round((finding.stamp_ns - self.start_ns) * 1e-9, 3)
 
     def as_dict(self) -> Mapping[str, object]:
-        """Plain values for JSON."""
         return {
             "path": self.path,
             "kind": self.kind,

@@ -105,7 +105,6 @@ class OfThisProgram:
 
 
 def run_words(words: list[str]) -> int:
-    """Run the program, for a runner."""
     main = importlib.import_module("splatctrl_cli.cli.main").main
     code: int = main(words)
     return code

@@ -74,7 +74,6 @@ def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: st
 
 
 def pose(text: str) -> tuple[float, ...]:
-    """Parse a pose as POSE, for argparse."""
     try:
         return checked_pose(numbers(text))
     except ValueError as error:
@@ -278,7 +277,7 @@ _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
 class Console:
-    """Output of a command: results to stdout, log lines to stderr unless --quiet, verdicts to CI.
+    """Output of a command: results to stdout, log lines to stderr, verdicts to CI.
 
     is_step: a step of another command; CI gets no verdict.
     """
@@ -337,7 +336,6 @@ class Console:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Aligned text columns, numbers to the right."""
     return list(long_table(header, lambda: rows))
 
 

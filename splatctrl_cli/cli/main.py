@@ -30,7 +30,7 @@ _NEVER_END = {"FIFO": stat.S_ISFIFO, "socket": stat.S_ISSOCK, "device": stat.S_I
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; 6 if output met a closed stdout."""
+    """Run the command line; return its exit code, 6 if stdout was closed."""
     lost = _stand_in_for_closed_streams()
     code = _run(argv)
     if lost.is_written and code not in {70, INTERRUPTED}:
@@ -65,7 +65,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
-    """Print an error on stderr, with --json as an object on stdout; return line and exit code."""
+    """Print an error on stderr (with --json on stdout); return line and exit code."""
     message, remedy, code = _told(error)
     if code == INTERRUPTED and remedy.endswith(RESUME):
         goes_on = shlex.join([words[0], RESUME, *(word for word in words[1:] if word != RESUME)])
@@ -161,7 +161,6 @@ def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
 
 
 def _places(output: Path) -> set[Path]:
-    """Output path and its partial."""
     target = Path(os.path.realpath(output))  # resolve() raises RuntimeError for a link to itself
     return {target, target.with_name(target.name + PARTIAL)} if target.name else {target}
 
@@ -170,8 +169,7 @@ def _places(output: Path) -> set[Path]:
 def refuse_endless_files() -> None:
     """Make reading a FIFO, socket or device raise OSError from now on, anywhere.
 
-    A FIFO among images would wait for its writer; a link to /dev/zero would fill the memory. Files are opened in many
-    places, so the interpreter checks each one.
+    A FIFO among images would wait for its writer; a link to /dev/zero would fill the memory.
     """
     sys.addaudithook(_look)
 

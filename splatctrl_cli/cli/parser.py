@@ -96,7 +96,6 @@ class Parser(argparse.ArgumentParser):
         return [("", shown), *((group.title or "", group._group_actions) for group in more if group._group_actions)]
 
     def format_usage(self) -> str:
-        """One line of positionals and required options."""
         either = [group for group in self._mutually_exclusive_groups if group.required]
         grouped = {id(action) for group in either for action in group._group_actions}
         required = [f"({' | '.join(invocation(a) for a in group._group_actions)})" for group in either]
@@ -106,7 +105,6 @@ class Parser(argparse.ArgumentParser):
         return " ".join(["usage:", self.prog, *places, *required, "[options]"]) + "\n"
 
     def format_help(self) -> str:
-        """Common options and examples."""
         num_hidden = sum(len(actions) for _, actions in self.groups[1:])
         titles = ", ".join(title for title, _ in self.groups[1:])
         examples = "".join(f"  splatctrl {example}\n" for example in self.examples)

@@ -1,12 +1,12 @@
 """A bound on a map's missed surface from held-out depth: split conformal prediction over time.
 
-Each held-out frame set has one number, its largest miss. As neighbouring sets are dependent, they form stretches of
-the misses' autocorrelation time, that long apart; a stretch's score is its largest miss. If n scores and a new one
-are exchangeable, the k-th smallest bounds the new one with probability at least `confidence`. Here ``k = ceil((n + 1)
-* confidence)``, up to confidence ``n / (n + 1)`` (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, section 2).
+Each held-out frame set has one number, its largest miss. Dependent sets form stretches of the misses' autocorrelation
+time, that long apart; a stretch's score is its largest miss. If n scores and a new one are exchangeable, the k-th
+smallest bounds the new one with probability at least `confidence`, for ``k = ceil((n + 1) * confidence)`` (Vovk,
+Gammerman and Shafer 2005; Lei et al. 2018, section 2).
 
-The bound is for a further stretch of the same kind, before it is recorded, not for each state. It excludes surface
-without depth return, changes of scene or camera, and unprecedented moments.
+The bound is for a further stretch of the same kind, not for each state. It excludes surface without depth return,
+changes of scene or camera, and unprecedented moments.
 """
 
 import math
@@ -87,9 +87,9 @@ def autocorrelation_time(misses: Float64) -> int:
 
 
 def stretches(num_sets: int, length: int) -> Index:
-    """The stretch (T,) of each set: `length` sets, which begin `length` sets after the last set of the previous one.
+    """The stretch (T,) of each set; `length` sets lie between two stretches.
 
-    Other sets count to the previous stretch, which only raises its score: the bound still holds.
+    Sets between count to the previous stretch, which only raises its score.
     """
     period = 2 * length - 1
     whole = max((num_sets + period - length) // period, 1)

@@ -70,7 +70,7 @@ OVER_SCALES = {
 
 @dataclass(frozen=True, kw_only=True)
 class FieldAccuracy:
-    """Bands by field name, everywhere and where seen, at the same points.
+    """Bands by field name, everywhere and where seen.
 
     Without known visibility, seen is empty and the over-estimate is over all points.
     """
@@ -80,7 +80,6 @@ class FieldAccuracy:
     over_estimate: OverEstimate
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for ``field.json``."""
         return {**asdict(self), "holds": self.over_estimate.holds}
 
     def figures(self) -> dict[str, float | None]:
@@ -149,8 +148,8 @@ class GridDistance:
 def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
     """A grid's distances by field name: sdf, hard, se, gpdf.
 
-    Without its channel, hard is ``bound`` plus the header's margin, within a micrometre (and includes never-seen
-    obstacle cells). Raises InputError with neither.
+    Without its channel, hard is ``bound`` plus the header's margin, within a micrometre. Raises InputError with
+    neither.
     """
     found: dict[str, GridDistance] = {
         name: GridDistance(values=grid.channels[name])
@@ -216,7 +215,7 @@ REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
 @dataclass(frozen=True, kw_only=True)
 class TrueCells:
-    """Q sampled cells, world: centres and nearest surface points (Q, 3) [m], `FIELDS` and true distance (Q,) [m]."""
+    """Q sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]."""
 
     points: Float64
     fields: Mapping[str, Float64]
@@ -228,10 +227,10 @@ class TrueCells:
 class TruthComparison:
     """The accuracy against the truth, and its cell counts.
 
-    num_drawn cells were sampled; num_blank have no distance (field.unknown = nan); num_near of the rest lie outside
-    objects within 20 cm. A training camera saw the nearest surface point of num_seen, and of num_outside_workspace
-    where the scene keeps no splats. reliability: by probability form, at seen cells within 20 cm of a surface, either
-    side. error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR`, or None.
+    num_drawn cells were sampled; num_blank have no distance; num_near of the rest lie outside objects within 20 cm. A
+    training camera saw the nearest surface point of num_seen, and of num_outside_workspace where the scene keeps no
+    splats. reliability: by probability form, at seen cells within 20 cm of a surface. error_mean, error_sigma [m]: of
+    sdf at seen cells within `PROBABILITY_NEAR`, or None.
     """
 
     accuracy: FieldAccuracy
@@ -245,7 +244,6 @@ class TruthComparison:
     error_sigma: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for ``field.json``."""
         counts = {name: value for name, value in vars(self).items() if name.startswith("num_")}
         error = {"error_mean": self.error_mean, "error_sigma": self.error_sigma}
         curves = {name: _curve(curve) for name, curve in self.reliability.items()}
@@ -263,9 +261,8 @@ def compare_with_truth(
 ) -> TruthComparison:
     """Accuracy of `FIELDS`, and reliability of probabilities, where `frames` saw the surface.
 
-    name: of the truth, for errors. workspace: where the scene keeps splats, None if unknown. median_radius [m]: of
-    the splats. probabilities: functions of points (Q, 3) and sdf (Q,) [m]. Raises NotEvaluableError with no cell near
-    an object.
+    name: of the truth, for errors. workspace: where the scene keeps splats. median_radius [m]: of the splats.
+    probabilities: functions of points (Q, 3) and sdf (Q,) [m]. Raises NotEvaluableError with no cell near an object.
     """
     sdf, distance = cells.fields["sdf"], cells.distance
     is_blank = ~np.isfinite(sdf)
@@ -310,9 +307,8 @@ def _curve(found: Reliability) -> dict[str, object]:
 class MeshComparison:
     """The accuracy against the mesh `file`, and its cell counts.
 
-    num_in_reach cells lie in the mesh's box widened by 20 cm; num_drawn were sampled. num_unknown of these have no
-    distance (NaN, by the unknown-space policy); num_inside lie inside the mesh near its surface. The num_near
-    compared lie outside within 20 cm.
+    num_in_reach cells lie in the mesh's box widened by 20 cm; num_drawn were sampled. Of these num_unknown have no
+    distance, num_inside lie inside the mesh, and the num_near compared lie outside within 20 cm.
     """
 
     file: str
@@ -326,7 +322,6 @@ class MeshComparison:
     num_near: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for ``field.json``."""
         counts = {name: value for name, value in vars(self).items() if name != "accuracy"}
         return {**counts, **self.accuracy.as_dict()}
 
@@ -334,9 +329,9 @@ class MeshComparison:
 def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_points: int = 50_000) -> MeshComparison:
     """Errors of the grid's distances at cells sampled by `seed`, against the exact mesh distance.
 
-    The mesh is in the grid's frame [m]. Inside a closed mesh, where the field is a shell, nothing is compared; an
-    open mesh's unsigned distance is the truth on both sides. `seen` is empty. Raises InputError for a file that is no
-    mesh, NotEvaluableError with no cell near it.
+    The mesh is in the grid's frame [m]. Inside a closed mesh nothing is compared: the field is a shell. An open
+    mesh's unsigned distance is the truth on both sides. Raises InputError for a file that is no mesh,
+    NotEvaluableError with no cell near it.
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)

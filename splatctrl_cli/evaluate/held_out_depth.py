@@ -1,8 +1,8 @@
 """A baked field against held-out depth, and a scene's surface against reference points.
 
 A depth pixel at point p bounds the distance at x by ``|x - p|``, and the ray up to p is free. A field above the
-distance to the nearest measured point over-estimates. A lower one may know surface that no held-out pixel shows. It
-errs only if the ball around x, up to that point, was seen free.
+distance to the nearest measured point over-estimates. A lower one errs only if the ball around x, up to that point,
+was seen free: else it may know surface that no held-out pixel shows.
 """
 
 import math
@@ -48,9 +48,9 @@ def cloud_score(
 
     As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; others count
     only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference. completeness:
-    the whole reference to the surface. chamfer: the mean of both. completeness_seen: of reference points that a
-    training camera saw, by seen (R,). nan without points. unit: metres per unit of the reference's file, for
-    messages. Raises NotEvaluableError without near points, or if another unit fits.
+    the reference to the surface. chamfer: the mean of both. completeness_seen: of reference points that a training
+    camera saw, by seen (R,). nan without points. unit: metres per unit of the reference's file, for messages. Raises
+    NotEvaluableError without near points, or if another unit fits.
     """
     if not max_distance > 0:
         raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
@@ -118,9 +118,8 @@ CLOUD_SCALES = {  # by the names of `cloud_score`
 def spaced(points: Float64, spacing: float) -> Float64:
     """Points (P, 3), visited in random order, farther than `spacing` [m] from all kept before.
 
-    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts; one point per cube
-    would improve accuracy by a tenth. Points in one cube of half the edge are merged first (of the whole edge, if
-    more than 6 million points are left).
+    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts. Points in one cube of
+    half the edge are merged first (of the whole edge, if more than 6 million points are left).
     """
     _check_spacing(spacing)
     some = thinned(points, spacing / 2)
@@ -205,9 +204,9 @@ class HeldOutComparison:
     """Errors [m] against held-out depth, and counts of points.
 
     on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
-    to the nearest measured point, seen free, so under-estimates count too. over_estimate is over all points, as it is
-    sound everywhere. num_edges pixels were left out at depth edges; num_outside points lie outside the grid,
-    num_unknown at a corner without distance.
+    to the nearest measured point, seen free, so under-estimates count too. over_estimate: over all points. num_edges
+    pixels were left out at depth edges; num_outside points lie outside the grid, num_unknown at a corner without
+    distance.
     """
 
     on_surface: dict[str, BandAccuracy]
@@ -237,8 +236,8 @@ def compare_with_held_out_depth(
     """Errors of interpolated distances on `max_points` held-out rays, sampled by `seed`.
 
     frames: of held-out cameras, at the bake's stamp, in the grid's frame. counted: per frame (H, W), False on objects
-    that the field leaves out (the robot); None: all count. Raises InputError for masks that do not fit,
-    NotEvaluableError without a measured point in the grid.
+    that the field leaves out; None: all count. Raises InputError for masks that do not fit, NotEvaluableError without
+    a measured point in the grid.
     """
     distances = grid_distances(grid)
     upper = grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1)
@@ -314,7 +313,7 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
 
 
 def depth_edges(depth: NDArray[np.float32]) -> Bool:
-    """(H, W) True where a neighbour's depth differs by more than a share of the smaller."""
+    """(H, W) True where a neighbour's depth differs by more than a share."""
     is_edge = np.zeros(depth.shape, dtype=np.bool_)
     for axis in (0, 1):
         here, there = [slice(None)] * 2, [slice(None)] * 2

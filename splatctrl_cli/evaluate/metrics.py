@@ -35,7 +35,6 @@ class Scale:
     relative: float = 0.0
 
     def tolerance(self, before: float) -> float:
-        """Tolerance in `unit`."""
         return self.absolute + self.relative * abs(before)
 
     def harm(self, before: float, after: float) -> float:
@@ -69,12 +68,10 @@ class Shown:
 
 
 def least_of(column: str) -> Shown:
-    """The row where a column is least."""
     return Shown(column=column, pick="least")
 
 
 def largest_of(column: str) -> Shown:
-    """The row where a column is largest."""
     return Shown(column=column, pick="largest")
 
 
@@ -82,8 +79,7 @@ def largest_of(column: str) -> Shown:
 class Metric(Generic[R]):
     """One figure: its value, and the number of states, views or points behind it.
 
-    running: its value before the first state, and up to each (T,); None if not of single states. shown: its row in a
-    table of states.
+    running: its value before the first state, and up to each (T,); None if not of states. shown: its row in a table.
     """
 
     name: str
@@ -96,7 +92,7 @@ class Metric(Generic[R]):
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """A column (T,) folded to a value; accumulate: up to each state, from `start` on, None if undefined."""
+    """A column (T,) folded to a value; accumulate: up to each state, from `start` on."""
 
     of: Callable[[Float64], float | None]
     start: float = np.nan
@@ -221,8 +217,8 @@ def clearance_agreement(
 ) -> dict[str, float | None]:
     """Agreement of clearance with truth (T,) [m], within 10 cm of seen surface.
 
-    By `FIGURES`: states compared; |clearance - truth| as median, 95 % and largest [m]; largest over-estimate [m];
-    share within tolerance [m]. None without states.
+    By `FIGURES`: states compared; |clearance - truth| as median, 95 % and largest; largest over-estimate; share
+    within tolerance. None without states.
     """
     tolerance = MAP_ALLOWANCE + median_radius
     compared = (truth < CLEARANCE_NEAR) & is_seen & np.isfinite(clearance)

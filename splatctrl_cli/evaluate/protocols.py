@@ -2,9 +2,9 @@
 
 Views are numbered from 0: view 0 is ``rect_001`` of DTU.
 
-ObsMaskN_10.mat and PlaneN.mat of DTU's ObsMask folder, in millimetres, say where points count. ObsMask (X, Y, Z):
-cells of BB (2, 3), Res wide, that the reference scanner observed. Reference points count above the ground, at ``P (4)
-. (x, y, z, 1) > 0`` (DTU's PointCompareMain.m; jzhangbs/DTUeval-python, eval.py).
+ObsMaskN_10.mat and PlaneN.mat of DTU's ObsMask folder, in millimetres, say where points count: ObsMask (X, Y, Z) has
+the cells of BB (2, 3), Res wide, that the reference scanner observed. Reference points count above the ground, at ``P
+(4) . (x, y, z, 1) > 0`` (DTU's PointCompareMain.m; jzhangbs/DTUeval-python, eval.py).
 """
 
 import re
@@ -45,8 +45,7 @@ class ScoreProtocol:
     mask: pixels of the published figure: of a mask if given, of the object (mask required), or with reference depth.
     fill: colour outside the mask in the published SSIM; is_zero_padded: without a mask, that SSIM has zeros beyond
     the border. size (width, height) [px], scans: as published. Without scored views, every `every`-th view from
-    `first` on is scored, or with `every` 0 all views, which also train. Without training views, those not scored
-    train.
+    `first` on is scored, with 0 all views, which also train. Without training views, those not scored train.
     """
 
     name: str
@@ -63,11 +62,10 @@ class ScoreProtocol:
 
     @property
     def scores_training(self) -> bool:
-        """True if the training views are scored."""
         return not (self.scored or self.every)
 
     def split(self, numbers: Sequence[int], where: str) -> Split:
-        """Split the views `numbers` of a scan, named `where` in errors; unnamed views are left out.
+        """Split the views `numbers` of a scan, named `where` in errors.
 
         Raises InputError if named views are missing, or if none train or are scored.
         """
@@ -198,7 +196,7 @@ class ObservedSpace:
     plane: Float64
 
     def near(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] in or near the box: only these are compared."""
+        """(Q,) True for points (Q, 3) [m] in or near the box, which are compared."""
         return np.asarray(((points >= self.low - BEFORE) & (points < self.high + BEYOND)).all(axis=1))
 
     def observed(self, points: Float64) -> Bool:

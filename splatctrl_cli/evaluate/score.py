@@ -140,7 +140,7 @@ def score_view(
 
     color (H, W, 3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen, mask (H, W):
     pixels seen in training, and of the mask rule. The published SSIM has grey `fill` outside the mask; without a
-    mask, it exists only if is_zero_padded, with zeros beyond the border. Invalid pixels of `frame` are in no region.
+    mask, it exists only if is_zero_padded. Invalid pixels of `frame` are in no region.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
@@ -179,8 +179,8 @@ def score_view(
 def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float:
     """Share of the splats' mass with centres in voxels observed free; nan without mass.
 
-    Mass is opacity times squared radius, what a splat can cover. The robot's are left out, since they cross free
-    space. free_below: occupancy below which a seen voxel is free.
+    Mass is opacity times squared radius. The robot's splats are left out: they cross free space. free_below:
+    occupancy below which a seen voxel is free.
     """
     mass = np.where(splats.labels == Label.ROBOT, 0.0, splats.opacities * splats.radii.astype(np.float64) ** 2)
     is_free = (grid.num_updates > 0) & (grid.log_odds < math.log(free_below / (1.0 - free_below)))

@@ -1,7 +1,6 @@
 """Conclusions from a score: means over scans, changes, verdict and doubts.
 
-A report is ``score.json``: ``metrics`` by flat name, ``protocol``, ``warnings``, and ``views``, or ``results`` by
-scan.
+A report is ``score.json``: ``metrics`` by flat name, ``protocol``, ``warnings``, ``views`` or ``results`` by scan.
 """
 
 import json
@@ -123,7 +122,6 @@ def other_scans(protocol: Mapping[str, Any], scans: Sequence[str]) -> list[str]:
 
 
 def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damaged: bool) -> Verdict:
-    """The verdict on a report: views, warnings, and gates."""
     metrics, counts = report["metrics"], counts_of(report)
     num_views, num_scans = metrics["num_views"], metrics.get("num_scans")
     compared = Reason(
@@ -141,7 +139,6 @@ def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damag
 
 
 def counts_of(report: Mapping[str, Any]) -> dict[str, int]:
-    """The number of views behind each metric or change."""
     metrics = report["metrics"]
     each = [report] if "views" in report else list(report["results"].values())
     views = [view for one in each for view in one["views"]]
@@ -175,7 +172,7 @@ class Doubts:
     def look(self, view: View, render: NDArray[np.floating], mask: Bool | None) -> None:
         """Check a view, its render (H, W, 3) in [0, 1] and mask (H, W).
 
-        Raises InputError for an empty mask: the mean would miss a view.
+        Raises InputError for an empty mask.
         """
         if mask is not None and not mask.any():
             raise InputError(

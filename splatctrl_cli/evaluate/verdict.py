@@ -32,8 +32,8 @@ class Reason:
     """One criterion's finding; `Criterion.reasons` names its `criterion`.
 
     value, threshold: in `unit`, or None. time_s [s]: as in the output's files. place (3,) [m]: world. who: link,
-    sphere, joint or camera. cause: what is there. remedy: for the user. count: states, views or points behind the
-    value. label: the outcome's name if this decides, such as "contact". is_note: worth a line, decides nothing.
+    sphere, joint or camera. cause: what is there. count: states, views or points behind the value. label: the
+    outcome's name if this decides, such as "contact". is_note: worth a line, decides nothing.
     """
 
     criterion: str = ""
@@ -52,7 +52,6 @@ class Reason:
     is_note: bool = False
 
     def __str__(self) -> str:
-        """The sentence with when, cause and remedy."""
         when = "" if self.time_s is None else f" at {self.time_s:.2f} s"
         near = f", {self.cause}" if self.cause else ""
         remedy = f"; {self.remedy}" if self.remedy else ""
@@ -98,8 +97,8 @@ class Criterion(Generic[E]):
 class Verdict:
     """The outcome of a command and its reasons, deciding ones first.
 
-    label: the outcome in the command's word, such as "safe"; how: such as "proven" or "waived"; scope: what was
-    judged; notes: decide nothing. is_damaged: part of the input was lost. counts: states, views or points by metric.
+    label: the outcome in the command's word, such as "safe"; how: such as "proven"; scope: what was judged; notes:
+    decide nothing. is_damaged: part of the input was lost. counts: states, views or points by metric.
     """
 
     command: str
@@ -134,12 +133,10 @@ class Verdict:
 
     @property
     def said(self) -> tuple[Reason, ...]:
-        """Passed reasons worth a line."""
         return tuple(reason for reason in self.reasons if reason.is_note and reason.outcome is Outcome.PASSED)
 
     @property
     def sentence(self) -> str:
-        """The verdict as one sentence."""
         scope = f" ({self.scope})" if self.scope else ""
         scope = f", {DAMAGE}{scope}" if self.is_damaged else scope
         if not self.decisive:

@@ -21,8 +21,8 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, R
 class View:
     """A frame to score, its name, and the training frames known at its time.
 
-    The name is the camera and a number: within the camera's frames with a clock, among all views without, or their
-    stamp if it is the views' own number.
+    The name is the camera and a number: within the camera's frames with a clock, else among all views, or the stamp
+    if that is the views' own number.
     """
 
     name: str
@@ -68,7 +68,6 @@ def _name(camera: str, number: int) -> str:
 
 
 def frames_of(source: RecordSource) -> Iterator[RgbdFrame]:
-    """The frames among a source's records."""
     return (record for record in source.records() if isinstance(record, RgbdFrame))
 
 
@@ -103,7 +102,7 @@ def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float 
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
-    """Indices (K,) of points (Q, 3) in the image, their own depth (K,) [m], and the depth measured there (K,) [m]."""
+    """Indices (K,) of points (Q, 3) in the image; their and measured depth [m]."""
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
     landing = np.flatnonzero(points_camera[:, 2] > 1e-6)
     pixels = np.floor(project(frame.intrinsics, points_camera[landing]) + 0.5)
@@ -149,8 +148,7 @@ def ssim_map(
     """Structural similarity (H, W, 3) of images in [0, 1] (Wang et al. 2004).
 
     Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments. The border is mirrored, with its
-    edge pixel repeated. Zero-padding, as in 3D Gaussian splatting (graphdeco-inria/gaussian-splatting,
-    utils/loss_utils.py), hides errors there.
+    edge pixel repeated. Zero-padding (graphdeco-inria/gaussian-splatting, utils/loss_utils.py) hides errors there.
     """
     x, y = image.astype(np.float64), np.asarray(reference, dtype=np.float64)
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
@@ -167,8 +165,8 @@ def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating],
     """SSIM of images in [0, 1], `fill` outside the mask, as in NeRF's papers.
 
     scikit-image's default (skimage/metrics/_structural_similarity.py before 0.20): box window of 7 pixels, sample
-    moments, data range 2 for floats, 3 border pixels left out. That range lifts the figure: compare only within its
-    kind. nan below 7 pixels, or for an empty mask.
+    moments, 3 border pixels left out. Its data range of 2 for floats lifts the figure: compare only within its kind.
+    nan below 7 pixels, or for an empty mask.
     """
     if min(mask.shape) < SSIM_BOX or not mask.any():
         return math.nan

@@ -70,9 +70,9 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
 
 
 def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
-    """Each moment's image: of the cameras' newest up to then, the one that best shows its worst sphere, or None.
+    """Each moment's image that best shows its worst sphere, or None.
 
-    One pass over frames (by stamp), one kept per camera.
+    One pass over frames, by stamp.
     """
     found: list[Sight | None] = [None] * len(moments)
     waiting = sorted(range(len(moments)), key=lambda i: -moments[i].stamp_ns)
@@ -90,7 +90,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 
 def draw_sight(path: Path, sight: Sight) -> None:
-    """Write the image with the spheres' silhouettes, the worst bold, a line to its obstacle, and the caption."""
+    """Write the image with the spheres' silhouettes, a line to the obstacle, and the caption."""
     moment, frame = sight.moment, sight.frame
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)

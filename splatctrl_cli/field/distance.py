@@ -131,7 +131,7 @@ class GpdfField(LogSumExpField):
 
 
 class SeField(LogSumExpField):
-    """The paper's Gaussian kernel in the log domain, with radii: unbiased over an evenly sampled plane.
+    """The paper's Gaussian kernel in the log domain, with radii: unbiased over a plane.
 
     ``f(x) = sqrt(-2 l^2 L) - sum_i pi_i r_i`` with ``L = log sum_i w_i exp(-|x - p_i|^2 / (2 l^2))``, pi the terms'
     shares. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) Undefined where L >= 0, near and inside the
@@ -196,10 +196,10 @@ class SeField(LogSumExpField):
 
 
 class SafeField:
-    """The smaller of the exact distance and a kernel field; exact where the kernel field is undefined.
+    """The smaller of the exact distance and a kernel field, where that is defined.
 
-    Row-sum lumping over-estimates the clearance to a sparse object before a dense one; the minimum never exceeds
-    the exact distance.
+    Row-sum lumping over-estimates the clearance to a sparse object before a dense one; the minimum never exceeds the
+    exact distance.
     """
 
     def __init__(self, exact: DistanceField, kernel: LogSumExpField) -> None:

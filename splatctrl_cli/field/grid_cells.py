@@ -1,4 +1,4 @@
-"""Layout of a distance grid, its memory, what cameras saw in it, and a baked one as a distance field."""
+"""A distance grid: layout, memory, what cameras saw in it, and its distance field."""
 
 import math
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class GridLayout:
 
     @classmethod
     def over(cls, box: Box, voxel: float) -> "GridLayout":
-        """Cover a box with centres, from lower corner to upper or just beyond, two at least.
+        """Cover a box with centres, from the lower corner on, two at least.
 
         Raises UsageError for a voxel or box without size.
         """

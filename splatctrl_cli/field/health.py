@@ -28,7 +28,7 @@ class FieldHealth:
 
 
 def field_health(centers: Floats, radii: Floats, length: float, *, kernels: Collection[str]) -> FieldHealth:
-    """Health of splats (N, 3), (N,) [m] for kernels (se, gpdf) of this length scale [m]."""
+    """Health of splats (N, 3), (N,) [m] for kernels of this length scale [m]."""
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
     return FieldHealth(
@@ -85,7 +85,7 @@ def _set_warnings(centers: Floats, radii: Floats, length: float, *, has_kernel: 
 
 
 def median_spacing(centers: Floats) -> float:
-    """Median distance from a splat (N, 3) [m] to the nearest other one; 0 for fewer than two."""
+    """Median distance from a splat (N, 3) [m] to the nearest other, or 0."""
     if len(centers) < 2:
         return 0.0
     points = np.asarray(centers, dtype=np.float64)
@@ -94,7 +94,7 @@ def median_spacing(centers: Floats) -> float:
 
 
 def planar_zero_level(radius: float, length: float) -> float:
-    """Height z [m] over a dense plane of splats where the Matern row-sum field is zero.
+    """Height z [m] over dense planar splats where the Matern row-sum field is zero.
 
     The field is ``z - l log(1 + z / l) - r``. (The integral of ``e^(-d/l)`` over a plane is ``2 pi l (z + l)
     e^(-z/l)``, the row sum ``2 pi l^2``.) Newton's method starts above, where it is convex.

@@ -35,7 +35,7 @@ class GradientLengths:
 
 @dataclass(frozen=True, kw_only=True)
 class Excess:
-    """Number and share of cells where a kernel field exceeds the exact distance, and by how much at most [m]."""
+    """Number and share of cells where a kernel field exceeds the exact distance; most [m]."""
 
     count: int
     share: float

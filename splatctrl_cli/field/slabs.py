@@ -1,4 +1,4 @@
-"""Bakes of a grid, whole or in slabs of x-planes to save memory, and their header."""
+"""Bakes of a grid, whole or in slabs of x-planes, and their header."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass
@@ -119,7 +119,7 @@ def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
 
 
 class UnknownSpace:
-    """Never-seen space in slabs, treated by the policy ``nan`` or ``obstacle``; its cells are found before the bake.
+    """Never-seen space in slabs, treated by the policy ``nan`` or ``obstacle``.
 
     ``nan``: no sdf, gradient or probability there. ``obstacle``: solid cubes of probability 1; sdf, gradient and
     bound are of the nearer of splats and cubes. Cells that only the robot swept are known

@@ -279,7 +279,7 @@ def flush(path: Path) -> None:
 
 
 def _check_replaceable(path: Path, *, is_folder: bool) -> None:
-    """Raise UsageError if --force could remove foreign files: our folders are empty or have a marker."""
+    """Raise UsageError if --force could remove foreign files."""
     if path.name in ("", ".."):
         raise UsageError(f"{path}: has no name of its own to write under", remedy="give another --out")
     if is_folder and path.is_file():

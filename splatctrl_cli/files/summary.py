@@ -50,7 +50,7 @@ def names_in(folder: Path) -> list[str]:
 
 
 def files_below(path: Path) -> tuple[int, int]:
-    """Number and bytes of files at any depth, links to folders not followed; a file counts itself."""
+    """Number and bytes of files at any depth, links not followed."""
     if not path.is_dir():
         return (1, path.stat().st_size) if path.is_file() else (0, 0)
     count, size, folders = 0, 0, [str(path)]

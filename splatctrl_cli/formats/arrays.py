@@ -33,7 +33,7 @@ DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a 
 
 @dataclass(frozen=True, kw_only=True)
 class Pieces:
-    """An array that is made while it is written: `make` yields its values in C order, piece by piece."""
+    """An array made while it is written: `make` yields its values in C order."""
 
     dtype: str
     shape: tuple[int, ...]

@@ -38,7 +38,7 @@ class ImageHead:
 
 
 def image_head(data: bytes) -> ImageHead | None:
-    """Read the head of a whole, plain JPEG or PNG; None for others, which need decoding.
+    """Read the head of a whole, plain JPEG or PNG; None for others.
 
     Plain: Huffman-coded 8-bit JPEG of one or three channels, with its closing mark; grey or RGB PNG without
     transparency or interlace, all checksums right (ITU-T T.81; W3C PNG).

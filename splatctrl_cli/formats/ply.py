@@ -1,4 +1,4 @@
-"""PLY elements as tables, read only if the file has exactly the bytes it promises; points in PLY or CSV."""
+"""PLY elements as tables, if the file has the promised bytes; points in PLY or CSV."""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -259,7 +259,7 @@ _Line = tuple[int, list[str]]
 
 
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
-    """Yield a CSV's points x, y, z as (Q, 3) float64 [m], at most `POINTS_PER_BLOCK` at once.
+    """Yield a CSV's points as (Q, 3) float64 [m], at most `POINTS_PER_BLOCK` at once.
 
     Without a header (a first line not all numbers) it has three columns; other columns are ignored. Raises InputError
     naming `name`, line and column for a missing column, a line of another length, or no finite number within

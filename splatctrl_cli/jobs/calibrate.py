@@ -51,7 +51,7 @@ class CalibrateRequest(RobotOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateResult:
-    """The written calibration, and distances [m] of points to what another camera or the robot shows there.
+    """The written calibration, and distances [m] to what another camera or the robot shows.
 
     before, after: `Adjustment.distance`. moved: by camera [m], [deg].
     """
@@ -237,7 +237,7 @@ def depth_frame(stored: StoredFrame) -> RgbdFrame:
 
 
 def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
-    """Fixed cameras: that of --hold; else none with a robot or a moving camera; else the first."""
+    """Fixed cameras: of --hold; else none with a robot or moving camera; else the first."""
     if request.hold is not None and request.hold not in cameras:
         raise UsageError(f"--hold {request.hold}: no such camera", remedy=f"use one of: {', '.join(cameras)}")
     if request.hold is not None:

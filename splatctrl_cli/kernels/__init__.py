@@ -32,7 +32,7 @@ native: Any = _best()
 
 
 def arithmetic() -> str:
-    """Name of the plainest module that gives the same bytes as `native`, as results depend on it."""
+    """Name of the plainest module that gives the same bytes as `native`."""
     name: str = native.__name__.rpartition(".")[2]
     return "_native_v3" if name == "_native_v4" else name
 

@@ -1,4 +1,4 @@
-"""Spheres on a kinematic tree, gaps between them, and edges proved free of solids and self-collision.
+"""Spheres on a kinematic tree, gaps between them, and edges proved free.
 
 Shapes: B bodies, the base first, J = B - 1 joints, S spheres, T postures, P pairs; E straight edges in joint space, R
 rows (M moving spheres, then P pairs).
@@ -42,7 +42,7 @@ class Chain(NamedTuple):
         return centers, jacobians
 
     def frame(self, q: Float64, body: int, in_body: Float64) -> tuple[Float64, Float64]:
-        """World pose (3, 4) of a frame at `in_body` (3, 4) in `body`, and its Jacobian (6, J), linear first."""
+        """World pose (3, 4) of a frame at `in_body` in `body`, and its Jacobian (6, J)."""
         pose, jacobian = np.empty((3, 4)), np.empty((6, len(q)))
         native.chain_frame(*self, np.ascontiguousarray(q), body, in_body, pose, jacobian)
         return pose, jacobian

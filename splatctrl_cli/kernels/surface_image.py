@@ -96,7 +96,7 @@ class TriangleTree:
         return np.asarray(number > INSIDE)
 
     def gaps(self, poses: Float64, centers: Floats, radii: Floats) -> tuple[Float64, Int64]:
-        """Signed gap (T,) [m] from the nearest ball to the triangles, negative inside, and that ball's number (T,).
+        """Signed gap (T,) [m] from the nearest ball, negative inside, and its number (T,).
 
         Balls (N, 3), (N,) [m]; poses (T, 4, 4): from their frame to the triangles'. Infinite and -1 without any.
         """

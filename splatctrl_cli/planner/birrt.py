@@ -116,7 +116,7 @@ class _Search:
         return tree.add(tree.q[near[is_free]] + way[is_free], near[is_free])
 
     def met(self, tree: _Tree, other: _Tree, new: Index) -> tuple[int, int] | None:
-        """Grow `other` towards the new nodes of `tree` as far as free; return the pair that meets, or None."""
+        """Grow `other` towards `tree`'s new nodes; return the pair that meets, or None."""
         near = other.nearest(tree.q[new])
         way = tree.q[new] - other.q[near]
         share = self.free_shares(other.q[near], tree.q[new], only_whole=False)
@@ -213,7 +213,7 @@ def checked_postures(clearance: Clearance, start: Float64, goals: Float64, confi
 def shortened(
     clearance: Clearance, waypoints: Float64, config: PlannerConfig, random: np.random.Generator
 ) -> tuple[Float64, int, int]:
-    """Return a path (W', J) of proved edges, not longer than before, and the numbers of edges and postures checked.
+    """Return a path (W', J) of proved edges, not longer, and the checks made.
 
     The shortest way over waypoints comes first. Each round then draws random shortcuts and takes the free one that
     saves most.

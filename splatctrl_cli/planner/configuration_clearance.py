@@ -145,7 +145,7 @@ def _apart(centers: Float64, pairs: Integers) -> Float64:
 
 
 def _between(levers: Float64, pairs: Integers) -> Float64:
-    """Bounds (P, J) on how fast two spheres approach; a joint that moves both moves neither against the other."""
+    """Bounds (P, J) on how fast two spheres approach; shared joints count nothing."""
     a, b = levers[pairs[:, 0]], levers[pairs[:, 1]]
     moves_both: Bool = (a > 0) & (b > 0)
     return np.where(moves_both, 0.0, np.maximum(a, b))

@@ -118,9 +118,9 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 class CalibratedSource(FrameSource):
     """Another source's records, corrected by a calibration.
 
-    Joint states move to the frames' clock. A moving camera takes its pose at the frame's time on the robot's clock:
-    from a log's transforms, else interpolated between the poses of frames. Frames without a pose within
-    `tolerance_ns` are left out and counted.
+    Joint states move to the frames' clock. A moving camera takes its pose at the frame's time on the robot's clock,
+    from a log's transforms or interpolated between frames. Frames without a pose within `tolerance_ns` are left out
+    and counted.
     """
 
     def __init__(self, source: FrameSource, correction: Correction, tolerance_ns: int = 0) -> None:
@@ -214,7 +214,7 @@ class CalibratedSource(FrameSource):
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-    """Interpolate the pose (4, 4) on a path; outside it, the end if within the tolerance, else None."""
+    """Interpolate the pose (4, 4) on a path; beyond it, the end within the tolerance."""
     after = int(np.searchsorted(stamps, stamp_ns))
     if after in (0, len(stamps)):
         end = min(after, len(stamps) - 1)
@@ -236,7 +236,7 @@ class Perturbation:
     """Errors drawn from `seed`: twice the size is twice the same error.
 
     depth_noise: standard deviation at 1 m [m]; it grows with depth squared, as for stereo. pose_error [m], pose_turn
-    [degrees]: a shift and a turn of each camera, in a drawn direction and about a drawn axis, the same in all frames.
+    [degrees]: a shift and a turn of each camera, drawn once for all frames.
     """
 
     depth_noise: float = 0.0

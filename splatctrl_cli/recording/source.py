@@ -106,7 +106,7 @@ def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescript
 
 
 def open_logs(paths: Sequence[Path]) -> RawLog | None:
-    """Open a log, or several of one session; None for a single path of another kind.
+    """Open a log, or several of one session; None for another kind.
 
     Raises InputError if missing, or if one of several is no log.
     """

@@ -28,7 +28,7 @@ class CameraTopics:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseTopic:
-    """A topic of poses; frame: what it poses, "" for the frame that its messages name, else the camera's."""
+    """A topic of poses; frame: what it poses, "" for the messages' or the camera's."""
 
     topic: str
     frame: str = ""
@@ -38,12 +38,11 @@ class PoseTopic:
 class SourceOptions:
     """The user's settings for an input; the defaults fit a well-formed log.
 
-    world_frame: of poses (default: tf's root). cameras: only these (default: all). By camera name: camera_topics
-    instead of those found; camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf
-    has none; human_topics: images not 0 on a person; intrinsics: fx, fy, cx, cy [px] and distortion coefficients,
-    instead of recorded ones. depth_scale [m per count]. root: of an image folder's files. holdout: its frames (index
-    or name) for camera `holdout`. stamps: ``header``, or ``log`` for log times. calibration: a file of `calibrate`.
-    perturb: changes to frames (`calibrated`).
+    world_frame: of poses (default: tf's root). cameras: only these (default: all). By camera name: camera_topics;
+    camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf has none; human_topics:
+    images not 0 on a person; intrinsics: fx, fy, cx, cy [px] and distortion coefficients. depth_scale [m per count].
+    root: of an image folder's files. holdout: its frames (index or name) for camera `holdout`. stamps: ``header`` or
+    ``log``. calibration: a file of `calibrate`. perturb: changes to frames (`calibrated`).
     """
 
     world_frame: str | None = None
@@ -78,7 +77,6 @@ class SourceOptions:
 
 
 def still_note(camera: str) -> str:
-    """A note on a camera posed by the user."""
     return f"camera {camera}: stands still where --camera-pose puts it, not where the recording may say"
 
 

@@ -49,7 +49,7 @@ class Cut:
 
 
 def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
-    """Write slices of `sdf` through the cell nearest to `point` [m], across z, y and x.
+    """Write slices of `sdf` through the cell nearest to `point` [m].
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is veiled and hatched.
     """

@@ -105,12 +105,10 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
 
 
 def skipped_case(group: str, why: str) -> Case:
-    """The only case of a skipped command."""
     return Case(name="skipped", group=group, kind=Kind.SKIPPED, sentence=why, text=why)
 
 
 def notes_of(verdict: Mapping[str, Any]) -> list[str]:
-    """A verdict's sentence and notes."""
     return [verdict["sentence"], *verdict["notes"]]
 
 
@@ -239,8 +237,7 @@ MORE = "\n... and {} more that do not fit here\n"
 def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> None:
     """Print annotations, and append a table to the step's summary, in GitHub Actions only.
 
-    stream: stdout or stderr. is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError if the
-    summary cannot be written.
+    is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError if the summary cannot be written.
     """
     if os.environ.get("GITHUB_ACTIONS") != "true":
         return
@@ -253,7 +250,7 @@ def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> N
 
 
 def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping[str, str]) -> list[str]:
-    """A workflow command for each of the most severe cases; its file is the recording, if in the repository."""
+    """A workflow command for each of the most severe cases."""
     level = "error" if is_fatal else "warning"
     lines = []
     # GitHub shows ten of a level for a step

@@ -2,7 +2,7 @@
 
 A scene holds splats by time, a moving arm, and the deciding event; trimesh brings the viewer's three.js. Packed, it
 is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64, and each array's type, first byte and count. Points
-are 16-bit integers within their box: 0.05 mm at three metres.
+are 16-bit integers within their box.
 """
 
 import base64
@@ -125,7 +125,7 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
 
 
 def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
-    """Centres (K, 3) [m] and edge [m] of at most `most` cubes on unknown space's border.
+    """Centres (K, 3) and edge [m] of at most `most` cubes on unknown space's border.
 
     Cubes of 2, 3, ... voxels a side are unknown by half or more.
     """

@@ -1,7 +1,6 @@
 """Pictures of renders against photos, slices of a distance field, and shared drawing.
 
-Matplotlib's Figure keeps no global state. Colours are by Okabe and Ito, or maps readable without red and green. Error
-bars end at fixed values, comparable by eye.
+Matplotlib's Figure keeps no global state. Colours are by Okabe and Ito, or maps readable without red and green.
 """
 
 from collections.abc import Iterator, Sequence
@@ -83,7 +82,7 @@ def field_slice_picture(
     """Write the slice of `sdf` across `axis` (0, 1, 2) nearest to `value` [m].
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
-    as the circles in which the plane cuts them. Raises NotEvaluableError outside the grid.
+    as circles. Raises NotEvaluableError outside the grid.
     """
     index = round((value - grid.origin[axis]) / grid.voxel)
     count = grid.channels["sdf"].shape[axis]
@@ -190,7 +189,6 @@ def draw_distance(
 
 
 def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArray[np.bool_], voxel: float) -> None:
-    """Veil and hatch never-seen cells."""
     if not never_seen.any():
         return
     veil = np.zeros((*never_seen.shape, 4))

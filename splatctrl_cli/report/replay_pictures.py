@@ -1,7 +1,4 @@
-"""Pictures of a replay: clearance and events, commands, and divergence.
-
-Long curves are drawn as their range per column: no extreme is lost, and drawing takes no longer.
-"""
+"""Pictures of a replay: clearance, events, commands, divergence; long curves as ranges."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -141,7 +138,7 @@ def commands_picture(
 ) -> None:
     """Write commanded velocities (T, J) [rad/s] with limits (J,), over strips of interventions.
 
-    These are rows that shaped the command, or steps not plainly taken. logged (T, J): drawn behind.
+    logged (T, J): drawn behind.
     """
     height = 0.78 * len(joints)
     with drawn_figure(height + 0.6 + _strip_height(interventions)) as figure:
@@ -255,7 +252,6 @@ def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) 
 
 
 def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float) -> None:
-    """Scale a joint's axis to its curves, with its limit."""
     height = max(1.25 * max(peak, beneath), SMALLEST)
     axes.set_ylim(-height, height)
     for side in (-limit, limit):
@@ -280,7 +276,6 @@ def _strip_height(events: Mapping[str, Intervals]) -> float:
 
 
 def _draw_strip(axes: Any, above: Any, events: Mapping[str, Intervals], seconds: Float64) -> None:
-    """Draw intervals by kind, or "no event"."""
     axes.set(xlabel="time [s]", xlim=span_of(seconds), ylim=(max(len(events), 1) - 0.4, -0.6))
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.set_yticks(range(len(events)), [f"{kind}  ({len(of)})" for kind, of in events.items()])

@@ -292,13 +292,13 @@ class Motion:
     waypoints: Float64
 
     def within(self, velocity_limit: Float64) -> "Motion":
-        """The same path, slowed as a whole where a joint would exceed its limit (J,) [rad/s]."""
+        """The same path, slowed where a joint would exceed its limit (J,) [rad/s]."""
         speeds = PEAK * np.abs(np.diff(self.waypoints, axis=0)) / np.diff(self.times)[:, None]
         slower = max(1.0, float(np.max(speeds / velocity_limit)))
         return replace(self, times=self.times + (slower - 1.0) * (self.times - self.times[0]))
 
     def at(self, time: float) -> tuple[Float64, Float64]:
-        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest before the first and after the last waypoint."""
+        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest outside the path."""
         time = float(np.clip(time, self.times[0], self.times[-1]))
         index = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2))
         span = self.times[index + 1] - self.times[index]

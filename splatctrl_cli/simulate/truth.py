@@ -53,7 +53,7 @@ def distance_to(primitives: Sequence[Primitive], points_world: Float64, stamp_ns
 
 
 def distance_along(primitives: Sequence[Primitive], points_world: Float64, stamps: Stamps) -> Float64:
-    """Signed distance (T, Q) [m] of points (T, Q, 3) to what is present at each of stamps (T,) [ns]."""
+    """Signed distance (T, Q) [m] of points (T, Q, 3) to solids present at stamps (T,)."""
     distance = np.full(points_world.shape[:2], np.inf)
     for primitive in primitives:
         present = np.flatnonzero([primitive.is_present(int(stamp)) for stamp in stamps])
@@ -65,7 +65,7 @@ def distance_along(primitives: Sequence[Primitive], points_world: Float64, stamp
 
 
 def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest present solid; inf and NaN without any."""
+    """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest present solid."""
     points = np.asarray(points_world, dtype=np.float64)
     distance = np.full(len(points), np.inf)
     surface = np.full((len(points), 3), np.nan)

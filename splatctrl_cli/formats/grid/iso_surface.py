@@ -22,7 +22,7 @@ FURTHEST = np.float32(1e9)  # [m] in the place of what is not known, where no cu
 
 
 def iso_surface(grid: DistanceGrid) -> Any:
-    """Extract the zero set of `sdf`, linear between cell centres; cubes with a NaN corner have none.
+    """Extract the zero set of `sdf`, linear between centres; NaN corners have none.
 
     A trimesh: vertices (V, 3) float64 [m], world; faces (F, 3) int64, anticlockwise from larger distances.
 

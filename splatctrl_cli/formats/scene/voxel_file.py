@@ -97,7 +97,7 @@ def read_states(path: Path) -> OccupancyGrid:
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
-    """Read the times at which voxels were last seen, and lost edges, alone: a replay does so five times a second.
+    """Read the times at which voxels were last seen, and lost edges, alone.
 
     None for an older file. Raises InputError for another one.
     """
@@ -169,7 +169,7 @@ def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 
 
 def _last_seen(stored: Array, header: Mapping[str, Any], num_steps: int) -> Array:
-    """`last_seen` in one byte or two; the largest numbers say why a voxel was never seen.
+    """`last_seen` in one byte or two; the largest numbers give reasons for never.
 
     Raises ValueError for another shape, or too many time steps.
     """

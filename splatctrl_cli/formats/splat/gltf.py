@@ -36,7 +36,7 @@ PROPERTIES = {
 
 
 def _write(path: Path, document: Mapping[str, Any], tables: Sequence[Array]) -> None:
-    """Write a document and its tables (N, 1 | 3 | 4) of float32, or of uint8 for 0 to 1."""
+    """Write a document and its tables (N, 1 | 3 | 4), float32 or uint8."""
     views, accessors, binary = list[dict[str, Any]](), list[dict[str, Any]](), bytearray()
     for table in tables:
         is_float, content = table.dtype == np.float32, np.ascontiguousarray(table).tobytes()

@@ -94,7 +94,7 @@ def float32_bound(gaussians: GaussianSet) -> Differences:
 
 
 def differences(a: GaussianSet, b: GaussianSet, centers: Float64 | None = None) -> Differences:
-    """Largest differences between Gaussians in the same order; centers: of `a`, more exact (N, 3) [m]."""
+    """Largest differences between Gaussians in the same order; centers (N, 3) [m]: of `a`."""
     return Differences(
         center=_largest((a.centers.astype(np.float64) if centers is None else centers) - b.centers),
         sigma=_largest(b.scales / a.scales.astype(np.float64) - 1.0),

@@ -197,7 +197,7 @@ def num_stretched(ply: PlyFile) -> int:
 
 
 def check_splats(where: str, splats: SplatSet) -> None:
-    """Raise InputError at the first splat that is not finite, has no radius, or an opacity outside [0, 1]."""
+    """Raise InputError at the first splat with invalid numbers, radius or opacity."""
     groups = {
         "center": splats.centers,
         "radius": splats.radii,
@@ -222,7 +222,7 @@ def format_of(path: Path) -> SplatFormat:
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
-    """Read any splat file and its comments; a SplatSet if all are round without view-dependent colour.
+    """Read any splat file and its comments; a SplatSet if all are round, of one colour each.
 
     Raises InputError if missing, truncated, unknown or invalid.
     """

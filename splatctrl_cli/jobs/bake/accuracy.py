@@ -50,7 +50,6 @@ class Accuracy:
     held_out_depth: HeldOutComparison | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for ``field.json``."""
         return {name: compared.as_dict() for name, compared in vars(self).items() if compared is not None}
 
 
@@ -158,7 +157,7 @@ def _held_out_cameras(
 ) -> tuple[str, ...]:
     """Return the named cameras, or all not known to have trained.
 
-    Raises UsageError for a camera that trained or does not exist, or if none is left.
+    Raises UsageError for another camera, or if none is left.
     """
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
     wrong = [name for name in names if name not in known]
@@ -240,7 +239,6 @@ def metrics_of(summary: Mapping[str, Any], accuracy: Accuracy) -> dict[str, floa
 
 
 def counts_of(metrics: Mapping[str, float | None]) -> dict[str, int]:
-    """Number of cells behind each metric."""
     of_bands = {name: f"{name.rpartition('.')[0]}.count" for name in metrics if not name.endswith(".count")}
     counted = {name: of_bands[name] if of_bands.get(name) in metrics else "num_cells" for name in metrics}
     return {name: int(metrics[count] or 0) for name, count in counted.items()}

@@ -342,7 +342,7 @@ def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence
 
 
 def _middle(job: _Job) -> list[float]:
-    """Point [m] where slices are drawn: the middle of the grid's splats without outliers, or of an empty grid."""
+    """Point [m] where slices are drawn: the middle of the grid's splats without outliers."""
     box, centers = job.baker.layout.box, job.obstacles.splats.centers
     inside = centers[box.contains(centers)]
     lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)

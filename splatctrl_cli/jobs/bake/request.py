@@ -31,10 +31,9 @@ class BakeRequest(RunOptions):
     """One bake of `scene` (reconstruct's folder, or a splat file) into the folder `out`.
 
     at: time after the scene's start [s], None for its end. labels: of the splats in the field. The grid covers `box`,
-    or the robot's reach, or the splats. channels: besides sdf, None for the usual ones or those of `update`.
-    References: `truth`, where cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out`
-    (`held_out_cameras`, by default all that did not train). update: a field baked from `previous_scene` (None:
-    `scene`), to bake only changes. resume: continue an interrupted bake.
+    or the robot's reach, or the splats. channels: besides sdf, None for the usual ones. References: `truth`, where
+    cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out` (`held_out_cameras`, by default all
+    that did not train). update: a field baked from `previous_scene` (None: `scene`), to bake only changes.
     """
 
     scene: Path
@@ -66,10 +65,9 @@ class BakeRequest(RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class BakeSource:
-    """Splats with the occupancy of the same moment; a bare splat file leaves the other fields None or empty.
+    """Splats with the occupancy of the same moment, None for a bare splat file.
 
-    unrepresented: occupied voxels without a splat. stamp_ns: time of the splats. workspace: the box outside which no
-    splats are kept. cameras: those that made the scene.
+    unrepresented: occupied voxels without a splat. workspace: the box outside which no splats are kept.
     """
 
     splats: SplatSet
@@ -214,7 +212,7 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
 
 
 def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
-    """Box of the grid: as given, else of the robot's reach, the previous field, or the splats with padding."""
+    """Box of the grid: given, else of the reach, the previous field, or the splats."""
     if request.box is not None:
         return request.box
     if request.urdf is not None:

@@ -214,9 +214,9 @@ def write_batch(
 
 
 def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: str) -> None:
-    """Raise UsageError if `out` is of a sweep or study (`what`) with other settings, or of another command.
+    """Raise UsageError if `out` is of another command, or of other settings (`what`).
 
-    Its file `name` has the settings; raises InputError if that is unreadable.
+    Its file `name` has the settings. Raises InputError if that is unreadable.
     """
     file = out / name
     if not file.is_file():

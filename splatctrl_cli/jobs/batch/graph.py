@@ -216,7 +216,7 @@ def text_of(value: Any) -> str:
 
 
 def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
-    """Write matrix choices for a node's name, with the job's name if two jobs share an option."""
+    """Write matrix choices for a node's name, with the job's name if ambiguous."""
     chosen = {
         f"{job.name}.{option}": (option.removeprefix("set."), values)
         for job in jobs

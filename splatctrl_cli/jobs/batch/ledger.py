@@ -72,7 +72,6 @@ class Run:
 
     @property
     def column(self) -> str:
-        """Job and variant."""
         return self.node.removeprefix(f"{self.recording}/")
 
     def document(self) -> dict[str, Any]:
@@ -130,7 +129,6 @@ class Ledger(AbstractContextManager["Ledger"]):
         return base
 
     def __exit__(self, *_: object) -> None:
-        """Release all claims."""
         if self._lock is not None:
             with suppress(sqlite3.Error):
                 self._base.execute("DELETE FROM claims WHERE owner = ?", (self._owner,))
@@ -158,7 +156,6 @@ class Ledger(AbstractContextManager["Ledger"]):
             self._base.execute("DELETE FROM claims WHERE node = ?", (run.node,))
 
     def release(self, node: str) -> None:
-        """Release a claimed node."""
         self._base.execute("DELETE FROM claims WHERE node = ? AND owner = ?", (node, self._owner))
 
     def last(self, node: str) -> Run | None:

@@ -29,7 +29,7 @@ PRINTED = "printed"  # stamp of a node that only prints
 
 @dataclass(kw_only=True)
 class Scheduler:
-    """A runner of nodes on an executor of `slots` places; hint: why a wait may be in vain."""
+    """A runner of nodes on `slots` places; hint: why a wait may be in vain."""
 
     ledger: Ledger
     entry: str
@@ -96,7 +96,7 @@ class Scheduler:
         return {node.name: self.runs[node.name] for node in nodes}
 
     def _without_running(self, node: Node, key: str, before: Run | None) -> Run | None:
-        """The run that stands: an earlier one, an unrecorded one, or skipped for a missing need."""
+        """The run that stands: earlier, unrecorded, or skipped for a missing need."""
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:
             cause = f"needs {lacking[0]}, which left nothing"
@@ -147,7 +147,6 @@ class Scheduler:
 
 
 def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
-    """Build a run from its end and output."""
     place = folder / node.name
     verdict = verdict_in(Path(f"{place}.json")) if end.exit_code is not None else {}
     code, outcome, label = end.exit_code, verdict.get("outcome", ""), verdict.get("label", "")
@@ -237,7 +236,7 @@ class Clock:
         return f"[{self._total - self._left.total()}/{self._total}]"
 
     def left(self) -> str:
-        """The time left in words: "over" a time if a job has no mean yet, empty if none has."""
+        """The time left in words; "over" a time if a job has no mean yet."""
         means = self._means | {job: sum(each) / len(each) for job, each in self._seen.items()}
         known = Counter({job: count for job, count in self._left.items() if count and job in means})
         if not known:

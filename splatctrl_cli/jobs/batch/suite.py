@@ -25,7 +25,7 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Limits of a job: wall time [s], memory [bytes] (0: none), and retries after transient errors."""
+    """Limits of a job: wall time [s], memory [bytes] (0: none), and retries."""
 
     timeout: float = 0.0
     memory: int = 0

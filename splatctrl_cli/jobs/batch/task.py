@@ -1,7 +1,7 @@
 """One node's run in a forked child under limits, with log, result and end.
 
-A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time in one
-thread, and reads each as a line of JSON from stdin. When stdin ends, so does the run.
+A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time, each a
+line of JSON from stdin, and ends with stdin.
 """
 
 import contextlib
@@ -128,7 +128,7 @@ def read_end(path: Path, key: str) -> End | None:
 
 
 def stamp_of(out: Path) -> str:
-    """Size and time of an output's run.json or capture.json, or of the file; empty if there is no output."""
+    """Size and time of an output's run.json, capture.json or file; empty without output."""
     for place in (out / "run.json", out / "capture.json", out):
         with contextlib.suppress(OSError):
             found = place.stat()

@@ -279,7 +279,7 @@ def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
 
 
 def _judged(scale: Scale, before: float, after: float | None) -> tuple[Change, float]:
-    """Change of a figure, and by how many tolerances it is worse; a lost value is worse."""
+    """Change of a figure, and by how many tolerances it is worse."""
     if after is None:
         return (Change.OTHER, 0.0) if scale.better is Better.NEITHER else (Change.WORSE, math.inf)
     harm, allowed = scale.harm(before, after), scale.tolerance(before)
@@ -375,7 +375,7 @@ def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
 
 
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
-    """Differing settings, versions and inputs, each before and after in the first run where it differs."""
+    """Differing settings, versions and inputs, before and after in the first such run."""
     found: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
         for name in [name for name in old.settings if name in new.settings]:

@@ -251,7 +251,7 @@ class WorstState:
 
 
 def worst_state(folder: Path | None, metric: str) -> WorstState | None:
-    """Worst state of a replay by a metric; None if its states do not show it."""
+    """Worst state of a replay by a metric; None if no state shows it."""
     where = shown().get(metric)
     if where is None or folder is None or not (folder / "steps.csv").is_file():
         return None

@@ -47,7 +47,7 @@ Splats = SplatSet | GaussianSet
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest:
-    """One export of a scene folder or splat file; the suffix of `out` is the format.
+    """One export of a scene or splat file; the suffix of `out` is the format.
 
     out: None for a PLY next to the scene. labels: None for all. layout: of a PLY, "short" or "full", None for the
     lossless one. isotropic: make anisotropic Gaussians round.
@@ -66,9 +66,9 @@ class ExportResult:
     """The written file and its differences from the source.
 
     origin: subtracted from every centre [m], in words. not_kept: attributes the format lacks. num_outside: Gaussians
-    with sigma or colour clamped to its range. allowed: the format's rounding. Over the pixels of all views:
+    with sigma or colour clamped to its range. allowed: the format's rounding. Over all views:
     largest_pixel_difference in colour, opacity, or depth over scene size; psnr [dB], None if equal; covered_share,
-    where anything shows. isotropic_psnr [dB]: of the rounded splats against the source.
+    where anything shows. isotropic_psnr [dB]: of the rounded splats.
     """
 
     file: Path

@@ -45,12 +45,12 @@ _DECIMALS = 7  # of a length [m]: finer than float32
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Answers at Q points, world; None if unavailable, NaN or -1 where a point has none.
+    """Answers at Q points, world; None if unavailable, NaN or -1 without one.
 
     in_box (Q,): in the source's box. distance (Q,) [m], gradient (Q, 3). bound (Q,) [m]: lower bound of the exact
     distance to the splats. probability (Q,) of collision. label (Q,) `Label` and splat (Q,), file index, of the
-    nearest sphere. observed (Q,) `VoxelState`. surface (Q, 3) [m]: end of sphere marching, where the field reads
-    rest (Q,) [m].
+    nearest sphere. observed (Q,) `VoxelState`. surface (Q, 3) [m]: end of sphere marching, where the field reads rest
+    (Q,) [m].
     """
 
     in_box: Bool | None = None
@@ -214,7 +214,7 @@ class QueryRequest(RunOptions):
 
     points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: source of the
     field, for what the grid lacks. at: time after the scene's start [s], None for its end. labels: of the splats that
-    count; a field has its own. device: for a scene's distances.
+    count. device: for a scene's distances.
     """
 
     source: Path
@@ -229,8 +229,8 @@ class QueryRequest(RunOptions):
 class QueryResult:
     """A query's figures; kind: scene, field, or field and scene.
 
-    metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision, at a distance of at
-    most 0; num_never_seen; min_distance, mean_distance and min_bound [m]. None if unknown.
+    metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision; num_never_seen;
+    min_distance, mean_distance and min_bound [m]. None if unknown.
     """
 
     out: Path | None

@@ -36,7 +36,6 @@ class Corrections:
 
     @property
     def options(self) -> str:
-        """The corrections as command-line options."""
         return " ".join(
             n for n, given in (("--refine-poses", self.poses), ("--refine-exposure", self.exposure)) if given
         )

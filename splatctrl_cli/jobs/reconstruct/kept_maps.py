@@ -1,7 +1,4 @@
-"""Time steps that leave a map: those due, and those with a new obstacle.
-
-An obstacle present only between two maps would otherwise escape a replay.
-"""
+"""Time steps that leave a map: due ones, and those with a new obstacle."""
 
 from pathlib import Path
 
@@ -58,7 +55,7 @@ class KeptMaps:
 
 
 def _num_new(spheres: SplatSet, field: SphereField | None, grid: OccupancyGrid) -> int:
-    """Spheres that stand out of a map's field, in its free voxels; without obstacles it has no field."""
+    """Spheres that stand out of a map's field, in its free voxels."""
     centers = spheres.centers.astype(np.float64)
     cells = np.floor((centers - grid.origin) / grid.voxel + 0.5).astype(np.int64)
     is_inside = np.all((cells >= 0) & (cells < grid.log_odds.shape), axis=1)

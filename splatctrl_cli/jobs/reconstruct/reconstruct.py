@@ -1,4 +1,4 @@
-"""A reconstruction: recording to splats, occupancy, audit and snapshots; what it learns of a robot's own surface."""
+"""A reconstruction: recording to splats, occupancy, audit, snapshots, and a robot's own surface."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing

@@ -49,10 +49,10 @@ def training_cameras(source: RecordSource) -> list[str]:
 class ReconstructRequest(RunOptions):
     """One reconstruction of `source` into the folder `out`.
 
-    urdf, spheres: the robot, segmented from the splats; its reach is the workspace without `box`. By default it is
-    the robot of the log `recording`, if any. points: a coloured cloud to start from instead of depth. declare: a TOML
-    of carried objects. corrections: of a still scene's views. resume: continue an interrupted run. options: what else
-    decides the bytes, by option name; a resumed run must have the same.
+    urdf, spheres: the robot, segmented from the splats, by default that of the log `recording`; its reach is the
+    workspace without `box`. points: a coloured cloud to start from instead of depth. declare: a TOML of carried
+    objects. corrections: of a still scene's views. options: what else decides the bytes, by option name; a resumed
+    run must have the same.
     """
 
     source: RecordSource
@@ -128,7 +128,6 @@ class Reconstruction:
         return self._fitter
 
     def run(self, console: Progress) -> None:
-        """Process the remaining log."""
         if self._fitter is not None:
             self.device.give(self.fitter, [view.frame for view in self.fitter.window.newest], console)
         self._step_through(console)
@@ -169,7 +168,7 @@ class Reconstruction:
             self._save_if_due()
 
     def take(self, step: TimeStep, console: Progress) -> AuditRow | None:
-        """Process the next time step, with a snapshot if due; None while the workspace is unknown."""
+        """Process the next time step; None while the workspace is unknown."""
         index, self.num_read = self.num_read, self.num_read + 1
         needs_depth = self.request.box is None and self.robot is None and self.cloud is None  # for the workspace
         if self._fitter is None and not step.has_depth and needs_depth:
@@ -223,7 +222,7 @@ class Reconstruction:
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Enlarge a default budget that the first step exceeded next to a robot; True if so.
+        """Enlarge a default budget that the first step exceeded next to a robot.
 
         Without a splat, a whole voxel counts as occupied.
         """
@@ -243,7 +242,6 @@ class Reconstruction:
         self.is_refined = True
 
     def finish(self) -> None:
-        """Write the final map."""
         fitter, stamp_ns = self.fitter, self.rows[-1].stamp_ns
         self.writer.finish(stamp_ns, fitter.splats(), fitter.known_voxels(), fitter.shell_splats())
         self._save(is_last=True)
@@ -340,7 +338,6 @@ class Reconstruction:
         restore_fitter(self.fitter, checkpoint.state)
 
     def time_steps(self) -> Iterator[TimeStep]:
-        """Time steps of the source, from its start."""
         records, has_clock = self.source.records(), self.source.has_clock
         steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see, repeats=self.repeats)
         return steps if self.cloud is None else (step.without_depth() for step in steps)

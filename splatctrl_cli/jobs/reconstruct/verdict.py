@@ -67,7 +67,6 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
 
 
 def counts_of(made: Reconstructed) -> dict[str, int]:
-    """Time steps or robot pixels behind each of `GATED`."""
     links = made.metrics["self_mask"].values()
     seen = [row["num_pixels"] for row in links]
     return dict.fromkeys(GATED, len(made.rows)) | {
@@ -159,7 +158,6 @@ def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
 
 
 def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
-    """Note on a displaced camera, corrected or not."""
     sentence = f"{camera} sees the robot {row['distance_mm']:.1f} mm from where its joints put it"
     if is_corrected(row):
         sentence += f"; its pose is corrected to within {row['left_mm']:.1f} mm"

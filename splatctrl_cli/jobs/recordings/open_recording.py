@@ -146,7 +146,7 @@ def check_pose_jumps(source: FrameSource, limit: float) -> None:
 
 
 class CameraAgreement:
-    """Agreement of cameras; disagreement [m]: how far apart a pair with enough shared view sees surfaces.
+    """Agreement of cameras; disagreement [m]: how far apart a pair sees surfaces.
 
     is_allowed: warn instead of refusing. is_still: views of a step show the same scene. guess: a guessed unit, in
     words.

@@ -159,8 +159,8 @@ def made_from_mismatches(
 ) -> Iterator[Mismatch]:
     """Mismatches of a scene or field, by its `SceneFolder.made_from`, with a log and robot.
 
-    Compares digests of files and calibration, each training camera's first frame, and the segmented robot's joints
-    and links; also finds corrected depth.
+    Compares digests of files and calibration, training cameras' first frames, and the segmented robot's joints and
+    links; also finds corrected depth.
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")
@@ -226,7 +226,7 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
 
 
 def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
-    """Mismatch of states at stamps (T,) [ns], T > 0, and a scene's span; None if they (nearly) overlap."""
+    """Mismatch of stamps (T,) [ns] and a scene's span; None if they (nearly) overlap."""
     first, last = int(states_ns[0]), int(states_ns[-1])
     apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
     if apart_ns <= RECORDINGS_APART_NS:

@@ -60,15 +60,14 @@ def mm(metres: float) -> str:
 
 
 def nearby(judged: Judged, values: Float64) -> tuple[float, float, int] | None:
-    """Largest of values (T,) about the arm, its time [s], and their count; None without any."""
+    """Largest of values (T,) about the arm, its time [s], and their count."""
     num = int(np.isfinite(values).sum())
     return (float(np.nanmax(values)), seconds_at(judged, int(np.nanargmax(values))), num) if num else None
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """The depth about the arm is at most `--max-map-age` old and not newer than the state it judges. After half a
-    second without any, the next depth shows nothing where the arm was. Frames without depth do not count; a baked
-    field has no times (a note).
+    """The depth about the arm is at most `--max-map-age` old and not newer than the state. After half a second
+    without any, the next depth shows nothing where the arm was. A baked field has no times (a note).
     """
     first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
     for found in judged.replay.unwatched:
@@ -115,7 +114,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
 
 
 def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
-    """First words and remedy if the evidence is too old because the log had ended; else empty."""
+    """First words and remedy if the evidence is old because the log ended."""
     lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""
@@ -125,8 +124,7 @@ def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
 
 def map_age(judged: Judged) -> Iterator[Reason]:
     """The map is at most `--max-map-age` old (a baked field: from its moment). Newer depth shows nothing within the
-    margin: depth of a state's own time that a late map (`--latency`) did not contain, or the next after the last
-    state.
+    margin: of a state's own time that a late map (`--latency`) did not contain, or the next after the last state.
     """
     yield from _overtaken(judged)
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age

@@ -182,9 +182,9 @@ class Misses:
 def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
     """Largest miss of each held-out frame set near the motion, without the robot.
 
-    Near is within `reach` [m]; sets count within the audited time. One at a time is in memory. Each is compared with
-    the map that judged the states just before it, when that map is oldest. The next map contains other cameras of
-    the same moment, so it misses less than the one that judges.
+    Near is within `reach` [m]; sets count within the audited time, one in memory at a time. Each is compared with the
+    map that judged the states just before it, when that map is oldest: the next one contains other cameras of the
+    same moment, and misses less.
     """
     swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
@@ -231,7 +231,7 @@ def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
 
 
 def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
-    """Largest distance [m] of points (Q, 3) to the map, and its point: (4,); NaN without points."""
+    """Largest distance [m] of points (Q, 3) to the map, and its point: (4,)."""
     if not len(points):
         return np.full(4, np.nan)
     values = distance(points)
@@ -240,7 +240,7 @@ def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
 
 
 class Swept:
-    """Space within `reach` [m] of an arm's moving spheres, or up to the diagonal of a SPHERE_CELL farther."""
+    """Space within `reach` [m] of an arm's moving spheres, plus a cell's diagonal at most."""
 
     def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
         """Enclose cells (K, 3), whole numbers of SPHERE_CELL, by radii (K,) [m], the largest in each."""
@@ -272,7 +272,7 @@ class Swept:
 
 
 class TrueSurfaces:
-    """True surface points (T, 3) [m] nearest to each state; `seen` (T,): by a camera by then."""
+    """True surface points (T, 3) [m] nearest to each state; `seen` (T,) by then."""
 
     def __init__(self, points: Rows, stamp_ns: Stamps, inputs: ReplayInputs) -> None:
         self._points, self._stamp_ns = points, stamp_ns

@@ -38,7 +38,7 @@ from splatctrl_cli.voxels import EvidenceClass
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A row of the evidence table; column: of `NEAR_COLUMNS`, for `parts` the least of their classes.
+    """A row of the evidence table; column: of `NEAR_COLUMNS`, for `parts` the least.
 
     most: largest share allowed; least [m]: distance to exceed (0: the margin). For the documentation, asked: the
     quantity; why: the reason.
@@ -146,9 +146,8 @@ PROOF = Limit(
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """Every point within the margin of the arm has one class of evidence, and each class keeps its limit (the table
-    below); at most `--max-unknown` of the sphere centres are in unobserved space. A baked field needs its channel
-    `observed`.
+    """Every class of evidence within the margin of the arm keeps its limit (listed below); at most `--max-unknown`
+    of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
     for limit in LIMITS:
         yield from _within(judged, limit)
@@ -290,7 +289,7 @@ def displaced(judged: Judged) -> tuple[str, float] | None:
 
 
 def calibration(judged: Judged) -> Iterator[Reason]:
-    """Each camera sees the robot, and all cameras together each link, within 5 mm of where its joints put it."""
+    """Each camera sees the robot, and all together each link, within 5 mm of where its joints put it."""
     figures = judged.inputs.scene.figures()
     if (camera := displaced(judged)) is not None:
         yield lacking(
@@ -328,8 +327,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
-    """The map's voxels are at most 25 mm, since an obstacle without a splat may be that large. The robot's mask
-    reaches at most the margin, since an obstacle touching the robot may go unseen that far.
+    """The map's voxels are at most 25 mm, the size of an obstacle without a splat. The robot's mask reaches at most
+    the margin: an obstacle touching the robot may go unseen that far.
     """
     figures, margin = judged.inputs.scene.figures(), judged.replay.margin
     voxel, by_link = figures.get("voxel"), figures.get("self_mask")

@@ -147,7 +147,6 @@ def write_replay(
 
 
 def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mapping[str, str]) -> dict[str, Any]:
-    """Verdict, reasons, metrics and their explanations for summary.json."""
     words = {
         "mode": replay.mode,
         "outcome": str(replay.closed_loop.outcome) if replay.closed_loop else f"{replay.mode}: every state",

@@ -19,7 +19,7 @@ ClearanceIn = Callable[[int, Stamps, Float64], Float64]
 
 @dataclass(frozen=True, kw_only=True)
 class LaterDepth:
-    """A state that kept the margin in the map known then, but not by later depth.
+    """A state that kept the margin in the map, but not by later depth.
 
     stamp_ns: of the state. clearance [m]: by the depth of `depth_ns`. since_ns: start of a stretch without depth
     about the arm that this depth ends, 0 without.
@@ -32,7 +32,7 @@ class LaterDepth:
 
 
 class NewerDepth:
-    """Comparison of states with the depth of their own time if maps are late, and of the last with the next depth."""
+    """Comparison of states with depth of their time, and of the last with later."""
 
     def __init__(self, scene: KnownScene, margin: float, clearance_in: ClearanceIn) -> None:
         self._scene, self._margin, self._clearance_in = scene, margin, clearance_in

@@ -296,7 +296,7 @@ def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[Expected
 
 
 def recorded_postures(states: StateColumns) -> Float64:
-    """Postures (R, J) evenly over the log: at least SELF_POSTURES and below twice as many, or all."""
+    """Postures (R, J) evenly over the log: SELF_POSTURES to twice as many, or all."""
     return states.position[np.arange(0, len(states), max(len(states) // SELF_POSTURES, 1))]
 
 

@@ -60,7 +60,7 @@ class KnownScene:
     stamps_ns: of consecutive scenes, each known `latency_ns` after its stamp; empty for one scene for all times.
     `advance` to a stamp makes the scenes up to it; call `finish` after the replay. box: of a grid's cell centres.
     moment_ns: the time of a baked field. seen_at: when space was last seen, as known at a stamp; without
-    has_seen_times only if it ever was. figures: of the reconstruction, complete after the replay.
+    has_seen_times only if it ever was.
     """
 
     at: Callable[[int], KnownFields]
@@ -79,7 +79,7 @@ class KnownScene:
     figures: Callable[[], Mapping[str, Any]] = dict
 
     def age_s(self, stamp_ns: int) -> float:
-        """Age [s] of the scene in use; for a field, time from its moment; NaN without times."""
+        """Age [s] of the scene in use (a field: from its moment); NaN without times."""
         if self.moment_ns is not None:
             return abs(stamp_ns - self.moment_ns) * 1e-9
         index = self._index_at(stamp_ns)
@@ -114,7 +114,7 @@ class KnownScene:
 def fields_at(
     stamps_ns: Sequence[int], latency_ns: int, key_of: Callable[[int], Key], fields_of: Callable[[Key], KnownFields]
 ) -> Callable[[int], KnownFields]:
-    """Return a lookup of the newest scene known at a stamp; it keeps the last HELD.
+    """Return a lookup of the newest scene at a stamp; it keeps the last HELD.
 
     The lookup raises NotEvaluableError before the first scene is known.
     """
@@ -132,7 +132,7 @@ def fields_at(
 
 
 def from_grid(path: Path) -> KnownScene:
-    """Read a baked grid as one scene for all times; `path` is its folder or ``field.npz``."""
+    """Read a baked grid (folder or ``field.npz``) as one scene for all times."""
     file = path / "field.npz" if path.is_dir() else path
     grid = read_npz(Parts.beside(file).checked(file))
     barrier = GridField(grid)
@@ -165,7 +165,7 @@ def from_grid(path: Path) -> KnownScene:
 
 
 def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0) -> KnownScene:
-    """Read a reconstruction; each stamp uses the newest snapshot at least as old as the latency.
+    """Read a reconstruction; each stamp uses the newest snapshot as old as the latency.
 
     Known space is where a camera looked, or the robot ever was in the log.
     """
@@ -209,7 +209,6 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
 
 
 def seen_of(voxels: SeenVoxels) -> Seen:
-    """Convert seen voxels for `NearSpace`."""
     edges = np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64)
     return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel)
 

@@ -28,7 +28,6 @@ from splatctrl_cli.robot.model import RobotModel
 
 
 def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
-    """Run the replay of --mode."""
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
     mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[request.mode]

@@ -136,9 +136,9 @@ def _at_worst(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links overlap. No moving link comes within the margin of a fixed one that carries no joint, such as a
-    table of the URDF. Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their
-    largest gap) unless the recording was. Measured by collision surfaces, or by spheres if these cannot be read.
+    """No two links overlap. No moving link comes within the margin of a fixed one without joints, such as a table.
+    Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap) unless
+    the recording was. By collision surfaces, or by spheres if these cannot be read.
     """
     least = lowest(judged.replay.audit.figures["self_clearance"])
     events = events_of(judged.replay, EventKind.SELF_COLLISION)
@@ -183,7 +183,7 @@ def _beside_fixture(judged: Judged) -> Reason | None:
 
 
 def _brought_together(judged: Judged) -> Reason | None:
-    """The worst pair that our controller brought below its lowered margin and nearer than the recording had it."""
+    """The worst pair that our controller brought below its margin and the recording's distance."""
     inputs, replay = judged.inputs, judged.replay
     if replay.outside is not None:
         return None
@@ -210,9 +210,8 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
-    """No new obstacle comes within the margin of a fixed link's surface in two scenes in a row. New is what lies 1 cm
-    or more (at its mount 3 cm) from all that stood there when a camera first looked. What stands there from the start
-    is a note.
+    """No new obstacle comes within the margin of a fixed link's surface in two scenes in a row. New is 1 cm or more
+    (at its mount 3 cm) from all that stood there when a camera first looked; the old is a note.
     """
     broken = {
         name: (first, least)
@@ -257,9 +256,7 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
-    """Velocities of the motion, and those that a user's controller commands, exceed the URDF's limits by at most one
-    percent.
-    """
+    """Velocities of the motion, and a user's commands, exceed the URDF's limits by at most one percent."""
     too_fast = commanded(judged)
     yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST) if too_fast is None else (too_fast,)
 
@@ -325,7 +322,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
-    """A lower bound by the spheres' lever arms keeps the margin; intervals where it is too low are halved."""
+    """A lower bound by the spheres' lever arms keeps the margin; intervals with too low a bound are halved."""
     model, columns = judged.replay.model, judged.replay.between
     _, surface, between = _of_body(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:

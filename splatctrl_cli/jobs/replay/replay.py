@@ -51,7 +51,7 @@ from splatctrl_cli.simulate.truth import load_truth
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayResult:
-    """A replay's result; notes: sentences on robot, pictures and log; is_damaged: part of the log was lost."""
+    """A replay's result; notes: on robot, pictures and log; is_damaged: log parts were lost."""
 
     __repr__ = brief
 

@@ -39,11 +39,10 @@ class ReplayRequest(RobotOptions, RunOptions):
 
     log: read by `options`. urdf: None for the robot of the log. The scene is `scene` (a reconstruction), `field` (a
     baked grid) or `lockstep` (reconstruct meanwhile, on `device`). Times are in seconds; start_time may be
-    "first-map".
-    evidence: a held-out camera, or k for each k-th frame set, to bound the map's error. require_evidence,
-    require_proof: no pass without evidence, or with space about the arm assumed free. unseen: `JUDGE` or `OCCUPIED`.
-    controller: a user's class ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the
-    verdict sets no exit code, except by `require`.
+    "first-map". evidence: a held-out camera, or k for each k-th frame set. require_evidence, require_proof: no pass
+    without evidence, or with space about the arm assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's
+    class ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the verdict sets no exit
+    code, except by `require`.
     """
 
     log: Path
@@ -114,8 +113,7 @@ class MapError:
     """The map's error by held-out frame sets; `bound` is None if they are too few.
 
     num_sets: within the judged time, num_seen of them with points near the motion. time_s (since the first judged
-    state), place (3,) [m]: where the miss equals the bound. A negative bound, of a map fatter than its surfaces,
-    becomes 0.
+    state), place (3,) [m]: where the miss equals the bound, which is at least 0.
     """
 
     source: str
@@ -132,10 +130,9 @@ class Replay:
     """A finished replay of T states: audit, trace of its mode, and truth if known.
 
     num_before_scene: requested states before the first scene, left out, over lead_in_s [s]. start_time_s: of the
-    first state in the log. between, near, strain, statics, closest: as in `ReplayRecord`. unwatched, overtaken: from
-    later depth. obstacles (T,): nearest to the nearest sphere, in words. map_age_s (T,): of the scene in use.
-    divergence: of a closed loop from the log: joints [rad], position [m], rotation [rad]. outside: a user's
-    controller.
+    first state. between, near, strain, statics, closest: as in `ReplayRecord`. unwatched, overtaken: from later
+    depth. obstacles (T,): nearest to the nearest sphere, in words. map_age_s (T,): of the scene in use. divergence:
+    of a closed loop from the log: joints [rad], position [m], rotation [rad]. outside: a user's controller.
     """
 
     model: RobotModel

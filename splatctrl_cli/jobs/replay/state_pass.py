@@ -197,7 +197,7 @@ class ReplayRecord:
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
         """Use gaps of link surfaces where known, and record pairs below their margin.
 
-        Spheres that stick out may overlap without contact, and spheres that leave surface uncovered may miss one.
+        Spheres may overlap without contact, or miss a contact.
         """
         surfaces, gaps = self._surfaces, np.empty((len(part.position), 0))
         if surfaces is not None:

@@ -33,7 +33,6 @@ class StampColumn:
         self._parts: list[Stamps] = []
 
     def append(self, stamp_ns: Stamps) -> None:
-        """Add the next (T,)."""
         self._parts.append(stamp_ns)
 
     @property
@@ -97,7 +96,6 @@ class Figures:
         self._files: dict[str, RowFile] = {}
 
     def append(self, **columns: Float64) -> None:
-        """Add the next (T,) of each."""
         for name, values in columns.items():
             self._files.setdefault(name, RowFile(values.shape[1:])).append(values)
 

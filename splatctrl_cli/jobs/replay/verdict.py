@@ -28,7 +28,6 @@ CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
 def replay_verdict(judged: Judged) -> Verdict:
-    """Judge a replay by every criterion and each ``--require``."""
     replay, request = judged.replay, judged.request
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     if displaced(judged) is not None:

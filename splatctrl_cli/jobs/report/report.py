@@ -38,7 +38,7 @@ MOST_PICTURES, PICTURE_WIDTH = 24, 560  # number and width [px] for recordings a
 
 @dataclass(frozen=True, kw_only=True)
 class ViewRequest(FolderRequest):
-    """A page on a run, scene or field folder, grid or splat file; out: None for PATH.html."""
+    """A page on a run, scene, field, grid or splat file; out: None for PATH.html."""
 
 
 @dataclass(frozen=True, kw_only=True)

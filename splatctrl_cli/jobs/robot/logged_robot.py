@@ -55,7 +55,7 @@ def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
 
 
 def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:
-    """Robot of --urdf, with a warning if the logs describe another; by default theirs, None without one.
+    """Robot of --urdf, else of the logs, with a warning if they differ.
 
     Raises InputError.
     """
@@ -98,7 +98,7 @@ def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
 
 
 def differs(file: UrdfFile, paths: Sequence[Path]) -> str:
-    """Describe how a model differs from all in the logs; empty if it is like one of them, or there is none."""
+    """Describe how a model differs from all in the logs, or empty."""
     words = []
     for path, description in logged_descriptions(paths):
         try:

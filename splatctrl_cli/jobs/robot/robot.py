@@ -216,7 +216,6 @@ def describe_robot(request: RobotRequest) -> RobotResult:
 
 
 def coverage_summary(report: CoverageReport) -> str:
-    """Sentence on uncovered surface and protrusion."""
     share = f"{100 * report.uncovered_share:.1f} % of the surface outside"
     out = f"sticking out by at most {1e3 * report.max_protrusion:.1f} mm"
     if report.worst is None or report.max_deficit is None:

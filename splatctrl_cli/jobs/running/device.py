@@ -114,7 +114,7 @@ class FitDevice:
         self.history: list[dict[str, Any]] = []
 
     def give(self, fitter: SceneFitter, frames: Sequence[RgbdFrame], progress: Progress) -> None:
-        """Move a fitter to the device; `frames` are its first time step, keyframes add to them."""
+        """Move a fitter to the device; `frames` are its first time step."""
         num_splats, window = fitter.config.max_splats, fitter.config.window
         sizes = [(frame.intrinsics.height, frame.intrinsics.width) for frame in frames]
         sizes += [max(sizes)] * window
@@ -142,7 +142,6 @@ class FitDevice:
         return automatic(progress, too_little, name=last or CUDA, needed=bytes_needed(num_splats, sizes))
 
     def close(self) -> None:
-        """Free the card's memory."""
         if self._fit is not None:
             with suppress(DeviceError):  # its failure was reported already
                 self._fit.close()

@@ -9,9 +9,7 @@ class Progress(Protocol):
 
     is_quiet: bool
 
-    def log(self, line: str) -> None:
-        """Show one line."""
-        ...
+    def log(self, line: str) -> None: ...
 
 
 class Silent:
@@ -27,7 +25,7 @@ SILENT = Silent()
 
 
 class Wait:
-    """A wait of many steps, announced, then reported with the time left; total: None if unknown."""
+    """A wait of `total` steps (None: unknown), announced and reported with the time left."""
 
     def __init__(self, progress: Progress, what: str, unit: str, total: int | None = None) -> None:
         self._progress, self._what, self._unit, self._total = progress, what, unit, total

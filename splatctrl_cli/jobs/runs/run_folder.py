@@ -100,7 +100,6 @@ class RunFolder:
             raise InputError(f"{file}: is not JSON: {error}") from None
 
     def pictures(self) -> list[Path]:
-        """PNG files of the run, by name."""
         found = [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
         return [self.parts.checked(path) for path in found if self.parts.has(path)]
 
@@ -116,7 +115,7 @@ class RunFolder:
             raise InputError(f"{file}: expected the columns of a replay: {error}") from None
 
     def place_of(self, given: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
-        """Find a path of the command line: as typed, below a folder above the run, or below `roots`.
+        """Find a path of the command line: as typed, above the run, or below `roots`.
 
         None if missing, or of another `digest`.
         """
@@ -127,7 +126,7 @@ class RunFolder:
 
 @dataclass(frozen=True, kw_only=True)
 class FolderRequest:
-    """A file `out` made from `path`, None to name it alike; roots: folders with a replay's scene and robot."""
+    """A file `out` made from `path`; roots: folders with a replay's scene and robot."""
 
     path: Path
     out: Path | None = None

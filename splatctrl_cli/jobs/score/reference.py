@@ -49,7 +49,6 @@ class Reference:
 
     @property
     def scores_training(self) -> bool:
-        """True if the protocol scores training views."""
         return self.protocol is not None and self.protocol.scores_training
 
 
@@ -112,7 +111,7 @@ def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference
 
 
 def missing_views(source: DtuSource, protocol: ScoreProtocol | None) -> Iterator[str]:
-    """Sentences on a scan's views that are missing, if that changes the scored ones, or lack depth."""
+    """Sentences on a scan's missing views that change the score, or lack depth."""
     numbers = sorted({*source.split.training, *source.split.scored, *source.split.left_out})
     missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
     if missing and protocol is not None and protocol.every:

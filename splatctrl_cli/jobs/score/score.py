@@ -82,7 +82,6 @@ class ScoreResult:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Number of views behind each figure."""
         return self.verdict.counts
 
     @property

@@ -175,7 +175,7 @@ def rendered_with_shell(
     background: Color,
     threads: int,
 ) -> tuple[Rendering, Float32]:
-    """Render splats at a frame's pose before a background; their depth (H, W) [m] is without the shell."""
+    """Render splats before a background; their depth (H, W) [m] is without the shell."""
     camera = frame.intrinsics, frame.T_world_camera
     rendering = rendered(splats, *camera, threads)
     depth = rendering.normalised_depth()
@@ -187,14 +187,12 @@ def rendered_with_shell(
 def rendered(
     splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int = 0
 ) -> Rendering:
-    """Render splats of either kind."""
     if isinstance(splats, GaussianSet):
         return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
     return render(splats, intrinsics, T_world_camera, threads=threads)
 
 
 def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:
-    """Final splats, of either kind."""
     return scene.gaussians() if scene.is_anisotropic else scene.splats()
 
 
@@ -254,7 +252,7 @@ def _reference(settings: CloudSettings) -> Float64:
 
 
 def _surface(scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int, spacing: float) -> Float64:
-    """World points (P, 3) [m] of the final splats' depth at `frames`, without the robot, `spacing` [m] apart."""
+    """World points (P, 3) [m] of the final depth at `frames`, without robot, `spacing` apart."""
     splats = final_splats(scene)
     splats = splats.select(splats.labels != Label.ROBOT)
     shown = (rendered(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)

@@ -1,7 +1,4 @@
-"""A simulation: a log of an arm at a table, with its truth.
-
-Another arm gets its files, its spheres, and a motion that moves its tip like ours.
-"""
+"""A simulation: a log of an arm at a table, with its truth."""
 
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -67,7 +64,6 @@ class SimulateRequest:
 
     @property
     def config(self) -> dict[str, Any]:
-        """Options for run.json."""
         own = {"is_slim": self.is_slim, "unmodelled": self.unmodelled}
         return {**vars(self.options), **{name: value for name, value in own.items() if value}}
 
@@ -224,9 +220,9 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
     """Adapt the scene's motion to another arm, whose tip follows the simulated arm's hand.
 
     The tip is the URDF's last link, its z pointing away from the arm. It goes as far as it reaches, turned any way
-    about z. The shortest clear way through the postures found is taken, or the least slowed one if none keeps the
-    velocity limits. An arm that fits the original postures keeps the original motion. Raises InputError for an
-    unreachable waypoint, or if every way collides.
+    about z, by the shortest clear way through the postures found, or the least slowed one if none keeps the velocity
+    limits. An arm that fits the original postures keeps the original motion. Raises InputError for an unreachable
+    waypoint, or if every way collides.
     """
     times, ours = scene.motion.times, scene.motion.waypoints
     if ours.shape[1] == model.num_joints and all(
@@ -327,7 +323,7 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """Cost of a leg: length [rad], more if close to anything, most if slowed; infinite in collision.
+    """Cost of a leg: length [rad], more if close or slowed; infinite in collision.
 
     A slowed leg meets objects at other times: it must avoid all, and is refused if one moves.
     """

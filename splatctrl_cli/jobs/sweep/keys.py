@@ -1,4 +1,4 @@
-"""Keys that a sweep may vary, and the jobs of a run with values of them."""
+"""Keys that a sweep may vary, and a run's jobs with their values."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -99,7 +99,6 @@ class Chain:
     keys: Mapping[str, Key]
 
     def jobs(self, values: Mapping[str, float]) -> tuple[Job, ...]:
-        """Batch jobs of the run with values of all keys."""
         return tuple(self._job(stage, values) for stage in self.stages)
 
     def _job(self, stage: Stage, values: Mapping[str, float]) -> Job:

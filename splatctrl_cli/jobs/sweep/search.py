@@ -101,7 +101,7 @@ def find_least(
     *,
     tolerance: float,
 ) -> LeastChange | None:
-    """Find the shortest joint change that flips the outcome of (0, ..., 0); None if no direction tried has one.
+    """Find the shortest joint change that flips the outcome of (0, ..., 0), or None.
 
     Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
     SWEEP_DIRECTIONS of Halton's sequence, then turns the best by a quarter and an eighth towards and away from each

@@ -58,7 +58,7 @@ class Tried:
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFlip:
-    """Effect of one key alone: runs at both ends, and at both sides of the flip."""
+    """Effect of one key alone: runs at both ends, and around the flip."""
 
     key: Key
     start: Tried
@@ -106,7 +106,6 @@ class SweepResult:
     num_new: int = 0
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, equal for equal settings."""
         return {
             "before": {name: self.before[name] for name in ("outcome", "label", "sentence")},
             "keys": {

@@ -1,4 +1,4 @@
-"""A CUDA card, over its driver and cuda-core; its kernels are compiled at run time with NVRTC, cached on disk."""
+"""A CUDA card, over its driver and cuda-core; NVRTC compiles its kernels, cached on disk."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ def source_digest() -> bytes:
 
 
 def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, source: str = FIT) -> Any:
-    """Machine code of a source for a compute capability, cached in cuda-core's or the given folder, if writable."""
+    """Machine code of a source for a compute capability, cached if writable."""
     options = ProgramOptions(
         name=source, arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
     )

@@ -36,7 +36,7 @@ HARD = "hard"
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Choice of distance: exact; with a kernel, the smaller, or if is_single, the kernel's where defined.
+    """Choice of distance: exact, with a kernel the smaller, is_single: the kernel's.
 
     resolution [m]: a larger excess of a kernel is counted.
     """
@@ -97,7 +97,7 @@ class DeviceField:
         self._rooms = {}
 
     def bake(self, span: GridSpan, wanted: Collection[str], *, margin: float = 0.0) -> Answers:
-        """Return `wanted` (fields of `Answers`, kernels) in a span; its mask is ignored; margin [m]: of bound."""
+        """Return `wanted` (fields of `Answers`) in a span; margin [m]: of bound."""
         grid = np.zeros((), GRID)
         grid["place"], grid["size"], grid["planes"] = (*span.origin, span.voxel), span.shape, (span.first, span.last)
         shape = span.shape_of_channel

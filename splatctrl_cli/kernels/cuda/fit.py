@@ -201,12 +201,12 @@ class DeviceFit:
                 return self._read("gradients", (self.num_splats, 8)), self._terms([view])[view]
 
     def list_lengths(self, view: int) -> Int32:
-        """Number of splats (K,) on each tile's list, after the last launch on the view's size."""
+        """Number of splats (K,) on each tile's list, after the last launch."""
         height, width = self.views[view].height, self.views[view].width
         return self._read(f"num_entries {height} {width}", (-(-height // TILE) * -(-width // TILE),), np.int32)
 
     def read_image(self, name: str, view: int, channels: int) -> Float32:
-        """Read `planes`, `plane_gradients` or `maps` (channels, H, W), after the last launch on the view's size."""
+        """Read `planes`, `plane_gradients` or `maps` (channels, H, W), after the last launch."""
         height, width = self.views[view].height, self.views[view].width
         return self._read(f"{name} {height} {width}", (channels, height, width))
 
@@ -318,7 +318,7 @@ class DeviceFit:
         return known
 
     def launches(self, height: int, width: int, gradients: int = 0) -> list[Launch]:
-        """Launches of one iteration on a view of that size; gradients: the address to write them to, or 0 to step."""
+        """Launches of one iteration on a view; gradients: their address, or 0 to step."""
         at: Callable[[str], int] = self._addresses.__getitem__
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         patches_x, patches_y = -(-width // PATCH), -(-height // PATCH)

@@ -24,7 +24,7 @@ class OutOfMemory(DeviceError):  # noqa: N818  (as the driver names it)
 
 @dataclass(frozen=True, kw_only=True)
 class Launch:
-    """One kernel launch: grid (x, y, z), threads per block; addresses are int, other arguments np.int32."""
+    """One kernel launch: grid (x, y, z), threads per block; addresses int, others np.int32."""
 
     kernel: str
     grid: tuple[int, int, int]

@@ -1,7 +1,4 @@
-"""``X.capture/``: a plain folder of images, poses and joints (docs/capture.md).
-
-Its index is capture.json, frames.csv and SHA256SUMS, in some fifty bytes of memory a file.
-"""
+"""``X.capture/``: a plain folder of images, poses and joints (docs/capture.md)."""
 
 import csv
 import hashlib
@@ -97,7 +94,6 @@ _ENTRIES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
 
 
 def is_capture(path: Path) -> bool:
-    """True for a capture folder."""
     return (path / "capture.json").is_file()
 
 
@@ -223,10 +219,9 @@ _NOT_FOR_CAPTURES = (
 
 
 class CaptureSource(FrameSource):
-    """Records of a capture folder; files with a wrong checksum are skipped and counted as damage.
+    """Records of a capture folder; files with a wrong checksum count as damage.
 
-    joints: a robot's, merged from the kept topics as from the log; if None, or no topic was kept, the states are
-    joints.npz's.
+    joints: a robot's, merged from the kept topics; if None, or no topic was kept, the states are joints.npz's.
     """
 
     def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
@@ -279,7 +274,7 @@ class CaptureSource(FrameSource):
         yield from filter(None, map(self._stored_frame, self._rows))
 
     def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
-        """A row's frame; None, and counted, if colour, depth or its mask of valid pixels is missing or damaged."""
+        """A row's frame; None, and counted, if a file of it is missing or damaged."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
         camera = self._cameras[row["camera"]]

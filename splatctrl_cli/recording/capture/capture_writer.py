@@ -76,19 +76,16 @@ class Journal:
         return Entry(**found)
 
     def add(self, entry: Entry) -> None:
-        """Add a written frame."""
         self.num_entries += 1
         self._stream.write(json.dumps(vars(entry)) + "\n")
         self._stream.flush()
 
     def entries(self) -> Iterator[Entry]:
-        """All entries in order."""
         lines = _lines(self._path)
         next(lines, None)
         yield from (Entry(**line) for line in lines)
 
     def remove(self) -> None:
-        """Delete the finished journal."""
         self._stream.close()
         self._path.unlink()
 
@@ -313,7 +310,7 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
-    """Suffix and bytes of the depth image: the recorded PNG if it counts in the camera's unit."""
+    """Suffix and bytes of the depth image: the recorded PNG if its unit fits."""
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)

@@ -1,10 +1,8 @@
-"""The messages of ROS bags: ROS 1, and ROS 2 sqlite3; damage is skipped and counted.
+"""The messages of ROS 1 and ROS 2 (sqlite3) bags; damage is skipped and counted.
 
 A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body, read in order in bounded
-memory. Its index is not needed: a cut or growing bag has none.
-
-rosbags (rosbags/rosbag2/storage_sqlite3.py) counts messages first, so one bad page makes it refuse. Tables of
-rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions.
+memory. Tables of rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions. rosbags refuses a damaged
+file.
 """
 
 import os
@@ -37,7 +35,7 @@ Fields = dict[str, bytes]
 
 
 class BagRecord(NamedTuple):
-    """A record; the body of a cut one is what the file still has of it."""
+    """A record; of a cut one the body that is left."""
 
     offset: int
     kind: int
@@ -47,10 +45,7 @@ class BagRecord(NamedTuple):
 
 
 class Bag1Log(RawLog):
-    """One ROS 1 bag; its index is not needed. Raises InputError without any record.
-
-    rosbags (rosbags/rosbag1/reader.py) refuses a bag without index, and ends at the first damaged chunk.
-    """
+    """One ROS 1 bag; its index is not needed: a cut or growing bag has none. Raises InputError without any record."""
 
     container = "ROS 1 bag"
 
@@ -262,8 +257,8 @@ _PAGE_SIZE, _FILE_FORMAT = slice(16, 18), slice(18, 20)  # of its header (sqlite
 class Db3Log(RawLog):
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal, so both are copied. It reads missing bytes of the last page as zeros,
-    so a file cut within a page is copied up to that page. Raises InputError for other tables, or an unreadable file.
+    SQLite writes while it reads a journal, so both are copied. It reads missing bytes of the last page as zeros, so a
+    cut file is copied up to that page. Raises InputError for other tables, or an unreadable file.
     """
 
     container = "ROS 2 bag (sqlite3)"
@@ -308,7 +303,7 @@ class Db3Log(RawLog):
         os.truncate(self._database, size)
 
     def _merge(self, size: int) -> None:
-        """Merge the journal into the copy; one that cannot be merged is left out of a new copy."""
+        """Merge the journal into the copy, or leave it out."""
         try:
             with closing(sqlite3.connect(self._database)) as database:
                 self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]

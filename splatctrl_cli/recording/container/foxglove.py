@@ -1,9 +1,8 @@
 """Foxglove's schemas, and the RealSense SDK's texts, as the ROS messages they stand for.
 
-Foxglove's are JSON, ROS twins, or protobuf, read by the log's FileDescriptorSet without generated code. Fields:
-docs.foxglove.dev ("Schemas"); JSON times are {sec, nsec} and bytes base64, protobuf times google.protobuf.Timestamp.
-The SDK's .db3 has intrinsics, extrinsics and depth units as std_msgs/String (librealsense,
-src/media/ros2/ros2_writer.cpp).
+Foxglove's are JSON, ROS twins, or protobuf, read by the log's FileDescriptorSet. Fields: docs.foxglove.dev
+("Schemas"); JSON times are {sec, nsec} and bytes base64, protobuf times google.protobuf.Timestamp. The SDK's .db3 has
+intrinsics, extrinsics and depth units as std_msgs/String (librealsense, src/media/ros2/ros2_writer.cpp).
 """
 
 import base64
@@ -110,7 +109,6 @@ def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> A
 
 
 def as_ros(schema: str, message: Any) -> Any:
-    """Convert a Foxglove message to its ROS message."""
     return _READERS[schema.replace("/", ".").rpartition(".")[2]](message)
 
 

@@ -299,7 +299,7 @@ FOREIGN = (
 def refuse_foreign(path: Path) -> None:
     """Raise InputError for a known unsupported format, with its name and export.
 
-    Some are supported containers with other contents (a .svo2 is an MCAP, an Azure Kinect's .mkv a video).
+    Some are supported containers with other contents (a .svo2 is an MCAP).
     """
     ends, names = (b"", []) if path.is_dir() else (_ends(path), _entries(path))
     for kind in FOREIGN:

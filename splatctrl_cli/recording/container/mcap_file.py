@@ -1,8 +1,7 @@
 """The records of an MCAP file from front to back, despite damage, in bounded memory.
 
 An impossible record is skipped, to the summary's next place or the next compressed chunk with consistent lengths. The
-`mcap` package reads the fields of a record (mcap.dev/spec), each within its own bytes; bytes after the last field are
-allowed, as specified.
+`mcap` package reads a record's fields (mcap.dev/spec); bytes after the last field are allowed, as specified.
 """
 
 import bisect
@@ -45,7 +44,6 @@ class _Fields(ReadDataStream):  # type: ignore[misc]
         return self.read(self.read4()).decode("utf-8", "replace")
 
     def rest(self) -> bytes:
-        """The remaining bytes."""
         return bytes(self._stream.read())
 
 
@@ -137,7 +135,6 @@ class McapFile:
         return found
 
     def chunk_indexes(self) -> list[ChunkIndex]:
-        """The summary's chunks in file order."""
         found: list[ChunkIndex] = []
         for part in self.summary():
             with suppress(BadRecordError):

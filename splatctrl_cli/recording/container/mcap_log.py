@@ -1,7 +1,7 @@
 """An MCAP file's messages by its own records, and its index without a full read.
 
 Damage is skipped and counted. The `mcap` package allocates what records announce; its indexed reader raises on valid
-files without summary, and yields nothing from truncated ones.
+files without summary.
 """
 
 import struct

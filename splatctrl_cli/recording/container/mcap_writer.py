@@ -2,10 +2,10 @@
 
 ROS 2 (CDR, zstd chunks, CRCs on). Topics: /CAM/color/image_raw/compressed (JPEG), /CAM/color/camera_info,
 /CAM/depth/image_raw (16UC1 millimetres, REP 118, 0 = none, registered to colour), /CAM/people/mask (mono8, 255 = a
-person; only with a mask), /joint_states, /tf, /tf_static. No wall-clock time in the bytes.
+person), /joint_states, /tf, /tf_static. No wall-clock time in the bytes.
 
-Foxglove: protobuf (docs.foxglove.dev, "Schemas"), with plots in JSON. Needs foxglove-schemas-protobuf and
-mcap-protobuf-support, a separate extra.
+Foxglove: protobuf (docs.foxglove.dev, "Schemas"), with plots in JSON; needs foxglove-schemas-protobuf and
+mcap-protobuf-support.
 """
 
 import json
@@ -67,7 +67,6 @@ class McapLog:
         self._add("/joint_states", message, state.stamp_ns)
 
     def add_transforms(self, stamp_ns: int, transforms: Sequence[Transform], *, is_static: bool) -> None:
-        """Add /tf or /tf_static."""
         stamped = [
             self._new(
                 "geometry_msgs/msg/TransformStamped",
@@ -196,7 +195,7 @@ class FoxgloveLog:
         self.counts: dict[str, int] = {}  # messages by topic
 
     def add_cloud(self, topic: str, stamp_ns: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Add a PointCloud of columns (N,) by name, float32 or uint8, among them x, y, z [m]."""
+        """Add a PointCloud of float32 or uint8 columns (N,), with x, y, z [m]."""
         kind = np.dtype([(name, column.dtype) for name, column in columns.items()])
         packed = np.zeros(len(columns["x"]), kind)
         for name, column in columns.items():
@@ -209,7 +208,7 @@ class FoxgloveLog:
     def add_voxels(
         self, topic: str, stamp_ns: int, name: str, values: NDArray[Any], origin: Float64, voxel: float
     ) -> None:
-        """Add (X, Y, Z), uint8 or float32; voxel (0, 0, 0) is centred at `origin` (3,) [m]."""
+        """Add (X, Y, Z), uint8 or float32, centred from `origin` (3,) [m] on."""
         columns, rows, _ = values.shape
         size = values.dtype.itemsize
         message = _new(
@@ -244,7 +243,7 @@ class FoxgloveLog:
     def add_mesh(
         self, topic: str, stamp_ns: int, frame: str, vertices: NDArray[np.floating], faces: NDArray[np.integer]
     ) -> None:
-        """Add a SceneUpdate: vertices (V, 3) [m] and faces (F, 3) that move with a frame."""
+        """Add a SceneUpdate: vertices (V, 3) [m], faces (F, 3), in a frame."""
         message = _new("SceneUpdate")
         entity = message.entities.add(id=frame, frame_id=frame, frame_locked=True)
         entity.timestamp.FromNanoseconds(stamp_ns)
@@ -257,11 +256,9 @@ class FoxgloveLog:
         self._add(topic, stamp_ns, message)
 
     def add_line(self, topic: str, stamp_ns: int, level: str, text: str) -> None:
-        """Add a Log of one of `LEVELS`."""
         self._add(topic, stamp_ns, _new("Log", level=LEVELS.index(level), message=text, name="splatctrl"))
 
     def add_numbers(self, topic: str, stamp_ns: int, values: Mapping[str, float | None]) -> None:
-        """Add numbers as a JSON object."""
         if topic not in self._channels:
             schema = {"type": "object", "properties": {name: {"type": ["number", "null"]} for name in values}}
             self._channels[topic] = self._writer.register_channel(

@@ -15,7 +15,7 @@ class Topic:
 
     type_name: ``package/msg/Type`` for ROS. encoding: ``cdr``, ``ros1`` or the file's (json, protobuf, ...).
     definition: the type's text or "", as definition_format ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, a
-    byte a character). schema: the original type if type_name stands for it in ROS (Foxglove), else "".
+    byte a character). schema: the original type if type_name stands for it in ROS, else "".
     """
 
     name: str
@@ -99,7 +99,6 @@ class JoinedLog(RawLog):
     def __init__(
         self, path: Path, parts: Sequence[RawLog], container: str, *, files: tuple[Path, ...] = (), note: str = ""
     ) -> None:
-        """files: by default the parts'."""
         self.path, self.container = path, container
         self.files = files or tuple(file for part in parts for file in part.files)
         self._parts, self._note = parts, note

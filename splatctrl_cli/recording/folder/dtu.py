@@ -58,11 +58,11 @@ class DtuScan:
 def read_dtu(
     root: Path, scan: str | None = None, masks: Path | None = None, shrink: Shrink = lambda view: view
 ) -> DtuScan:
-    """Read scan `scan` (default: the only one) of a DTU folder; `masks` contains NNN.png by view number.
+    """Read scan `scan` (default: the only one) of a DTU folder; `masks` has NNN.png.
 
     `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or a
-    quarter). Depth of another size is sampled, not blended: a larger map at the image's pixels; a smaller one sets
-    only the pixels it was made for. Drops views without depth. Raises InputError naming the file.
+    quarter). Depth of another size is sampled, not blended; a smaller one sets only the pixels it was made for. Drops
+    views without depth. Raises InputError naming the file.
     """
     scan, folder = chosen_scan(root, scan_folders(root), scan)
 
@@ -152,10 +152,7 @@ def read_views(
 
 
 def check_lengths(where: str, views: Sequence[DtuView]) -> None:
-    """Raise InputError if depth or camera distances are not millimetres.
-
-    It expects a table seen from near; a wrong unit is a thousand times off.
-    """
+    """Raise InputError if depth or camera distances are not millimetres."""
     known = [view.depth[view.depth > 0] for view in views]
     medians = [float(np.median(depth)) for depth in known if depth.size]
     if not medians:

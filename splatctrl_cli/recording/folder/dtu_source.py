@@ -28,10 +28,10 @@ def view_numbers(words: Sequence[str]) -> list[int]:
 class DtuSource:
     """A scan's views by number (view 0 is ``rect_001``), which is also the stamp.
 
-    The scene is static, so there is no clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``,
-    unless a `protocol` assigns or drops them. masks, depths: folders of what the layout does not have. downscale:
-    shrink factor; None: to the protocol's size, if that is a whole factor. layout: ``MVSNet`` or ``IDR``; split:
-    training and held-out views.
+    The scene is static, without a clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``,
+    unless a `protocol` assigns or drops them. masks, depths: folders of what the layout lacks. downscale: shrink
+    factor; None: to the protocol's size, if that is a whole factor. layout: ``MVSNet`` or ``IDR``; split: training
+    and held-out views.
     """
 
     joint_names: tuple[str, ...] = ()
@@ -83,7 +83,6 @@ class DtuSource:
 
     @property
     def has_depth(self) -> bool:
-        """True if any view has depth."""
         return any(bool((view.depth > 0).any()) for view in self._views.values())
 
     def mask(self, number: int) -> Bool | None:
@@ -114,9 +113,8 @@ class DtuSource:
 def shrunk(view: DtuView, factor: int) -> DtuView:
     """Merge every `factor` x `factor` pixels: mean colour, the middle's depth, the first's mask.
 
-    Colour and mask follow RegNeRF (regnerf/internal/datasets.py, downsample: cv2.INTER_AREA; masks cv2.INTER_NEAREST,
-    which takes the first pixel). Pixel (0, 0) has its centre at (0, 0): u becomes (u + 0.5) / factor - 0.5. Raises
-    UsageError for a factor that does not divide the size.
+    Colour and mask follow RegNeRF (regnerf/internal/datasets.py, downsample). Pixel (0, 0) has its centre at (0, 0):
+    u becomes (u + 0.5) / factor - 0.5. Raises UsageError for a factor that does not divide the size.
     """
     k = view.intrinsics
     if factor < 1 or k.width % factor or k.height % factor:

@@ -59,7 +59,7 @@ class FramesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthTable:
-    """``[depth]``: encoding, metres per count, and the count that is invalid in addition to 0 (-1: no other)."""
+    """``[depth]``: encoding, metres per count, and a further invalid count (-1: none)."""
 
     encoding: str = "uint16"
     scale: float = 1e-3
@@ -114,7 +114,6 @@ class ImagePart:
         return self.file.is_file()
 
     def absolute(self) -> Path:
-        """The whole file."""
         return self.file.absolute()
 
     def relative_to(self, root: Path) -> Path:
@@ -151,9 +150,9 @@ class ListedView:
 class Description:
     """A whole description; transforms.json may give camera and frames, --camera-pose the poses.
 
-    listed: a layout's views, instead of frames. is_depth_resized: depth is resized to colour by nearest pixels.
-    unpaired: colour and depth files without partner. num_damaged: views lost to damage. supply: how to add depth if
-    no view has it. notes: assumptions on what the layout leaves open.
+    listed: a layout's views, instead of frames. is_depth_resized: to colour, by nearest pixels. unpaired: colour and
+    depth files without partner. num_damaged: views lost to damage. supply: how to add depth if no view has it. notes:
+    assumptions on what the layout leaves open.
     """
 
     path: Path
@@ -204,7 +203,7 @@ def read_table(
     beside: Collection[str] = (),
     fill: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> T:
-    """Read table [name] of a TOML file with no others but `beside`; `fill` adds keys left out.
+    """Read table [name] of a TOML file; `fill` adds keys left out.
 
     Raises as `read_description`.
     """

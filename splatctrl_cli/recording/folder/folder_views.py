@@ -62,7 +62,7 @@ def length_unit(median: float, apart: float) -> float:
     """Metres per length of a recording with this median depth and camera distance.
 
     1 unless depth is too large for metres and the cameras have the same unit. If depth alone is too large, its scale
-    is wrong, and the cameras are close together in comparison. `reconstruct` then compares the views.
+    is wrong.
     """
     if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
         return 1.0
@@ -268,7 +268,7 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """Stamp by the layout, the file name, frame number and rate, or (no clock) one second a frame."""
+    """Stamp by layout, file name, frame number and rate, or one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

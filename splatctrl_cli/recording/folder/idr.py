@@ -1,10 +1,9 @@
 """DTU scans in the layout of IDR and NeuS.
 
 SCAN/cameras_sphere.npz (or cameras.npz) has world_mat_I, the projection (4, 4) of world points to pixels of image I,
-and scale_mat_I, the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png.
-Image I is the I-th by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing. World lengths are
-millimetres there, metres here. The layout has no depth; SCAN/depth may have depth_map_0000.pfm (and
-depth_visual_0000.png) as MVSNet names them.
+and scale_mat_I, the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png. Image I is the I-th
+by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing. Lengths there are millimetres, here
+metres. SCAN/depth may have depth_map_0000.pfm (and depth_visual_0000.png) as MVSNet names them.
 """
 
 import re
@@ -41,7 +40,6 @@ def idr_scans(root: Path) -> dict[str, Path]:
 
 
 def is_idr(folder: Path) -> bool:
-    """True for a scan in this layout."""
     return any((folder / name).is_file() for name in CAMERAS)
 
 

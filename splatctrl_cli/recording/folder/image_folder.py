@@ -90,7 +90,6 @@ class ImageFolderSource(FrameSource):
         return any(view.depth is not None for view in self._views)
 
     def no_depth(self) -> InputError:
-        """The error for missing depth."""
         return InputError(
             f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
             remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
@@ -147,7 +146,6 @@ class ImageFolderSource(FrameSource):
         return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
 
     def count_views(self) -> dict[str, int]:
-        """Views by camera."""
         return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
 
     def digests(self) -> dict[str, str]:
@@ -238,7 +236,7 @@ class ImageFolderSource(FrameSource):
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
-        """Pixels that the lens saw and the mask keeps (None: all); none if the mask is unreadable."""
+        """Pixels that the lens saw and the mask keeps (None: all)."""
         seen = None if lens.undistortion is None else lens.undistortion.valid
         if view.valid is None:
             return seen
@@ -354,7 +352,7 @@ def layout_of(path: Path) -> Layout | None:
 
 
 def has_views(path: Path) -> bool:
-    """True for a folder that is no ROS 2 bag, or a file with a layout."""
+    """True for a folder but a ROS 2 bag, or a layout's file."""
     return layout_of(path) is not None if path.is_file() else path.is_dir() and not is_bag_folder(path)
 
 
@@ -379,7 +377,7 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
 
 
 def unknown_folder(folder: Path, what: str, remedy: str) -> InputError:
-    """The error for a folder that is not read: it names readable parts, else missing depth."""
+    """The error for an unread folder: it names readable parts, else missing depth."""
     inside = _readable_in(folder)
     if not inside and (found := _bare_images(folder)):
         return InputError(

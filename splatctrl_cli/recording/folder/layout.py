@@ -50,7 +50,7 @@ class Layout:
 
 
 def marked(*alternatives: str) -> Callable[[Path], bool]:
-    """Make a test of folders: one must have every name of one alternative; a trailing / means a folder."""
+    """Make a test of folders: every name of one alternative; "/" means a folder."""
 
     def has(folder: Path, mark: str) -> bool:
         return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))
@@ -59,7 +59,7 @@ def marked(*alternatives: str) -> Callable[[Path], bool]:
 
 
 def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions], Description]:
-    """Make a reader that refuses a folder and asks for a description like one of the examples."""
+    """Make a reader that refuses a folder and asks for a description."""
 
     def refuse(folder: Path, _: SourceOptions) -> Description:
         raise InputError(
@@ -129,7 +129,7 @@ def paired_by_stamp(
     pose_at: Callable[[int], Float64 | None],
     options: SourceOptions,
 ) -> Pairs:
-    """Pair files by stamp [ns] within the tolerance; the pose is that at the colour's stamp."""
+    """Pair files by stamp [ns] within the tolerance; the pose is at colour's stamp."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
     pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
     views = [

@@ -210,7 +210,7 @@ _ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth
 
 
 def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder, a lens per K; --depth-scale is metres per length of cameras and depth."""
+    """Describe the folder, a lens per K; --depth-scale is metres per length."""
     options.refuse(("intrinsics",), "an MVSNet scene", folder)
     files = {path.name.removesuffix("_cam.txt"): path for path in sorted(folder.glob(_CAMERAS))}
     cameras = {stem: read_camera_file(path) for stem, path in files.items()}

@@ -1,8 +1,8 @@
 """Organised PCL point clouds: a ``.pcd`` with a point per pixel, or a folder.
 
-Format: PCL's tutorial "The PCD file format" (v0.7; ascii, binary, binary_compressed), read by pypcd4 (extra `pcd`).
-Intrinsics follow from the grid: column u, row v is on that pixel's ray. VIEWPOINT is the camera's pose; points are in
-the camera (z forward) or world, whichever fits.
+Format: PCL's tutorial "The PCD file format" (v0.7), read by pypcd4 (extra `pcd`). Intrinsics follow from the grid:
+column u, row v is on that pixel's ray. VIEWPOINT is the camera's pose; points are in the camera (z forward) or world,
+whichever fits.
 """
 
 import struct

@@ -1,9 +1,8 @@
 """Layouts with images paired by stamp: TUM RGB-D and its kin, and SUN3D.
 
-TUM RGB-D: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``. Depth counts 1/5000 m. Files, factor and cameras: the
-dataset's page (Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012; "File Formats" and
-"Intrinsic Camera Calibration"; the same in raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml). Poses are the
-colour camera's. Depth is registered to raw colour, so both are undistorted alike.
+TUM RGB-D: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``. Depth counts 1/5000 m, registered to raw colour; poses are
+the colour camera's. Files, factor and cameras: the dataset's page (Sturm et al., A benchmark for the evaluation of
+RGB-D SLAM systems, IROS 2012; the same in raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml).
 
 Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and T_camera = T_ros^-1 T_groundtruth T_ros
 T_m from groundtruth.txt's marker frame. T_m's rotation has a scale of 1.059, which is dropped. ETH3D SLAM (Schöps et
@@ -116,7 +115,7 @@ def listed(path: Path) -> list[tuple[int, Path]]:
 
 
 def _series(folder: Path) -> str:
-    """The series, of `SERIES`, in the folder's name, else in its lists' heads; "" if none."""
+    """The series, of `SERIES`, in the folder's name, or its lists' heads."""
     names = [folder.resolve().name]
     for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
         if (folder / file).is_file():

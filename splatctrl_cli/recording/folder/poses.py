@@ -79,7 +79,7 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
 
 
 def tum_rows(path: Path) -> dict[str, Float64 | None]:
-    """Read ``stamp tx ty tz qx qy qz qw`` by stamp [s] as written; None for a line with NaN."""
+    """Read ``stamp tx ty tz qx qy qz qw`` by stamp [s]; None for NaN."""
     poses: dict[str, Float64 | None] = {}
     for where, words, values in read_rows(path):
         if len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any():
@@ -138,7 +138,7 @@ def read_numbers(path: Path) -> list[float]:
 
 
 class Trajectory:
-    """A camera's poses by stamp [s, as text], interpolated like tf, never across a stamp with None."""
+    """A camera's poses by stamp [s, as text], interpolated like tf, never across None."""
 
     def __init__(self, poses: Mapping[str, Float64 | None]) -> None:
         self._tree = TfTree()
@@ -165,7 +165,7 @@ class Trajectory:
 
 
 def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
-    """Nanoseconds of a time written in units of `unit_ns`, without float rounding; None if it is no time."""
+    """Nanoseconds of a time in units of `unit_ns`, unrounded; None if no time."""
     try:
         stamp_ns = Decimal(text) * unit_ns
         return round(stamp_ns) if abs(stamp_ns) < _MOST_NS else None  # rounding 1e999 writes out its digits

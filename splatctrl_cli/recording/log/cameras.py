@@ -61,7 +61,7 @@ def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraT
     """Pair colour and depth topics that share a namespace, deepest first, into named cameras.
 
     /cam0/color/image_raw and /cam0/depth/image_raw make `cam0`. Prefers registered depth, colour to grey, rectified
-    to raw, uncompressed images. Skips topics `without`.
+    to raw, uncompressed images.
     """
     colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
     depths = image_topics(survey, "depth")
@@ -168,7 +168,7 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
-    """The colour images' frame; a video file names none and takes that of its depth, which is aligned to it."""
+    """The colour images' frame; a video file takes its depth's."""
     return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 
@@ -198,9 +198,9 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
-    """Name cameras by the namespace's last part if unique, else all of it; `camera` if empty.
+    """Name cameras by the namespace's last part if unique, else all of it.
 
-    Names are folders: characters but letters, digits, ``_``, ``-``, ``.`` become ``_``; the last two cannot be first.
+    Names are folders: other characters than letters, digits, ``_``, ``-``, ``.`` become ``_``.
     """
     short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
     long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
@@ -339,7 +339,6 @@ def join_pose_topics(
 
 
 def pose_topics(survey: Survey) -> list[str]:
-    """Topics of pose messages."""
     return [topic.topic.name for topic in survey.of_type(*POSE_TYPES)]
 
 

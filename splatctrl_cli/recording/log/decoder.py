@@ -2,11 +2,8 @@
 
 RealSense bags have extrinsics and depth units on ``/device_D/sensor_S/STREAM_N/...`` (librealsense,
 src/media/ros/ros_file_format.h). ``tf/R`` maps points of group R's reference stream to this stream: T_color_depth =
-T_color_R T_R_depth, the direction in which edges of depth and colour meet (docs/formats.md).
-
-In newer bags (2.5x) an image's frame is "1", and a little-endian float32 follows the message: metres per count of
-depth, 0 for others (librealsense, src/media/ros/ros_writer.cpp,
-third-party/realsense-file/rosbag/msgs/sensor_msgs/Image.h).
+T_color_R T_R_depth (docs/formats.md). In newer bags (2.5x) an image's frame is "1", and a little-endian float32
+follows the message: metres per count of depth, 0 for others (src/media/ros/ros_writer.cpp).
 """
 
 import re
@@ -108,8 +105,8 @@ class MessageDecoder:
 def header_stamp_ns(message: RawMessage) -> int:
     """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
 
-    Two 32-bit words follow four bytes (CDR's encapsulation, or ROS 1's `seq`). Foxglove's are decoded. Raises
-    UndecodableMessageError if too short.
+    Two 32-bit words follow four bytes (CDR's encapsulation, or ROS 1's `seq`). Raises UndecodableMessageError if too
+    short.
     """
     if message.topic.schema == TEXT:
         return message.log_time_ns
@@ -146,7 +143,6 @@ def _unpack_image(data: bytes) -> Any:
 
 
 def stamp_ns(header: Any) -> int:
-    """Stamp of a decoded std_msgs/Header."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 

@@ -1,8 +1,8 @@
 """Decoders of sensor_msgs images: colour (H, W, 3) uint8 RGB, depth (H, W) float32 [m].
 
-The encodings follow sensor_msgs/image_encodings.hpp. 16-bit infrared has the encoding of depth: a topic's name tells.
-Drivers: /ir (Azure Kinect, Orbbec), /infra1 (RealSense), image_ir (Kinect 2), confidence (ZED, L515), amplitude and
-noise (time of flight), aux (MultiSense), signal, reflec and nearir (Ouster).
+The encodings follow sensor_msgs/image_encodings.hpp. A topic's name tells 16-bit infrared from depth: /ir (Azure
+Kinect, Orbbec), /infra1 (RealSense), image_ir (Kinect 2), confidence (ZED, L515), amplitude and noise (time of
+flight), aux (MultiSense), signal, reflec and nearir (Ouster).
 """
 
 import re
@@ -100,7 +100,6 @@ class ImageMessage:
 
     @property
     def is_counts(self) -> bool:
-        """True if depth is integer counts."""
         return self.encoding != "32FC1"
 
     @property
@@ -172,7 +171,6 @@ class _Packed(NamedTuple):
 
     @property
     def is_rvl(self) -> bool:
-        """True if the format names RVL."""
         return "rvl" in self.form.lower()
 
 
@@ -296,7 +294,7 @@ def depth_of(image: ImageMessage, scale: float | None) -> Float32:
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
-    """Count recorded depths (H, W) that are negative, NaN, a no-return code, or floats from `FARTHEST` on."""
+    """Count depths (H, W) that are negative, NaN, a no-return code, or beyond `FARTHEST`."""
     is_invalid = depth == NO_RETURN
     if depth.dtype.kind != "u":
         is_invalid |= ~(depth >= 0) | (np.abs(depth - NO_RETURN_M) < 1e-4) | (depth >= FARTHEST)
@@ -374,11 +372,9 @@ def _rvl_counts(data: bytes) -> NDArray[np.uint16]:
 def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
     """Decode an RVL stream of little-endian words to pixels (num_pixels,).
 
-    A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017 (its listing is the definition). Runs of zeros and
-    of values alternate; a value is the zigzag-coded difference to the last nonzero one. Numbers are three-bit groups,
-    low first, in nibbles whose high bit marks a continuation; nibbles fill 32-bit words from the top.
-
-    Raises ValueError if invalid. Memory is the image and a few times `data`.
+    A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017. Runs of zeros and of values alternate; a value is
+    the zigzag-coded difference to the last nonzero one. Numbers are three-bit groups, low first, in nibbles whose
+    high bit marks a continuation; nibbles fill 32-bit words from the top. Raises ValueError if invalid.
     """
     numbers = _numbers(data)
     runs: list[tuple[int, int, int]] = []  # first pixel, first number, length

@@ -1,7 +1,4 @@
-"""The tf tree over time, depth registered to the colour camera, and lens undistortion.
-
-The tree takes 16 bytes of memory a sample.
-"""
+"""The tf tree over time, depth registered to the colour camera, and lens undistortion."""
 
 import re
 from array import array
@@ -106,7 +103,7 @@ class TfTree:
         static: bool,
         holds: bool = False,
     ) -> None:
-        """Add T_parent_child at a time; one that `holds` is valid always while it is the only one.
+        """Add T_parent_child at a time; one that `holds` is valid always while alone.
 
         A frame keeps its first parent; edges that would close a loop are left out. Differing static transforms are
         valid from their stamps on, the first also before; of one stamp the last. All is noted. Raises ValueError if
@@ -143,7 +140,6 @@ class TfTree:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """All frames, sorted."""
         return tuple(sorted(set(self._edges) | {edge.parent for edge in self._edges.values()}))
 
     @property
@@ -260,9 +256,8 @@ class DepthToColor:
 class Undistortion:
     """A remap that removes lens distortion.
 
-    intrinsics: of the result, the lens's own unless `lens` differs. R (3, 3): the lens's axes to the result's. valid:
-    (H, W), False where the lens saw nothing, as in a pincushion's corners; None if it saw all. There colour is black,
-    depth and labels 0.
+    intrinsics: of the result. R (3, 3): the lens's axes to the result's. valid: (H, W), False where the lens saw
+    nothing, None if it saw all; there colour is black, depth and labels 0.
     """
 
     def __init__(
@@ -362,8 +357,7 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 def undistortion_of(lens: Intrinsics, model: str, coefficients: Float64) -> Undistortion | None:
     """A lens's undistortion, None for a pinhole. Raises InputError for an impossible lens.
 
-    It keeps focal lengths. An equidistant lens's are shortened to show all on the image's axes, up to `WIDEST_RAY`:
-    beyond it the middle would keep few pixels.
+    It keeps focal lengths; an equidistant lens's are shortened to show all on the image's axes, up to `WIDEST_RAY`.
     """
     if not is_distorted(model, coefficients):
         return None

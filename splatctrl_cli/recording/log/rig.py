@@ -171,8 +171,7 @@ def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> Im
     """Decide if images are rectified, by topic name and CameraInfo.
 
     A distorted CameraInfo may describe rectified images next to raw ones (image_proc): by a P unlike K, or raw images
-    in the folder. RealSense's ``image_rect_raw`` is distorted; depth is computed in rectified images. Otherwise name
-    and CameraInfo contradict each other.
+    in the folder. RealSense's ``image_rect_raw`` is distorted.
     """
     says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
     if not is_distorted(calibration.distortion_model, calibration.distortion):

@@ -1,8 +1,7 @@
 """A ROS log as records: paired images, poses from tf, joints in one order.
 
-The first pass skips images, as transforms may follow them, and plans every frame, in some fifty bytes. The second
-takes planned images in plan order, as few at once as the log's order allows. For `ingest`, files that a capture can
-keep stay undecoded.
+The first pass skips images, as transforms may follow them, and plans every frame. The second takes planned images in
+plan order, as few at once as the log's order allows. For `ingest`, files that a capture can keep stay undecoded.
 """
 
 import tempfile
@@ -178,7 +177,7 @@ class HeldMessages:
 def planned_images(
     log: RawLog, plan: FramePlan, damage: Damage, held: HeldMessages
 ) -> Iterator[tuple[Planned, list[RawMessage]]]:
-    """Yield frames in plan order with their colour, depth and mask messages, whatever the log's order.
+    """Yield frames in plan order with colour, depth and mask messages.
 
     `held` keeps waiting ones; missing frames go to `damage`.
     """

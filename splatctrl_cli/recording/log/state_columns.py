@@ -107,7 +107,6 @@ class StateColumns(Sequence[JointState]):
         return plain._changed(moved, OF_JOINTS)
 
     def tables(self) -> dict[str, Table]:
-        """The present `COLUMNS`."""
         return {name: table for name in COLUMNS if (table := getattr(self, name)) is not None}
 
     def _changed(self, change: Callable[[Table, str], Table], names: Collection[str], **others: Any) -> Self:
@@ -136,7 +135,6 @@ class ColumnWriter:
         return self._num + len(self._waiting)
 
     def add(self, values: Mapping[str, Float64 | None]) -> None:
-        """Add a state by column."""
         self._waiting.append(values)
         if len(self._waiting) == BLOCK:
             self._flush()
@@ -178,7 +176,6 @@ class StateCollector:
         self._columns.add({name: getattr(state, name) for name in COLUMNS})
 
     def columns(self) -> StateColumns:
-        """Columns so far."""
         nothing = np.zeros((0, self._num_joints))
         found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.tables()}
         return StateColumns(stamp_ns=np.array(self._stamps, dtype=np.int64), **found)

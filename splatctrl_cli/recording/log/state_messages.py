@@ -193,12 +193,10 @@ class JointStream:
 
     @property
     def stamp_ns(self) -> Stamps:
-        """Message stamps (T,)."""
         return np.array(self._stamps, dtype=np.int64)
 
     @property
     def log_time_ns(self) -> Stamps:
-        """Log times (T,)."""
         return np.array(self._log_times, dtype=np.int64)
 
     def columns(self) -> dict[str, Rows]:
@@ -228,7 +226,6 @@ class JointLog:
     """States in file order; first_names: the first one's, or None; notes: counted."""
 
     def __init__(self, streams: Sequence[JointStream] = (), num: int = 0) -> None:
-        """Start with the streams of `num` states."""
         self.first_names = streams[0].names if streams else None
         self.notes: Counter[str] = Counter()
         self._num = num

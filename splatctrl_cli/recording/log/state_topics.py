@@ -45,8 +45,8 @@ def joint_records(
 ) -> tuple[tuple[str, ...], StateColumns]:
     """Joint names and states by stamp; both empty if the log has none.
 
-    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states that do not name
-    the same joints as its fullest (a gripper that publishes alone) are left out with a note.
+    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states that do not name the
+    same joints as its fullest are left out with a note.
     """
     topics = state_topics(survey, options, loss)
     if not topics:
@@ -244,7 +244,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
 
 
 def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
-    """Map a log's joint names to the robot's by a prefix on either side; empty unless one prefix fits best."""
+    """Map a log's joint names to the robot's by the best prefix, else empty."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(found):
         for meant in wanted:

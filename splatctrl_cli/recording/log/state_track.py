@@ -63,7 +63,6 @@ class _Sums:
 
     @property
     def num(self) -> int:
-        """States added."""
         return self._start + self._sums.shape[1] - 1
 
     def add(self, k: Float64, r: Float64) -> None:
@@ -72,7 +71,7 @@ class _Sums:
         self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
 
     def means(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> Float64:
-        """Means (4, T) over the states from each first up to, but not with, its last."""
+        """Means (4, T) over the states from each first to before its last."""
         return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
 
     def forget(self, before: int) -> None:
@@ -151,8 +150,8 @@ class RawTrack(StateColumns):
 def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     """Sort states by stamp, each stamp once, each with velocities; changes are noted in `loss`.
 
-    States with a position that is not finite are damage, and left out; of equal stamps the first is kept. Velocities
-    that are absent, NaN, or always zero for a moving joint become position differences.
+    States with a position that is not finite are damage, and left out. Velocities that are absent, NaN, or always
+    zero for a moving joint become position differences.
     """
     ordered = unwrapped(_in_order(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)

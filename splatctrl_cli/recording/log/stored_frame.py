@@ -1,8 +1,7 @@
 """Frames and joint states as their source stored them, which `ingest` keeps without decoding.
 
-All recorded joint states are kept, for any joints. joint_topics/K/: stamp_ns.npy, log_time_ns.npy (T,) int64;
-position.npy and, if any, velocity.npy, commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4) float64; capture.json
-describes each K.
+joint_topics/K/: stamp_ns.npy, log_time_ns.npy (T,) int64; position.npy and, if any, velocity.npy,
+commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4) float64; capture.json describes each K.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -171,8 +170,7 @@ class StoredFrame:
 
     read_color, read_depth: the image, or UndecodableMessageError. color_file: JPEG or PNG bytes of exactly the color.
     depth_file: 16-bit PNG whose ``counts * float32(depth_unit)`` is exactly the depth. depth_unit: [m] of which every
-    depth is a uint16 multiple. Each is None if there is none. origin: the source in words. places: the messages
-    without bytes, if any.
+    depth is a uint16 multiple. Each is None if there is none. origin: the source in words. places: of the messages.
     """
 
     stamp_ns: int
@@ -266,7 +264,6 @@ def is_kept(data: bytes | None) -> bool:
 
 
 def is_png(data: bytes | None) -> bool:
-    """True for PNG."""
     return data is not None and data.startswith(PNG)
 
 

@@ -1,8 +1,4 @@
-"""A first pass over a log: topics, stamps, frames, calibrations, joints and first images.
-
-Pairs images, counts repeats, gaps and clocks that went back, and finds ``robot_description``, latched or a node's
-parameter.
-"""
+"""A first pass over a log: topics, stamps, frames, calibrations, joints, first images and ``robot_description``."""
 
 from array import array
 from collections.abc import Sequence
@@ -100,7 +96,7 @@ def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
 
 
 def dropped(stamps_ns: Stamps) -> tuple[int, int, float]:
-    """Number of gaps, images missing in them, and the period [ns]; no gaps if unsteady, all 0 with few stamps.
+    """Number of gaps, images missing in them, and the period [ns].
 
     The period is the median interval; three of four must be within a quarter of it.
     """
@@ -125,10 +121,8 @@ class Calibration:
 
     size [px]; K (3, 3) of the raw image with its distortion; projection (3, 3) of the rectified image (left part of
     P); rotation (3, 3) from the raw axes to the rectified; both zero if unset. valid (H, W): False where the lens did
-    not see a rectified pixel.
-
-    They fit binned or cropped images, sensor_K (3, 3) the whole sensor; cut says how ("" if whole), is_possible if
-    the region is inside.
+    not see a rectified pixel. They fit binned or cropped images, sensor_K (3, 3) the whole sensor; cut says how,
+    is_possible if the region is inside.
     """
 
     width: int
@@ -147,7 +141,7 @@ class Calibration:
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """A topic; stamps_ns and clock (images only) are of the headers, or log times, in file order."""
+    """A topic; stamps_ns and clock (images only) are headers', or log times."""
 
     topic: Topic
     count: int = 0
@@ -178,7 +172,6 @@ class Survey:
 
     @property
     def num_messages(self) -> int:
-        """Messages of all topics."""
         return sum(topic.count for topic in self.topics.values())
 
     def of_type(self, *types: str) -> list[TopicSurvey]:

@@ -2,7 +2,7 @@
 
 Reads H.264 and H.265 of foxglove.CompressedVideo (Annex B, an image per message; docs.foxglove.dev, CompressedVideo)
 and ffmpeg_image_transport's FFMPEGPacket. Images without a prior key frame, or after a missing image, are dropped and
-counted until the next key frame: FFmpeg shows them with wrong blocks. Its log reveals a missing packet.
+counted until the next key frame: FFmpeg shows them with wrong blocks.
 """
 
 import re
@@ -35,7 +35,6 @@ _EARLY, _LATE = f"before its first {KEY_FRAME}", f"that follow missing or damage
 
 
 def is_video(topic: Topic) -> bool:
-    """True if messages are video packets."""
     return topic.type_name in FORMATS
 
 
@@ -186,7 +185,7 @@ class VideoFileLog(RawLog):
     """The images of ``X.mp4`` as topic ``/X``, at the times in ``X.csv`` or its kin.
 
     That file has a stamp per line, or a column named time or stamp. Before the point, 10 digits are seconds since
-    1970, 13 milliseconds, 16 microseconds, 19 nanoseconds; fewer than ten are seconds. Images have no frame.
+    1970, 13 milliseconds, 16 microseconds, 19 nanoseconds; fewer than ten are seconds.
     """
 
     container = "video"

@@ -150,7 +150,7 @@ _SEE = "see splatctrl help replay, Twists"
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedTwists:
-    """N twists: stamp_ns (N,) rising, twist (N, 6) [m/s, rad/s], linear first, in the axes of `frame`.
+    """N twists: stamp_ns (N,) rising, twist (N, 6) [m/s, rad/s], linear first.
 
     frame: the log's name, or "". notes: dropped twists and the stamps' clock.
     """

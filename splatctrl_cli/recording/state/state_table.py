@@ -1,9 +1,9 @@
-"""Joint states in CSV, NPZ, HDF5 or Parquet, described in TOML (docs/replay.md, Logs), and libfranka's logs.
+"""Joint states in CSV, NPZ, HDF5, Parquet, by a TOML (docs/replay.md, Logs); libfranka's logs.
 
-LeRobot datasets are a preset of [states]: an episode's file and its columns. Versions 2 and 3 (huggingface/lerobot,
-lerobot_dataset.py, utils.py) list features in ``meta/info.json``. v2 has ``data/chunk-000/episode_000000.parquet``
-per episode; v3 shares ``data/chunk-000/file-000.parquet`` by column ``episode_index``. ``observation.state`` is
-position, ``timestamp`` seconds from the episode's begin.
+LeRobot datasets are a preset of [states]. Versions 2 and 3 (huggingface/lerobot, lerobot_dataset.py, utils.py) list
+features in ``meta/info.json``. v2 has ``data/chunk-000/episode_000000.parquet`` per episode; v3 shares
+``data/chunk-000/file-000.parquet`` by column ``episode_index``. ``observation.state`` is position, ``timestamp``
+seconds from the episode's begin.
 """
 
 import csv
@@ -132,8 +132,7 @@ def libfranka_track(table: CsvTable) -> RawTrack:
 
     The first column counts milliseconds since power-on. Positions are ``q[0]`` to ``q[6]``, velocities ``dq[0]``...,
     prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second columns ``dq_d``
-    (libfranka, src/log.cpp and src/logging/robot_state_log.cpp). An added O_T_EE is the end effector's pose by
-    columns.
+    (libfranka, src/log.cpp, src/logging/robot_state_log.cpp). O_T_EE is the end effector's pose by columns.
     """
     num = len(NAMELESS)
     position = _block(table, "q", num)
