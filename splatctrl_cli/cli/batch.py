@@ -76,8 +76,7 @@ class OfThisProgram:
         parser, places, words = _parser_of(command), list[str](), [command]
         given = {"threads": self._threads, **options}
         known = [name for name in given if name not in OWN or f"--{name}" in parser._option_string_actions]
-        actions = {name: _action(parser, command, name) for name in known}
-        for name, action in actions.items():
+        for name, action in {name: _action(parser, command, name) for name in known}.items():
             made = _words_of(name, action, given[name], folder)
             places += made if not action.option_strings else []
             words += made if action.option_strings else []
@@ -106,8 +105,7 @@ class OfThisProgram:
 
 def run_words(words: list[str]) -> int:
     """Run the program, for a runner."""
-    main = importlib.import_module("splatctrl_cli.cli.main").main
-    code: int = main(words)
+    code: int = importlib.import_module("splatctrl_cli.cli.main").main(words)
     return code
 
 
@@ -131,8 +129,10 @@ def _action(parser: Parser, command: str, name: str) -> argparse.Action:
     by_name = {option.removeprefix("--"): action for option, action in parser._option_string_actions.items()}
     by_name |= {action.dest: action for action in parser._actions if not action.option_strings}
     if name not in by_name:
-        remedy = did_you_mean(name, by_name, f"see splatctrl {command} --help-all")
-        raise UsageError(f"{command} has no option {name!r}", remedy=remedy)
+        raise UsageError(
+            f"{command} has no option {name!r}",
+            remedy=did_you_mean(name, by_name, f"see splatctrl {command} --help-all"),
+        )
     return by_name[name]
 
 

@@ -65,13 +65,11 @@ def _lines(report: CheckReport) -> Iterator[str]:
 
 
 def _needs(report: CheckReport) -> Iterator[str]:
-    ready = [need.command for need in report.needs if not report.lacks(need)]
-    if ready:
+    if ready := [need.command for need in report.needs if not report.lacks(need)]:
         yield f"can start: {', '.join(ready)}"
     kept: dict[str, list[str]] = {}
     for need in report.needs:
-        codes = dict.fromkeys(finding.code for finding in report.refusing(need))
-        if codes:
+        if codes := dict.fromkeys(finding.code for finding in report.refusing(need)):
             kept.setdefault(", ".join(f"[{code}]" for code in codes), []).append(need.command)
     for why, commands in kept.items():
         yield f"cannot start, or would be wrong: {', '.join(commands)}; see {why}"

@@ -38,8 +38,9 @@ def run_help(args: argparse.Namespace) -> int:
     names = sorted(page.stem for page in folder.glob("*.md"))
     topic = args.topic or "README"
     if topic not in names:
-        remedy = did_you_mean(topic, names, f"give one of: {', '.join(names)}")
-        raise UsageError(f"help: no page {shown(topic)}", remedy=remedy)
+        raise UsageError(
+            f"help: no page {shown(topic)}", remedy=did_you_mean(topic, names, f"give one of: {', '.join(names)}")
+        )
     text = (folder / f"{topic}.md").read_text(encoding="utf-8")
     return Console(args).result({"topic": topic, "text": text}, text.splitlines())
 

@@ -45,8 +45,7 @@ def _labels(names: str | None) -> list[Label] | None:
         return None
     known = {label.name.lower(): label for label in Label}
     chosen = [name.strip() for name in names.split(",")]
-    unknown = [name for name in chosen if name not in known]
-    if unknown:
+    if unknown := [name for name in chosen if name not in known]:
         raise UsageError(f"--labels {names}: unknown label {unknown[0]!r}", remedy=f"known here: {', '.join(known)}")
     return [known[name] for name in chosen]
 

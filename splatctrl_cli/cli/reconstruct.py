@@ -25,17 +25,16 @@ def run(args: argparse.Namespace) -> int:
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
     allowed = {"views-agreement", "views-scale"} if args.allow_disagreement or args.refine_poses else set()
-    source = open_to_train(
-        recording_of(args, args.source),
-        max_pose_jump=args.max_pose_jump,
-        needs_depth=args.points is None,
-        allowed=allowed | ({"alignment"} if args.allow_disagreement else set()),
-    )
     request = request_of(
         ReconstructRequest,
         args,
         config=config,
-        source=source,
+        source=open_to_train(
+            recording_of(args, args.source),
+            max_pose_jump=args.max_pose_jump,
+            needs_depth=args.points is None,
+            allowed=allowed | ({"alignment"} if args.allow_disagreement else set()),
+        ),
         recording=args.source,
         out=args.out or Path("scene"),
         box=None if args.box is None else Box.from_text(args.box),

@@ -35,8 +35,13 @@ def run(args: argparse.Namespace) -> int:
         locked=locked_joints(args),
     )
     result = replay(request, console)
-    code = result.exit_code(report_only=args.report_only)
-    return show_replayed(console, result, code=code, is_long=args.verbose > 0, with_steps=args.steps)
+    return show_replayed(
+        console,
+        result,
+        code=result.exit_code(report_only=args.report_only),
+        is_long=args.verbose > 0,
+        with_steps=args.steps,
+    )
 
 
 def show_replayed(

@@ -59,9 +59,12 @@ def _cloud(args: argparse.Namespace) -> CloudSettings | None:
     if args.dtu is None and (args.cloud_masks is not None or args.cloud.is_dir()):
         what = "--cloud-masks" if args.cloud_masks is not None else f"--cloud {args.cloud}"
         raise UsageError(f"{what}: a folder of scans, only with --dtu", remedy="give the file of this recording")
-    unit = args.cloud_unit if args.cloud_unit is not None else (MILLIMETRE if args.dtu is not None else 1.0)
     return CloudSettings(
-        path=args.cloud, unit=unit, max_distance=args.cloud_max, spacing=args.cloud_spacing, masks=args.cloud_masks
+        path=args.cloud,
+        unit=args.cloud_unit if args.cloud_unit is not None else (MILLIMETRE if args.dtu is not None else 1.0),
+        max_distance=args.cloud_max,
+        spacing=args.cloud_spacing,
+        masks=args.cloud_masks,
     )
 
 

@@ -102,8 +102,7 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
 
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    presets = [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]
-    for name in presets:
+    for name in [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]:
         _check_known(name, PRESETS, "--preset", "")
         for section, values in PRESETS[name].items():
             yield f"--preset {name}", section, values

@@ -241,8 +241,7 @@ def compare_with_held_out_depth(
     NotEvaluableError without a measured point in the grid.
     """
     distances = grid_distances(grid)
-    upper = grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1)
-    box = Box(lower=grid.origin, upper=upper)
+    box = Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1))
     measured, eyes, num_edges = _measured(frames, counted, Box(lower=box.lower - REACH, upper=box.upper + REACH))
     if not box.contains(measured).any():
         raise NotEvaluableError(

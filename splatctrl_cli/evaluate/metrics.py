@@ -68,16 +68,6 @@ class Shown:
     pick: str
 
 
-def least_of(column: str) -> Shown:
-    """The row where a column is least."""
-    return Shown(column=column, pick="least")
-
-
-def largest_of(column: str) -> Shown:
-    """The row where a column is largest."""
-    return Shown(column=column, pick="largest")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Metric(Generic[R]):
     """One figure: its value, and the number of states, views or points behind it.

@@ -19,7 +19,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.held_out_depth import CLOUD_SCALES
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS
 from splatctrl_cli.evaluate.score import metric_scales
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, gate_reasons, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, gate_reasons, note, verdict_of
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.records import Bool, Float64
@@ -134,10 +134,15 @@ def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damag
         threshold=1.0,
         count=int(num_views),
     )
-    notes = [noted("score", line) for line in report["warnings"]]
+    notes = [note(criterion="score", sentence=line) for line in report["warnings"]]
     gates = gate_reasons(require, dict.fromkeys(NAMES_WITH_CHANGES, None) | metrics, counts)
-    scope = counted(num_views, "view") + ("" if num_scans is None else f" of {counted(num_scans, 'scan')}")
-    return verdict_of("score", [compared, *notes, *gates], scope=scope, is_damaged=is_damaged, counts=counts)
+    return verdict_of(
+        "score",
+        [compared, *notes, *gates],
+        scope=counted(num_views, "view") + ("" if num_scans is None else f" of {counted(num_scans, 'scan')}"),
+        is_damaged=is_damaged,
+        counts=counts,
+    )
 
 
 def counts_of(report: Mapping[str, Any]) -> dict[str, int]:
@@ -204,8 +209,7 @@ class Doubts:
                 f"{self._twins[0]}{_and_more(self._twins)}: a view that trained says nothing about others; is a view"
                 " there twice?"
             )
-        strangers = _strangers(self._names, self._photos, self._renders)
-        if strangers:
+        if strangers := _strangers(self._names, self._photos, self._renders):
             lines.append(
                 f"{strangers[0]}{_and_more(strangers)}: do the cameras belong to these images, and in this order?"
             )

@@ -133,14 +133,17 @@ def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda 
             stopwatch=stopwatch,
             verdict=verdict.as_dict(),
         )
-    pictures = {out / name: description for name, description in PICTURES.items()}
-    return DemoResult(out=out, verdict=verdict, seconds=time.perf_counter() - start, pictures=pictures)
+    return DemoResult(
+        out=out,
+        verdict=verdict,
+        seconds=time.perf_counter() - start,
+        pictures={out / name: description for name, description in PICTURES.items()},
+    )
 
 
 def _refuse_unusable(data: Path, out: Path) -> None:
     """Raise InputError if `data` is no recording, UsageError if it is the output."""
-    missing = [name for name in INPUTS if not (data / name).is_file()]
-    if missing:
+    if missing := [name for name in INPUTS if not (data / name).is_file()]:
         raise InputError(
             f"{data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
         )

@@ -55,11 +55,9 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
     """
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
-            distance = cut.of(grid, "sdf")
-            image = draw_distance(axes, cut.coordinates, distance, cut.voxel, names_lines=False)
+            image = draw_distance(axes, cut.coordinates, cut.of(grid, "sdf"), cut.voxel, names_lines=False)
             if _knows_seen(grid):
-                never_seen = cut.of(grid, "observed") == VoxelState.NEVER_SEEN
-                draw_never_seen(axes, cut.coordinates, never_seen, cut.voxel)
+                draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
         figure.colorbar(image, ax=[axes for axes, _ in panels], extend="both", label="distance [cm]", pad=0.01)
         never = "; hatched: never seen" if _knows_seen(grid) else ""
         lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
@@ -100,9 +98,8 @@ def gradient_picture(
     height = float(np.clip(0.5 * (WIDTH - 2.5) * sides[1] / sides[0] + 1.2, 4.0, 8.0))
     with drawn_figure(height) as figure:
         left, right = figure.subplots(1, 2)
-        length = np.linalg.norm(cut.of(grid, "gradient"), axis=2)
         image = left.imshow(
-            length,
+            np.linalg.norm(cut.of(grid, "gradient"), axis=2),
             origin="lower",
             extent=extent_of(cut.coordinates, cut.voxel),
             cmap="RdBu_r",
@@ -162,9 +159,15 @@ def _cuts(grid: DistanceGrid, point: Sequence[float], *, axes: Sequence[int]) ->
         first, second = (other for other in range(3) if other != axis)
         step = max(1, -(-max(shape[first], shape[second]) // 600))
         right, up = (grid.origin[i] + grid.voxel * np.arange(0, shape[i], step) for i in (first, second))
-        plane = float(grid.origin[axis]) + grid.voxel * index
         cuts.append(
-            Cut(axis=axis, index=index, step=step, plane=plane, coordinates=(right, up), voxel=step * grid.voxel)
+            Cut(
+                axis=axis,
+                index=index,
+                step=step,
+                plane=float(grid.origin[axis]) + grid.voxel * index,
+                coordinates=(right, up),
+                voxel=step * grid.voxel,
+            )
         )
     return cuts
 
@@ -211,7 +214,6 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
     if not ((probability >= 0) & (probability <= 1)).all():
         i = int(np.argmin((probability >= 0) & (probability <= 1)))
         raise UsageError(f"reliability: point {i}: expected a probability in [0, 1], got {probability[i]}")
-    edges = np.linspace(0.0, 1.0, bins + 1)
     which = np.minimum((probability * bins).astype(np.int64), bins - 1)
     count = np.bincount(which, minlength=bins)
     total, collided = (
@@ -219,7 +221,7 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
         for values in (probability, is_colliding.astype(np.float64))
     )
     return Reliability(
-        edges=edges,
+        edges=np.linspace(0.0, 1.0, bins + 1),
         predicted=np.divide(total, count, out=np.full(bins, np.nan), where=count > 0),
         observed=np.divide(collided, count, out=np.full(bins, np.nan), where=count > 0),
         count=count,
@@ -240,8 +242,14 @@ def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: st
         )
         for index, (name, curve) in enumerate(curves.items()):
             color = CURVE_COLORS[index % len(CURVE_COLORS)]
-            label = f"{name}  calibration error {curve.calibration_error:.3f}"
-            axes.plot(curve.predicted, curve.observed, "o-", color=color, linewidth=1.8, label=label)
+            axes.plot(
+                curve.predicted,
+                curve.observed,
+                "o-",
+                color=color,
+                linewidth=1.8,
+                label=f"{name}  calibration error {curve.calibration_error:.3f}",
+            )
             width = np.diff(curve.edges) / (len(curves) + 1)
             bars.bar(curve.edges[:-1] + (index + 1) * width, curve.count, width, color=color)
         axes.set(xlabel="predicted probability", ylabel="share that collides", xlim=(0, 1), ylim=(-0.02, 1.02))

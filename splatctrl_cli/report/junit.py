@@ -99,9 +99,13 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
 
     line: its message; lines: the end of its log.
     """
-    name = "killed" if exit_code is None else WORDS.get(exit_code, "error")
-    text = "\n".join([line, *lines, *([] if exit_code is None else [f"exit code: {exit_code}"])])
-    return Case(name=name, group=group, kind=Kind.ERROR, sentence=line, text=text)
+    return Case(
+        name="killed" if exit_code is None else WORDS.get(exit_code, "error"),
+        group=group,
+        kind=Kind.ERROR,
+        sentence=line,
+        text="\n".join([line, *lines, *([] if exit_code is None else [f"exit code: {exit_code}"])]),
+    )
 
 
 def skipped_case(group: str, why: str) -> Case:

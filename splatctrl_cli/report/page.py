@@ -137,8 +137,7 @@ def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most
         full = 2 * cells.sum(axis=(1, 3, 5), dtype=np.int32) >= factor**3
         borders = np.argwhere(full & ~binary_erosion(full, border_value=1))
         if len(borders) <= most:
-            centers = origin + voxel * (factor * borders + (factor - 1) / 2)
-            return np.asarray(centers, np.float32), factor * voxel
+            return np.asarray(origin + voxel * (factor * borders + (factor - 1) / 2), np.float32), factor * voxel
         factor += 1
 
 
@@ -325,8 +324,9 @@ def rendered(page: Page) -> str:
         name: Markup((PARTS / file).read_text(encoding="utf-8"))
         for name, file in {"css": "page.css", "script": "page.js", "viewer": "viewer.js"}.items()
     }
-    three = Markup(json.dumps(three_js())) if page.scenes else ""
-    return environment.get_template("page.html").render(page=page, three=three, **parts)
+    return environment.get_template("page.html").render(
+        page=page, three=Markup(json.dumps(three_js())) if page.scenes else "", **parts
+    )
 
 
 def picture(path: Path, title: str, most: int) -> Picture:

@@ -122,14 +122,14 @@ def span_of(seconds: Float64) -> tuple[float, float]:
 def drawn_figure(height: float) -> Iterator["mpl.figure.Figure"]:
     """A figure of the house style, 1200 pixels wide."""
     with mpl.rc_context(STYLE):
-        layout = mpl.layout_engine.ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08)
-        yield mpl.figure.Figure(figsize=(WIDTH, height), dpi=DPI, layout=layout)
+        yield mpl.figure.Figure(
+            figsize=(WIDTH, height), dpi=DPI, layout=mpl.layout_engine.ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08)
+        )
 
 
 def save_figure(figure: "mpl.figure.Figure", path: Path, told: str = "") -> None:
     """Write the figure without a date; told: its description in the file."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
+    if (engine := figure.get_layout_engine()) is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)  # else savefig lays out once more, and draws everything for it
     figure.savefig(

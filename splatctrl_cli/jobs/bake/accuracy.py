@@ -20,7 +20,7 @@ from splatctrl_cli.evaluate.field_accuracy import (
 )
 from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, verdict_of
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import LOSS, exact_channel
@@ -161,11 +161,9 @@ def _held_out_cameras(
     Raises UsageError for a camera that trained or does not exist, or if none is left.
     """
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
-    wrong = [name for name in names if name not in known]
-    if wrong:
+    if wrong := [name for name in names if name not in known]:
         raise UsageError(f"--held-out: {log} has no camera {wrong[0]}", remedy=f"it has: {', '.join(known)}")
-    also = [name for name in names if trained is not None and name in trained]
-    if also:
+    if also := [name for name in names if trained is not None and name in trained]:
         raise UsageError(f"--held-out: camera {also[0]} trained the scene", remedy="name one that did not")
     chosen = names or tuple(name for name in known if trained is None or name not in trained)
     if not chosen:
@@ -275,7 +273,7 @@ def bake_verdict(
                 count=num_cells,
             )
         )
-    reasons += [noted("field", text) for text in report.warnings]
+    reasons += [note(criterion="field", sentence=text) for text in report.warnings]
     shape, counts = report.grid.channels["sdf"].shape, counts_of(metrics)
     return verdict_of(
         "sdf-bake",

@@ -337,8 +337,7 @@ def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence
     if "probability" in grid.channels:
         probability_picture(folder / "probability.png", grid, point)
     if accuracy.truth is not None and accuracy.truth.reliability:
-        curves = accuracy.truth.reliability
-        reliability_picture(folder / "reliability.png", curves, "Probability against the truth")
+        reliability_picture(folder / "reliability.png", accuracy.truth.reliability, "Probability against the truth")
 
 
 def _middle(job: _Job) -> list[float]:

@@ -145,10 +145,9 @@ def _is_damaged(run: Run) -> bool:
 
 def _reason(run: Run) -> Reason:
     lacks = run.state == SKIPPED or (run.state != ERROR and run.outcome == Outcome.NOT_EVALUABLE)
-    outcome = Outcome.PASSED if run.state == DONE else Outcome.NOT_EVALUABLE if lacks else Outcome.FAILED
     return Reason(
         criterion=run.node,
-        outcome=outcome,
+        outcome=Outcome.PASSED if run.state == DONE else Outcome.NOT_EVALUABLE if lacks else Outcome.FAILED,
         sentence=told(run) + (f": {run.sentence}" if run.sentence and run.state != DONE else ""),
         label="error" if run.state == ERROR else "not as expected",
         remedy="" if run.state in (DONE, SKIPPED) else f"see {run.log}",
@@ -168,8 +167,15 @@ def suites_of(result: BatchResult) -> list[Suite]:
             for number, case in enumerate(_cases_of(run, result.out))
         ]
         properties = {} if suites else {"splatctrl": __version__, "batch": result.suite}  # once: readers join suites
-        seconds = sum(run.seconds for run in runs)
-        suites.append(Suite(name=recording, cases=cases, properties=properties, started=began, seconds=seconds))
+        suites.append(
+            Suite(
+                name=recording,
+                cases=cases,
+                properties=properties,
+                started=began,
+                seconds=sum(run.seconds for run in runs),
+            )
+        )
     return suites
 
 
@@ -200,8 +206,9 @@ def write_batch(
     for node in nodes:
         run = latest.get(node.name)
         if node.name in keys and (run is None or run.key != keys[node.name]):
-            cause = "has not run since the suite, its inputs or the program changed"
-            run = not_run(node, "", out, state=TO_DO, cause=cause)
+            run = not_run(
+                node, "", out, state=TO_DO, cause="has not run since the suite, its inputs or the program changed"
+            )
         found += [] if run is None else [run]
     document = {
         "format": FORMAT,

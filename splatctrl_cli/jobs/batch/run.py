@@ -97,10 +97,10 @@ class Scheduler:
 
     def _without_running(self, node: Node, key: str, before: Run | None) -> Run | None:
         """The run that stands: an earlier one, an unrecorded one, or skipped for a missing need."""
-        lacking = [need for need in node.needs if not self.runs[need].stamp]
-        if lacking:
-            cause = f"needs {lacking[0]}, which left nothing"
-            run = not_run(node, key, self.ledger.folder, state=SKIPPED, cause=cause)
+        if lacking := [need for need in node.needs if not self.runs[need].stamp]:
+            run = not_run(
+                node, key, self.ledger.folder, state=SKIPPED, cause=f"needs {lacking[0]}, which left nothing"
+            )
             if before is None or (before.state, before.key) != (SKIPPED, key):
                 self.ledger.record(run)
             return run

@@ -184,15 +184,16 @@ def read_baseline(path: Path) -> Judged:
             f"{path}: expected a baseline, got another TOML file", remedy="give one of --update-baseline"
         )
     if (found := document.get("version")) != VERSION:
-        remedy = "update splatctrl" if (found or 0) > VERSION else ANEW
-        raise InputError(f"{path}: a baseline of version {found}, this splatctrl reads {VERSION}", remedy=remedy)
+        raise InputError(
+            f"{path}: a baseline of version {found}, this splatctrl reads {VERSION}",
+            remedy="update splatctrl" if (found or 0) > VERSION else ANEW,
+        )
     version, runs = str(document.get("splatctrl", "")), {}
     try:
         kind = str(document["kind"])
         for name, one in document["run"].items():
             metrics = one.pop("metrics", {})
-            unknown = [metric for metric in metrics if metric not in scales().get(one["command"], {})]
-            if unknown:
+            if unknown := [metric for metric in metrics if metric not in scales().get(one["command"], {})]:
                 what = f"{path}: {name}: no figures of {one['command']}: {', '.join(unknown[:5])}"
                 raise InputError(what, remedy=ANEW)
             figures = {metric: float(value) for metric, value in metrics.items()}

@@ -66,8 +66,7 @@ def _num_new(spheres: SplatSet, field: SphereField | None, grid: OccupancyGrid) 
     is_free[is_inside] = grid.log_odds[tuple(cells[is_inside].T)] < 0.0
     if field is None:
         return int(is_free.sum())
-    distance = field.query(centers[is_free])[0]
-    return int(np.count_nonzero(distance + spheres.radii[is_free] > 0.5 * grid.voxel))
+    return int(np.count_nonzero(field.query(centers[is_free])[0] + spheres.radii[is_free] > 0.5 * grid.voxel))
 
 
 def _spheres(splats: SplatSet, balls: Balls | None) -> SplatSet | None:

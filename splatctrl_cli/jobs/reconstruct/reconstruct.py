@@ -116,9 +116,12 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
             seed=request.seed,
             verdict=verdict.as_dict(),
         )
-    removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
     return ReconstructResult(
-        out=request.out, metrics=made.metrics, verdict=verdict, removed=removed, seconds=stopwatch.seconds
+        out=request.out,
+        metrics=made.metrics,
+        verdict=verdict,
+        removed={name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed},
+        seconds=stopwatch.seconds,
     )
 
 

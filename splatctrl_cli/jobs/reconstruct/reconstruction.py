@@ -364,9 +364,14 @@ class Reconstruction:
     def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)
         human, seed, threads = self.config.human, self.request.seed, self.request.threads
-        has_shell = self.robot is not None and scene.shell > 0
         return SceneFitter(
-            scene, self.config.occupancy, workspace, human=human, seed=seed, threads=threads, has_shell=has_shell
+            scene,
+            self.config.occupancy,
+            workspace,
+            human=human,
+            seed=seed,
+            threads=threads,
+            has_shell=self.robot is not None and scene.shell > 0,
         )
 
     def _workspace(self, first: TimeStep) -> Box:

@@ -190,8 +190,9 @@ class CameraAgreement:
         cameras = sorted({frame.camera for frame in step.frames})
         if self._guess:
             console.log(f"warning: {self._name}: {self._guess}; the map is in metres")
-        is_sure = not self._guess and not are_far(step.frames)
-        findings = check_views(step.frames, dict.fromkeys(cameras), is_sure=is_sure)[0]
+        findings = check_views(
+            step.frames, dict.fromkeys(cameras), is_sure=not self._guess and not are_far(step.frames)
+        )[0]
         for finding in [finding for finding in findings if finding.code == "views-scale"]:
             if not self._is_allowed:
                 raise InputError(

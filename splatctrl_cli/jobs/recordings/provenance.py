@@ -4,7 +4,7 @@ Camera names are alike on every rig and prove nothing.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,6 +23,7 @@ from splatctrl_cli.config.fixed import (
     SAME_POSE_DEGREES,
     SAME_POSE_METRES,
 )
+from splatctrl_cli.evaluate.verdict import Reason, lacking
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder
 from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.recording.log.state_columns import StateColumns
@@ -92,8 +93,7 @@ def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
     gap = float(np.abs(then[:4] - now[:4]).max())
     if gap > SAME_LENS_PIXELS:
         lines.append(f"{camera}: intrinsics differ by {gap:.1f} px")
-    apart = (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9
-    if apart:
+    if apart := (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9:
         side = "after" if apart > 0 else "before"
         lines.append(f"{camera}: its nearest frame is {abs(apart):.3g} s {side} the one that trained")
     then_pose = np.array(first["T_world_camera"], np.float64).reshape(4, 4)
@@ -123,40 +123,31 @@ def _tiles(color: UInt8) -> list[float]:
 S = TypeVar("S", SceneConfig, OccupancyConfig)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mismatch:
-    """A mismatch as a sentence, and its remedy."""
-
-    sentence: str
-    remedy: str
-
-
 def scene_mismatches(
     scene: SceneFolder, source: RecordSource, states: StateColumns, model: RobotModel
-) -> Iterator[Mismatch]:
+) -> Iterator[Reason]:
     """Mismatches of a reconstruction with a log and robot: provenance, times, and its own parts."""
     if not scene.has_digests:
-        yield Mismatch(
+        yield lacking(
             sentence=f"{scene.path} is of an earlier version: nothing tells whether its files are as written",
             remedy="reconstruct again",
         )
     yield from made_from_mismatches(scene.path, scene.made_from, source, model)
     if scene.has_clock and not scene.snapshots:
-        yield Mismatch(
+        yield lacking(
             sentence=f"{scene.path} has no snapshot: the map of its end would judge the log from its beginning",
             remedy="reconstruct again",
         )
     if scene.has_clock and len(states):
         stamps = [*(snapshot.stamp_ns for snapshot in scene.snapshots), scene.stamp_ns]
-        found = times_apart(states.stamp_ns, (min(stamps), max(stamps)))
-        if found is not None:
+        if (found := times_apart(states.stamp_ns, (min(stamps), max(stamps)))) is not None:
             yield found
     yield from _map_mismatches(scene)
 
 
 def made_from_mismatches(
     path: Path, made_from: Mapping[str, Any], source: RecordSource, model: RobotModel
-) -> Iterator[Mismatch]:
+) -> Iterator[Reason]:
     """Mismatches of a scene or field, by its `SceneFolder.made_from`, with a log and robot.
 
     Compares digests of files and calibration, each training camera's first frame, and the segmented robot's joints
@@ -169,24 +160,24 @@ def made_from_mismatches(
         with_made, with_given = (
             f"with {', '.join(names.values())}" if names else "without one" for names in (made, given)
         )
-        yield Mismatch(
+        yield lacking(
             sentence=f"calibration: {path} was made {with_made}, this log is read {with_given}",
             remedy="give the --calibration that it was made with, or reconstruct",
         )
     elif not other and recorded and source.cameras:
         other = differences(recorded, source.records())
     if other:
-        yield Mismatch(
+        yield lacking(
             sentence=f"{path} was made from another recording: {'; '.join(other[:3])}", remedy="reconstruct this log"
         )
     if made_from.get("depth_bend"):
-        yield Mismatch(
+        yield lacking(
             sentence=f"{path} rests on depth corrected by up to {100 * made_from['depth_bend']:.1f} %, which no"
             " sensor measured",
             remedy="reconstruct with --urdf or without --refine-poses: depth stays as recorded",
         )
     if robot := _robot_difference(made_from, model):
-        yield Mismatch(
+        yield lacking(
             sentence=f"{path} was told apart from another robot, {robot}",
             remedy="reconstruct with this --urdf, or give the one that it was made with",
         )
@@ -225,21 +216,21 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
     return ""
 
 
-def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
+def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Reason | None:
     """Mismatch of states at stamps (T,) [ns], T > 0, and a scene's span; None if they (nearly) overlap."""
     first, last = int(states_ns[0]), int(states_ns[-1])
     apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
     if apart_ns <= RECORDINGS_APART_NS:
         return None
     ours, theirs = (f"from {start * 1e-9:.2f} to {end * 1e-9:.2f} s" for start, end in ((first, last), scene_ns))
-    return Mismatch(
+    return lacking(
         sentence=f"joint states {ours} and a scene {theirs} are "
         + ("on clocks that do not overlap" if (apart_ns > CLOCK_MIXED * 1e9) else "of different times"),
         remedy="record both by one clock, or reconstruct this log",
     )
 
 
-def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
+def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
     """Splats unlike their occupancy grid: rescaled, moved, or removed."""
     known = scene.known() if scene.has_digests else None
     if known is None:
@@ -249,7 +240,7 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
         scene.splats(), known, _used(SceneConfig, used.get("scene")), _used(OccupancyConfig, used.get("occupancy"))
     )
     if not found.holds and found.num_voxels:
-        yield Mismatch(
+        yield lacking(
             sentence=f"{scene.path}: splats and occupancy disagree: {100 * found.on_surface:.0f} % of the splats "
             f"lie on occupied voxels, {100 * found.represented:.0f} % of {found.num_voxels} occupied "
             "voxels are represented",
@@ -263,12 +254,12 @@ def _used(section: type[S], values: object) -> S:
     return section(**{name: value for name, value in given.items() if name in known})
 
 
-def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mismatch | None:
+def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Reason | None:
     """Mismatch of a truth file and logged states, by the truth's clearance."""
     stamps = states.stamp_ns
     shared = np.intersect1d(truth.stamps, stamps)
     if not len(shared):
-        return Mismatch(
+        return lacking(
             sentence=f"{truth.path} is of another recording: none of its {len(truth.stamps)} stamps is in the log",
             remedy="give the truth.json that simulate wrote beside the log",
         )
@@ -285,7 +276,7 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mis
         worst = max(worst, abs(float(gap.min()) - float(recorded)))
     if worst <= SAME_CLEARANCE:
         return None
-    return Mismatch(
+    return lacking(
         sentence=f"{truth.path} is of another recording: the logged motion has clearances up to {1e3 * worst:.0f} mm "
         "off those that it recorded",
         remedy="give the truth.json that simulate wrote beside the log",

@@ -134,8 +134,12 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
         raise InputError(f"{request.log}: --evidence: expected cameras, got joint states alone")
     if not source.has_clock:
         raise InputError(f"{request.log}: --evidence: expected frames with times, got views without")
-    cameras = source.cameras if every is None else tuple(training_cameras(source))
-    evidence = Evidence(source=source, cameras=cameras, name=name, every=every)
+    evidence = Evidence(
+        source=source,
+        cameras=source.cameras if every is None else tuple(training_cameras(source)),
+        name=name,
+        every=every,
+    )
     if not any(step.has_depth for step in evidence.frame_sets()):
         raise InputError(
             f"{request.log}: --evidence: {name} has no pixel with depth", remedy="name a camera with depth"
@@ -318,11 +322,13 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
 def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
     """Compare the audit with the truth near seen surfaces, after the last frame."""
     truth = np.asarray(replay.true_clearance)
-    agreement = {
-        name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)
-        for name, of in replay.audit.clearance.items()
-    }
-    return replace(replay, agreement=agreement)
+    return replace(
+        replay,
+        agreement={
+            name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)
+            for name, of in replay.audit.clearance.items()
+        },
+    )
 
 
 def _unexpected(

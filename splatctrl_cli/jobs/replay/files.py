@@ -277,14 +277,13 @@ def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
             None if replay.open_loop is None else replay.open_loop.figures.rows("logged"),
         )
     if replay.open_loop is not None:
-        shaped = [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS]
         open_loop_picture(
             folder / "open_loop.png",
             seconds,
             replay.open_loop.figures.rows("difference"),
             replay.model.joint_names,
             replay.open_loop.figures.rows("barrier"),
-            shaped,
+            [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS],
         )
     if replay.divergence is not None and np.isfinite(replay.divergence["joints"]).any():
         of = [replay.divergence[name] for name in ("joints", "position", "rotation")]

@@ -325,8 +325,7 @@ def certified_distance(fields: KnownFields) -> DistanceFunction:
 
     Kernel fields prove nothing from samples: their slope has no useful bound.
     """
-    certified = fields.distances.get("certified")
-    if certified is not None:
+    if (certified := fields.distances.get("certified")) is not None:
         return certified
     exact = fields.distances["exact"]
     return lambda points: exact(points) - ROUNDING

@@ -190,7 +190,7 @@ def _replay(
         unwatched=tuple(record.hindsight.found),
         overtaken=tuple(record.newer_depth.found),
         strain=record.strain,
-        statics=record.statics,
+        statics=record.fixed.found,
         closest=record.closest,
         events=record.events.events(),
     )

@@ -84,10 +84,11 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     events = events_of(replay, EventKind.IN_COLLISION if least < 0 else EventKind.BELOW_MARGIN, source)
     worst = min(events, key=lambda event: event.worst)
     states = sum(event.num_states for event in events)
+    apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
     yield _at_worst(
         worst,
         failed(
-            sentence=f"{worst.worst_name} {_apart(least)}, margin {mm(replay.margin)}, {states} states in "
+            sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}, {states} states in "
             f"{counted(len(events), 'interval')}, worst",
             value=least,
             threshold=replay.margin,
@@ -96,10 +97,6 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
             label=CONTACT if least < 0 else MARGIN,
         ),
     )
-
-
-def _apart(least: float) -> str:
-    return f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
 
 
 def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
@@ -299,8 +296,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             remedy="give a URDF with collision geometry (--packages finds its meshes)",
         )
         return
-    bare = bare_moving_links(judged.replay.model)
-    if bare:
+    if bare := bare_moving_links(judged.replay.model):
         yield lacking(
             sentence=f"no sphere on {', '.join(bare)}: their clearance is unknown",
             who=bare[0],

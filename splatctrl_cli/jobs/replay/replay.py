@@ -6,13 +6,13 @@ from pathlib import Path
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
+from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, check_gate_names
 from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.jobs.reconstruct.reconstruct import declarations_of
-from splatctrl_cli.jobs.recordings.provenance import Mismatch, made_from_mismatches, scene_mismatches, truth_mismatch
+from splatctrl_cli.jobs.recordings.provenance import made_from_mismatches, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.replay.criteria import Judged
 from splatctrl_cli.jobs.replay.evidence import (
     Evidence,
@@ -169,14 +169,13 @@ def _read(
     scene = opened_scene(request, model, declared, folder, progress, source, observe)
     given = (request.urdf, request.spheres, request.self_model, request.srdf, request.truth, request.declare)
     files = [path for path in given if path not in (None, NO_SELF_MODEL)]
-    digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
     inputs = ReplayInputs(
         source=source,
         states=logged.states,
         model=model,
         scene=scene,
         truth=truth,
-        digests=digests,
+        digests={**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}},
         mismatches=_mismatches(request, scene, logged, model),
         declared=declared,
         surfaces=robot.surfaces,
@@ -187,7 +186,7 @@ def _read(
 
 def _mismatches(
     request: ReplayRequest, known: KnownScene, logged: LoggedStates, model: RobotModel
-) -> tuple[Mismatch, ...]:
+) -> tuple[Reason, ...]:
     if request.field is not None:
         return tuple(made_from_mismatches(request.field, known.figures(), logged.source, model))
     if request.scene is None:

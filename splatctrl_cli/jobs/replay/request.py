@@ -14,8 +14,8 @@ from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.conformal import ConformalBound
+from splatctrl_cli.evaluate.verdict import Reason
 from splatctrl_cli.jobs.reconstruct.verdict import LONGEST_BLIND
-from splatctrl_cli.jobs.recordings.provenance import Mismatch
 from splatctrl_cli.jobs.replay.hindsight import LaterDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
@@ -99,7 +99,7 @@ class ReplayInputs:
     scene: KnownScene
     truth: Truth | None
     digests: dict[str, str]
-    mismatches: tuple[Mismatch, ...] = ()
+    mismatches: tuple[Reason, ...] = ()
     declared: Declarations = made_by(default_factory=Declarations)
     surfaces: SelfSurfaces | None = None
     kept: tuple[KeptMargin, ...] = ()

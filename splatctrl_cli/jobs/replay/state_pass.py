@@ -93,7 +93,7 @@ class ReplayRecord:
         self._robot = self._model = model
         self._scene, self._max_map_age = scene, max_map_age
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
-        self._fixed = FixedParts(model, 2.0 * (self._margin - SLIGHTLY_UNDER))
+        self.fixed = FixedParts(model, 2.0 * (self._margin - SLIGHTLY_UNDER))
         self._spheres = sphere_names(model.sphere_set)
         self._number = {name: number for number, name in enumerate(self._spheres)}
         self._surfaces, self._kept = surfaces, kept
@@ -258,11 +258,7 @@ class ReplayRecord:
             return
         self._last_scene, before, self._seen_before = known, self._seen_before, self._scene.seen_at(stamp)
         was_seen = None if before is None else lambda places: before.look(places)[0] >= 0
-        self._fixed.look(known.distances["exact"], part.position[0], was_seen)
-
-    @property
-    def statics(self) -> dict[str, tuple[float, float]]:
-        return self._fixed.found
+        self.fixed.look(known.distances["exact"], part.position[0], was_seen)
 
     def _look_around(self, part: AuditTrace) -> None:
         num = len(part.stamp_ns)
@@ -271,8 +267,7 @@ class ReplayRecord:
             self.hindsight.add(part.stamp_ns, part.position)
         for at, is_timed in self._near.due(part.stamp_ns, self._model.sphere_centers_batch(part.position)).items():
             stamp = int(part.stamp_ns[at])
-            known = self._scene.seen_at(stamp)
-            if known is not None:
+            if (known := self._scene.seen_at(stamp)) is not None:
                 exact = self._scene.at(stamp).distances["exact"]
                 before, q = part.position[at - 1] if at else self._posture_before, part.position[at]
                 way = self._near.on_the_way(before, q) if before is not None and self._is_continuous else ()

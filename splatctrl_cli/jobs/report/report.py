@@ -232,11 +232,14 @@ def _section(
     most, width = (3, 800) if has_space else (1, 640)  # number, and width [px]
     section = section_of(run, anchor=ran.node, title=ran.node, most_pictures=most, width=width)
     if ran.state != DONE:
-        lines = [f"expected: {ran.expect}", *([ran.cause] if ran.cause else []), *section.lines]
-        section = replace(section, state=ran.state, lines=lines, details=[*section.details, _log(batch, ran)])
+        section = replace(
+            section,
+            state=ran.state,
+            lines=[f"expected: {ran.expect}", *([ran.cause] if ran.cause else []), *section.lines],
+            details=[*section.details, _log(batch, ran)],
+        )
     if not has_space:
-        hint = "not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else ""
-        return replace(section, no_space=hint)
+        return replace(section, no_space="not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else "")
     return _in_space(section, run, (batch.path, *request.roots), scenes, f"scene-{len(scenes)}")
 
 

@@ -15,7 +15,7 @@ from splatctrl_cli.evaluate.verdict import (
     Verdict,
     check_gate_names,
     gate_reasons,
-    noted,
+    note,
     parse_gate,
     verdict_of,
 )
@@ -172,8 +172,11 @@ def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageRes
     if request.picture is not None:
         _draw(request.picture, urdf, solids, spheres)
     allowed = max(DEFAULT_MARGIN, request.fit.max_deficit)
-    verdict = _verdict(report, urdf, solids, "robot spheres", request.require, allowed)
-    return CoverageResult(report=report, verdict=verdict, spheres=request.out)
+    return CoverageResult(
+        report=report,
+        verdict=_verdict(report, urdf, solids, "robot spheres", request.require, allowed),
+        spheres=request.out,
+    )
 
 
 def check_robot(request: RobotRequest) -> CoverageResult:
@@ -200,10 +203,13 @@ def robot_pairs(request: RobotRequest) -> PairsResult:
     """Find links that may collide, and why others may not."""
     model = RobotModel.from_urdf(request.urdf, request.spheres, locked=request.locked)
     disabled, foreign = ((), ()) if request.srdf is None else read_srdf(request.srdf, model.urdf)
-    found = self_collision_pairs(
-        model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
+    return PairsResult(
+        found=self_collision_pairs(
+            model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
+        ),
+        num_foreign=len(foreign),
+        doubts=tuple(model.doubts),
     )
-    return PairsResult(found=found, num_foreign=len(foreign), doubts=tuple(model.doubts))
 
 
 def describe_robot(request: RobotRequest) -> RobotResult:
@@ -211,8 +217,11 @@ def describe_robot(request: RobotRequest) -> RobotResult:
     urdf = read_urdf(request.urdf)
     locked = urdf.with_followers(request.locked)
     spheres = own_spheres(urdf) if request.spheres is None else request.spheres
-    model = RobotModel.from_urdf(request.urdf, spheres, locked=locked)
-    return RobotResult(model=model, locked=locked, lost_meshes=_lost_meshes(urdf, request.packages))
+    return RobotResult(
+        model=RobotModel.from_urdf(request.urdf, spheres, locked=locked),
+        locked=locked,
+        lost_meshes=_lost_meshes(urdf, request.packages),
+    )
 
 
 def coverage_summary(report: CoverageReport) -> str:
@@ -271,7 +280,7 @@ def _verdict(
     gates = gate_reasons(require, {name: of(report) for name, of in METRICS.items()}, counts)
     return verdict_of(
         command,
-        [covered, *([noted("coverage", bare)] if bare else []), *gates],
+        [covered, *([note(criterion="coverage", sentence=bare)] if bare else []), *gates],
         scope=f"{report.num_spheres} spheres on {num} links",
         notes=ignored,
         counts=counts,

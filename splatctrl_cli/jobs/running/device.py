@@ -68,8 +68,9 @@ def demanded(name: str, source: str = FIT) -> Device | None:
     try:
         return opened(name, source)
     except DeviceError as error:
-        remedy = f"{error.remedy}, or {TO_CPU}" if error.remedy else TO_CPU
-        raise UsageError(f"--device {name}: {error}", remedy=remedy) from error
+        raise UsageError(
+            f"--device {name}: {error}", remedy=f"{error.remedy}, or {TO_CPU}" if error.remedy else TO_CPU
+        ) from error
 
 
 def automatic(

@@ -80,8 +80,7 @@ def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint
 def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise UsageError naming deciding values that differ from the interrupted run."""
     before, after = dict(_flat(run)), dict(_flat(now))
-    differing = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    if differing:
+    if differing := [name for name in {**before, **after} if before.get(name) != after.get(name)]:
         said = ", ".join(f"{n} was {_shown(before.get(n))}, is {_shown(after.get(n))}" for n in differing[:3])
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise UsageError(

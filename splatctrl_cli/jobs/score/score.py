@@ -152,10 +152,14 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
             for (_, best), (_, worst) in scorer.extremes.values() if request.images != "none" else ():
                 comparison = [best] if worst.title == best.title else [best, worst]
                 comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
-        config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
         made = request.scene if request.scene.is_file() else request.scene / "splats.ply"
-        inputs = {**digests, f"scene/{made.name}": sha256(made)}
-        _write_result(folder, result, config=config, inputs=inputs, stopwatch=stopwatch)
+        _write_result(
+            folder,
+            result,
+            config={"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol},
+            inputs={**digests, f"scene/{made.name}": sha256(made)},
+            stopwatch=stopwatch,
+        )
     return result
 
 
@@ -189,7 +193,6 @@ def _protocol(scorer: Scorer) -> dict[str, Any]:
     """Facts a figure must be published with to be comparable."""
     reference = scorer.reference
     named, split = reference.protocol, reference.split
-    sizes = sorted({view.size for view in scorer.views})
     return {
         "name": "none" if named is None else named.name,
         "source": "none" if named is None else named.source,
@@ -199,7 +202,7 @@ def _protocol(scorer: Scorer) -> dict[str, Any]:
         "left_out_views": None if split is None else list(split.left_out),
         "split": "by camera" if split is None else split.words(),
         "mask_rule": reference.mask_rule,
-        "resolution": [f"{width}x{height}" for width, height in sizes],
+        "resolution": [f"{width}x{height}" for width, height in sorted({view.size for view in scorer.views})],
         "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
         "published_scans": None if named is None or not named.scans else list(named.scans),
         "background": [round(value, 4) for value in scorer.scene.background],
@@ -220,8 +223,9 @@ def _free_mass(path: Path, scene: SceneFolder) -> float:
 def _concluded(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
     if request.baseline is not None:
         report["metrics"] |= changes(report, request.baseline)
-    verdict = score_verdict(report, request.require, is_damaged=is_damaged)
-    return ScoreResult(report=report, verdict=verdict, out=request.out)
+    return ScoreResult(
+        report=report, verdict=score_verdict(report, request.require, is_damaged=is_damaged), out=request.out
+    )
 
 
 def _view_drawer(folder: Path) -> Callable[[ComparisonRow], None]:
@@ -265,8 +269,7 @@ def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
     if not found or recording.scan is None:
         return found
     wanted = [name.strip() for name in recording.scan.split(",") if name.strip()]
-    unknown = [name for name in wanted if name not in found]
-    if unknown:
+    if unknown := [name for name in wanted if name not in found]:
         raise InputError(f"{folder}: no scene {unknown[0]!r}", remedy=f"scenes: {', '.join(found)}")
     return {name: found[name] for name in wanted}
 
@@ -277,9 +280,8 @@ def _score_scans(
     results: dict[str, ScoreResult] = {}
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
-        recording = of_scan(request.recording, scan)
         # gates and baseline apply to the means alone
-        alone = replace(request, scene=scene, recording=recording, require=(), baseline=None)
+        alone = replace(request, scene=scene, recording=of_scan(request.recording, scan), require=(), baseline=None)
         results[scan] = _score_scene(alone, folder and folder / scan, progress)
     report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
     report |= report_of_scans({scan: result.report for scan, result in results.items()})

@@ -245,8 +245,7 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
         raise InputError(f"{model.urdf.path}: expected a way between the waypoints, got none", remedy=REMEDY)
     for choice in reversed(before):
         chosen.insert(0, int(choice[chosen[0]]))
-    waypoints = np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)])
-    return Motion(times=times, waypoints=waypoints)
+    return Motion(times=times, waypoints=np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)]))
 
 
 def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:

@@ -105,8 +105,7 @@ class Chain:
     def _job(self, stage: Stage, values: Mapping[str, float]) -> Job:
         chosen: dict[str, list[Any]] = {}
         for name, key in self.keys.items():
-            options = options_for(key, is_lockstep="lockstep" in self.stages[-1].options)
-            option = options.get(stage.command)
+            option = options_for(key, is_lockstep="lockstep" in self.stages[-1].options).get(stage.command)
             if option is not None:
                 value = int(values[name]) if key.is_whole else values[name]
                 chosen[option] = [self._given(stage, option, values, value)]

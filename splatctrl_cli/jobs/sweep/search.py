@@ -110,11 +110,11 @@ def find_least(
     num = len(alone)
     start = judge([(0.0,) * num])[0]
     best: LeastChange | None = None
-    axes = [(share, k) for k, share in enumerate(alone) if share is not None]
-    if axes:
+    if axes := [(share, k) for k, share in enumerate(alone) if share is not None]:
         share, k = min(axes)
-        first = tuple(share if each == k else 0.0 for each in range(num))
-        best = LeastChange(last=(0.0,) * num, first=first, length=share)
+        best = LeastChange(
+            last=(0.0,) * num, first=tuple(share if each == k else 0.0 for each in range(num)), length=share
+        )
 
     def improved(way: np.ndarray, best: LeastChange | None) -> LeastChange | None:
         length = min(1.0 / way.max(), np.inf if best is None else best.length - tolerance)

@@ -230,8 +230,7 @@ class Runs:
         made = {values: self.nodes_at(point) for values, point in new.items()}
         nodes: dict[str, Node] = {}
         for node in (node for each in made.values() for node in each):
-            other = nodes.setdefault(node.name, self.nodes.get(node.name, node))
-            if other.words != node.words:
+            if nodes.setdefault(node.name, self.nodes.get(node.name, node)).words != node.words:
                 raise UsageError(f"two runs are called {node.name}", remedy="vary fewer keys at once")
         assert self.scheduler is not None
         found = self.scheduler.run(list(nodes.values())) if nodes else {}
@@ -276,12 +275,11 @@ def _found(
         raise InputError(f"{_told(starts)}: is refused: {start.sentence}", remedy="begin at a value that is not")
     _check_settings(run, open_run(runs.out / start.folder), runs.chain)
     flips = [_alone(name, starts, b, runs, request.tolerance) for name, (_, b) in ranges.items()]
-    least = _together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None
     return SweepResult(
         out=request.out,
         before=run.verdict,
         flips=flips,
-        least=least,
+        least=_together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None,
         num_runs=len(runs.nodes),
         num_new=sum(each.started >= began for each in runs.scheduler.runs.values()) if runs.scheduler else 0,
     )
