@@ -46,19 +46,22 @@ def run(args: argparse.Namespace) -> int:
     if args.dry_run:
         planned_nodes = dry_run(request, command_line)
         rows = [(node.name, state, ", ".join(node.needs) or "-") for node, state in planned_nodes]
-        found = [{"id": n.name, "state": s, "needs": n.needs, "words": n.words} for n, s in planned_nodes]
-        lines = [*table(("node", "state", "needs"), rows), ""]
+        commands = (f"splatctrl {shlex.join(node.words)}" for node, _ in planned_nodes)
         return console.result(
-            {"nodes": found}, [*lines, *(f"splatctrl {shlex.join(n.words)}" for n, _ in planned_nodes)]
+            {"nodes": [{"id": n.name, "state": s, "needs": n.needs, "words": n.words} for n, s in planned_nodes]},
+            [*table(("node", "state", "needs"), rows), "", *commands],
         )
     result = batch(request, command_line, console)
-    printed = {
-        "out": str(result.out),
-        "suite": result.suite,
-        "kept": result.num_kept,
-        "nodes": [run.document() for run in result.runs],
-    }
-    code = console.concluded(result.verdict, printed, _lines(result, is_long=args.verbose > 0))
+    code = console.concluded(
+        result.verdict,
+        {
+            "out": str(result.out),
+            "suite": result.suite,
+            "kept": result.num_kept,
+            "nodes": [run.document() for run in result.runs],
+        },
+        _lines(result, is_long=args.verbose > 0),
+    )
     publish(suites_of(result), junit=args.junit, is_fatal=code != 0)
     return code
 
@@ -126,8 +129,9 @@ def _parser_of(command: str) -> Parser:
 
 
 def _action(parser: Parser, command: str, name: str) -> argparse.Action:
-    by_name = {option.removeprefix("--"): action for option, action in parser._option_string_actions.items()}
-    by_name |= {action.dest: action for action in parser._actions if not action.option_strings}
+    by_name = {option.removeprefix("--"): action for option, action in parser._option_string_actions.items()} | {
+        action.dest: action for action in parser._actions if not action.option_strings
+    }
     if name not in by_name:
         raise UsageError(
             f"{command} has no option {name!r}",
@@ -198,5 +202,7 @@ def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, c
         write_csv(args.csv, runs)
         console.log(f"wrote {len(runs)} runs to {args.csv}")
     rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
-    lines = table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"]
-    return console.result({"nodes": [run.document() for run in runs]}, lines)
+    return console.result(
+        {"nodes": [run.document() for run in runs]},
+        table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"],
+    )

@@ -47,9 +47,8 @@ def run(args: argparse.Namespace) -> int:
 
 def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
     """The recording at `path`, or at --dtu."""
-    is_dtu = args.dtu is not None
-    given = {"path": args.dtu or path, "is_dtu": is_dtu, "options": source_options(args), "masks": masks}
-    return request_of(RecordingRequest, args, **given)
+    options, is_dtu = source_options(args), args.dtu is not None
+    return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=is_dtu, options=options, masks=masks)
 
 
 def show_reconstructed(console: Console, result: ReconstructResult) -> int:

@@ -44,9 +44,13 @@ def show_scored(console: Console, result: ScoreResult) -> int:
 
 def _request(args: argparse.Namespace) -> ScoreRequest:
     first, *beside = args.reference or [None]
-    recording = replace(recording_of(args, first, args.masks), beside=tuple(beside))
-    given = {"recording": recording, "newest": args.snapshots == "newest", "cloud": _cloud(args)}
-    return request_of(ScoreRequest, args, **given)
+    return request_of(
+        ScoreRequest,
+        args,
+        recording=replace(recording_of(args, first, args.masks), beside=tuple(beside)),
+        newest=args.snapshots == "newest",
+        cloud=_cloud(args),
+    )
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
@@ -100,12 +104,14 @@ def _lines_of_scans(report: Mapping[str, Any]) -> Iterator[str]:
     metrics, results = report["metrics"], report["results"]
     columns = [name for name in COLUMNS if name in metrics]
     rows = [[s, one["metrics"]["num_views"], *_cells(columns, one["metrics"])] for s, one in results.items()]
-    mean = [f"mean of {len(results)}", metrics["num_views"]]
-    yield from _with_mean(("scan", "views"), columns, rows, mean, metrics)
+    yield from _with_mean(
+        ("scan", "views"), columns, rows, [f"mean of {len(results)}", metrics["num_views"]], metrics
+    )
     yield from ("", *_protocol_lines(report["protocol"]))
     if "chamfer" in metrics:
-        words = (one["protocol"]["definitions"]["cloud"] for one in results.values())
-        yield from _cloud_lines(metrics, "; ".join(words))
+        yield from _cloud_lines(
+            metrics, "; ".join(one["protocol"]["definitions"]["cloud"] for one in results.values())
+        )
 
 
 def _with_mean(

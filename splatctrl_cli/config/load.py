@@ -6,11 +6,10 @@ import json
 import math
 import tomllib
 import types
-import typing
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, get_args, get_origin, get_type_hints
 
 from splatctrl_cli.config.ranges import Declared, Section, Within, check, cut, shown
 from splatctrl_cli.config.sections import (
@@ -104,8 +103,7 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     for name in [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]:
         _check_known(name, PRESETS, "--preset", "")
-        for section, values in PRESETS[name].items():
-            yield f"--preset {name}", section, values
+        yield from ((f"--preset {name}", section, values) for section, values in PRESETS[name].items())
     for section, values in ({} if path is None else _read_toml(path)).items():
         _check_known(section, [field.name for field in fields(Config)], str(path), "")
         if not isinstance(values, dict):
@@ -133,12 +131,12 @@ def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
     """Typed values. Raises UsageError for unknown keys or types."""
     kind = type(getattr(Config(), section))
     assert issubclass(kind, Section)
-    hints, declared = typing.get_type_hints(kind), kind.declared
+    hints, declared = get_type_hints(kind), kind.declared
     typed: dict[str, Any] = {}
     for key, value in values.items():
         _check_known(key, declared, where, f"{section}.")
         typed[key] = _of_type(value, hints[key])
-        if type(typed[key]) not in [typing.get_origin(option) or option for option in _options(hints[key])]:
+        if type(typed[key]) not in [get_origin(option) or option for option in _options(hints[key])]:
             expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
             expected += declared[key].expected
             raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {shown(value)}")
@@ -148,8 +146,10 @@ def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
 def _check_known(name: str, known: Collection[str], where: str, prefix: str) -> None:
     if name not in known:
         first = ", ".join(list(known)[:8]) + (", ... (splatctrl help config has all)" if len(known) > 8 else "")
-        choices = did_you_mean(name, known, f"known here: {first}", prefix=prefix, cutoff=0.4)
-        raise UsageError(f"{where}: unknown key {prefix}{name}", remedy=choices)
+        raise UsageError(
+            f"{where}: unknown key {prefix}{name}",
+            remedy=did_you_mean(name, known, f"known here: {first}", prefix=prefix, cutoff=0.4),
+        )
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -176,7 +176,7 @@ def type_name(hint: Any) -> str:
 
 
 def _options(hint: Any) -> tuple[Any, ...]:
-    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    return get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
 
 
 def _of_type(value: Any, hint: Any) -> Any:

@@ -2,10 +2,9 @@
 
 import copy
 import math
-import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args, get_type_hints
 
 from splatctrl_cli.errors import UsageError
 
@@ -71,7 +70,7 @@ class Section:
 
     def __init_subclass__(cls, *, section: str) -> None:
         """Raises TypeError for a key without a range."""
-        hints = typing.get_type_hints(cls, include_extras=True)
+        hints = get_type_hints(cls, include_extras=True)
         cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
 
     def derived(self, **values: float) -> Self:
@@ -92,7 +91,7 @@ class Section:
 
 
 def _declared(hint: Any) -> Declared:
-    for note in typing.get_args(hint)[1:]:
+    for note in get_args(hint)[1:]:
         if isinstance(note, Within | OneOf):
             return note
     raise TypeError(f"{hint}: expected Annotated with a range or words")

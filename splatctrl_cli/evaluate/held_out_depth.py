@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_GOOD_OVERLAP, CLOUD_NO_OVERLAP
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.field_accuracy import (
     BandAccuracy,
@@ -39,7 +38,7 @@ def cloud_score(
     reference: Float64,
     seen: Bool,
     *,
-    max_distance: float = CLOUD_DISTANCE,
+    max_distance: float = fixed.CLOUD_DISTANCE,
     counts: Bool | None = None,
     unit: float = 1.0,
     threads: int = 1,
@@ -88,7 +87,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
     factors = (1.0, 1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
     fits = {factor: _overlap(some, factor * others, margin) for factor in factors}
     best = max(fits, key=lambda factor: fits[factor])
-    if fits[1.0] < CLOUD_NO_OVERLAP and fits[best] > CLOUD_GOOD_OVERLAP:
+    if fits[1.0] < fixed.CLOUD_NO_OVERLAP and fits[best] > fixed.CLOUD_GOOD_OVERLAP:
         raise NotEvaluableError(
             f"the reference cloud: expected the size of the scene's surface, which spans {_box(points)} m, got"
             f" {_box(reference)} m; {best:g} times as large it overlaps by {100 * fits[best]:.0f}%",
@@ -305,8 +304,9 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
             is_chosen &= counted[index]
         is_edge = depth_edges(frame.depth)
         num_edges += int(np.count_nonzero(is_chosen & is_edge))
-        here = back_project(frame.intrinsics, frame.depth)[is_chosen & ~is_edge]
-        points_world = transform_points(frame.T_world_camera, here)
+        points_world = transform_points(
+            frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[is_chosen & ~is_edge]
+        )
         points.append(points_world[box.contains(points_world)])
         eyes.append(np.broadcast_to(frame.T_world_camera[:3, 3], points[-1].shape))
     return np.concatenate(points), np.concatenate(eyes), num_edges

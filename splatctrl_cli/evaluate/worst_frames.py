@@ -35,17 +35,8 @@ class Moment:
     caption: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sight:
-    """The image that shows a moment best."""
-
-    moment: Moment
-    frame: RgbdFrame
-
-    @property
-    def age_s(self) -> float:
-        """Age [s] of the image at the moment."""
-        return (self.moment.stamp_ns - self.frame.stamp_ns) * 1e-9
+Sight = tuple[Moment, RgbdFrame]
+"""A moment, and the image that shows it best."""
 
 
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
@@ -89,12 +80,15 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
     return found
 
 
-def draw_sight(path: Path, sight: Sight) -> None:
+def draw_sight(path: Path, moment: Moment, frame: RgbdFrame) -> None:
     """Write the image with the spheres' silhouettes, the worst bold, a line to its obstacle, and the caption."""
-    moment, frame = sight.moment, sight.frame
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
-    image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
-    picture = np.asarray(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    picture = np.asarray(
+        cv2.resize(
+            cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC
+        ),
+        dtype=np.uint8,
+    )
     T_camera_world = np.linalg.inv(frame.T_world_camera)
     centers = moment.centers @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
     for index in np.argsort(-centers[:, 2]):
@@ -114,7 +108,7 @@ def draw_sight(path: Path, sight: Sight) -> None:
 
 def _best(moment: Moment, newest: dict[str, RgbdFrame]) -> Sight | None:
     frames = [newest[camera] for camera in sorted(newest)]
-    return Sight(moment=moment, frame=max(frames, key=lambda frame: _view(moment, frame))) if frames else None
+    return (moment, max(frames, key=lambda frame: _view(moment, frame))) if frames else None
 
 
 def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:

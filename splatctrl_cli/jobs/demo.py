@@ -176,16 +176,18 @@ def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step
 
     def reconstructed() -> ReconstructResult:
         source, options = open_to_train(training), {**DECIDING_OPTIONS, "cameras": ",".join(TRAINING)}
-        asked = ReconstructRequest(
-            source=source,
-            out=scene,
-            config=Config(scene=BUDGET),
-            urdf=urdf,
-            spheres=spheres,
-            options=options,
-            threads=threads,
+        return reconstruct(
+            ReconstructRequest(
+                source=source,
+                out=scene,
+                config=Config(scene=BUDGET),
+                urdf=urdf,
+                spheres=spheres,
+                options=options,
+                threads=threads,
+            ),
+            progress,
         )
-        return reconstruct(asked, progress)
 
     steps: tuple[tuple[str, Callable[[], StepResult], str], ...] = (
         ("info {data}/log.mcap", lambda: describe(log, SourceOptions()), "done"),

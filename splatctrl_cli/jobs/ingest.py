@@ -104,6 +104,9 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
 
 def _identity(options: SourceOptions, inputs: Mapping[str, str]) -> dict[str, Any]:
     versions = {name: metadata.version(name) for name in ("numpy", "opencv-python-headless")}
-    values = {"splatctrl": __version__, **versions, "options": asdict(options), "sha256": dict(inputs)}
-    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
+    plain: dict[str, Any] = json.loads(
+        json.dumps(
+            {"splatctrl": __version__, **versions, "options": asdict(options), "sha256": dict(inputs)}, default=str
+        )
+    )
     return plain

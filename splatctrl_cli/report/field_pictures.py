@@ -21,7 +21,6 @@ from splatctrl_cli.report.pictures import (
     draw_never_seen,
     drawn_figure,
     extent_of,
-    save_figure,
     set_grid,
 )
 from splatctrl_cli.voxels import VoxelState
@@ -53,7 +52,7 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is veiled and hatched.
     """
-    with _panels(grid, point) as (figure, panels):
+    with _panels(path, grid, point) as (figure, panels):
         for axes, cut in panels:
             image = draw_distance(axes, cut.coordinates, cut.of(grid, "sdf"), cut.voxel, names_lines=False)
             if _knows_seen(grid):
@@ -63,12 +62,11 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
         lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
         field = grid.header.get("sdf", "positive outside")
         figure.suptitle(f"Distance in world: {field}; lines at {lines} cm{never}", fontsize=12)
-        save_figure(figure, path)
 
 
 def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
     """Write slices of `probability` through the cell nearest to `point` [m], with the surface."""
-    with _panels(grid, point) as (figure, panels):
+    with _panels(path, grid, point) as (figure, panels):
         for axes, cut in panels:
             image = axes.imshow(
                 cut.of(grid, "probability"),
@@ -82,7 +80,6 @@ def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) 
             _surface(axes, cut, grid, "white")
         figure.colorbar(image, ax=[axes for axes, _ in panels], label="probability of collision", pad=0.01)
         figure.suptitle(f"Probability of collision, {grid.header.get('probability', '')}; white line: sdf = 0")
-        save_figure(figure, path)
 
 
 def gradient_picture(
@@ -96,7 +93,7 @@ def gradient_picture(
     (cut,) = _cuts(grid, point, axes=(2,))
     sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]
     height = float(np.clip(0.5 * (WIDTH - 2.5) * sides[1] / sides[0] + 1.2, 4.0, 8.0))
-    with drawn_figure(height) as figure:
+    with drawn_figure(path, height) as figure:
         left, right = figure.subplots(1, 2)
         image = left.imshow(
             np.linalg.norm(cut.of(grid, "gradient"), axis=2),
@@ -111,7 +108,6 @@ def gradient_picture(
         figure.colorbar(image, ax=left, extend="both", label="length of the gradient", fraction=0.05, pad=0.02)
         _label(left, cut)
         _draw_histogram(right, histogram, bin_width)
-        save_figure(figure, path)
 
 
 def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> None:
@@ -138,13 +134,13 @@ def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> No
 
 @contextmanager
 def _panels(
-    grid: DistanceGrid, point: Sequence[float]
+    path: Path, grid: DistanceGrid, point: Sequence[float]
 ) -> Iterator[tuple["mpl.figure.Figure", list[tuple[Any, Cut]]]]:
-    """Axes for slices across z, y and x, at one scale."""
+    """Axes for slices across z, y and x, at one scale, written to `path`."""
     cuts = _cuts(grid, point, axes=(2, 1, 0))
     sides = np.array([[float(np.ptp(c)) + cut.voxel for c in cut.coordinates] for cut in cuts])
     height = float(np.clip((WIDTH - 3.2) * sides[:, 1].max() / sides[:, 0].sum() + 1.5, 3.2, 9.0))
-    with drawn_figure(height) as figure:
+    with drawn_figure(path, height) as figure:
         panels = figure.subplots(1, 3, gridspec_kw={"width_ratios": sides[:, 0]})
         for axes, cut in zip(panels, cuts, strict=True):
             _label(axes, cut)
@@ -234,7 +230,7 @@ def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: st
 
     A calibrated probability lies on the diagonal.
     """
-    with drawn_figure(5.6) as figure:
+    with drawn_figure(path, 5.6) as figure:
         axes, bars = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1, 1]})
         axes.plot([0, 1], [0, 1], color=INK, linewidth=1.0, linestyle=(0, (6, 3)))
         axes.annotate(
@@ -259,4 +255,3 @@ def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: st
         for panel in (axes, bars):
             set_grid(panel, "both")
         figure.legend(frameon=False, loc="outside lower center", ncols=2)
-        save_figure(figure, path)

@@ -80,8 +80,9 @@ def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, requ
     stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
     shape = grid.channels["sdf"].shape
     num_cells = int(np.prod(shape))
-    count = min(num_cells, COMPARED_CELLS)
-    drawn = np.sort(np.random.default_rng(request.seed).choice(num_cells, count, replace=False))
+    drawn = np.sort(
+        np.random.default_rng(request.seed).choice(num_cells, min(num_cells, COMPARED_CELLS), replace=False)
+    )
     points = grid.origin + grid.voxel * np.stack(np.unravel_index(drawn, shape), axis=1)
     chunks = np.array_split(points, -(-len(points) // 50_000))  # else large (points x primitives) arrays
     distances, surfaces = zip(*(truth.closest(chunk, stamp_ns) for chunk in chunks), strict=True)
@@ -149,8 +150,9 @@ def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request:
             centers = robot.sphere_centers(robot.positions_of(recording.joint_names, at.position))
             spheres = centers, robot.sphere_set.radii
         counted.append(counted_pixels(frame, source.workspace, spheres))
-    frames = [frame for frame, _ in newest.values()]
-    return compare_with_held_out_depth(grid, frames, seed=request.seed, counted=counted)
+    return compare_with_held_out_depth(
+        grid, [frame for frame, _ in newest.values()], seed=request.seed, counted=counted
+    )
 
 
 def _held_out_cameras(

@@ -235,5 +235,6 @@ def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progre
             raise UsageError(f"--device {request.device}: --update bakes on the processor", remedy=TO_CPU)
         return Device()
     is_matern = KERNEL_OF[request.config.field.distance] == "gpdf"
-    is_enough = layout.num_cells * (num_splats if is_matern else CARD_SPLATS) >= CARD_LEAST_BAKE
-    return chosen(request.device, is_enough, progress)
+    return chosen(
+        request.device, layout.num_cells * (num_splats if is_matern else CARD_SPLATS) >= CARD_LEAST_BAKE, progress
+    )

@@ -160,7 +160,6 @@ def suites_of(result: BatchResult) -> list[Suite]:
     suites = list[Suite]()
     for recording in dict.fromkeys(run.recording for run in result.runs):
         runs = [run for run in result.runs if run.recording == recording]
-        began = datetime.fromtimestamp(min(run.started for run in runs), UTC).isoformat(timespec="seconds")
         cases = [
             replace(case, seconds=0.0 if number else run.seconds)  # the first case of a node has its time
             for run in runs
@@ -172,7 +171,7 @@ def suites_of(result: BatchResult) -> list[Suite]:
                 name=recording,
                 cases=cases,
                 properties=properties,
-                started=began,
+                started=datetime.fromtimestamp(min(run.started for run in runs), UTC).isoformat(timespec="seconds"),
                 seconds=sum(run.seconds for run in runs),
             )
         )
@@ -183,8 +182,14 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
     if run.state == SKIPPED:
         return [skipped_case(run.node, run.cause)]
     if run.state == ERROR:
-        said = run.cause or run.sentence or run.label
-        return [error_case(run.node, said, exit_code=run.exit_code, lines=last_lines(out / run.log))]
+        return [
+            error_case(
+                run.node,
+                run.cause or run.sentence or run.label,
+                exit_code=run.exit_code,
+                lines=last_lines(out / run.log),
+            )
+        ]
     verdict = verdict_in(out / run.result)
     if run.state == FAILED:
         wrong = Case(name="expected", group=run.node, kind=Kind.FAILED, sentence=told(run), text=str(_reason(run)))

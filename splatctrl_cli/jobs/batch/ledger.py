@@ -144,7 +144,11 @@ class Ledger(AbstractContextManager["Ledger"]):
             row = self._base.execute("SELECT owner FROM claims WHERE node = ?", (node,)).fetchone()
             if row is not None and row["owner"] != self._owner and self._is_alive(row["owner"]):
                 return False
-            self._hold()
+            if self._lock is None:  # a file of this process, locked until it ends
+                place = self.folder / OWNERS / self._owner
+                place.parent.mkdir(exist_ok=True)
+                self._lock = place.open("w")
+                fcntl.flock(self._lock, fcntl.LOCK_EX)
             self._base.execute("INSERT OR REPLACE INTO claims VALUES (?, ?)", (node, self._owner))
         return True
 
@@ -210,14 +214,6 @@ class Ledger(AbstractContextManager["Ledger"]):
             raise
         self._base.execute("COMMIT")
 
-    def _hold(self) -> None:
-        """Lock a file of this process, until it ends."""
-        if self._lock is None:
-            place = self.folder / OWNERS / self._owner
-            place.parent.mkdir(exist_ok=True)
-            self._lock = place.open("w")
-            fcntl.flock(self._lock, fcntl.LOCK_EX)
-
     def _is_alive(self, owner: str) -> bool:
         place = self.folder / OWNERS / owner
         try:
@@ -275,11 +271,12 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
     outs = {node.name: str(node.out) for node in nodes}
     for node in nodes:
         digests |= {path: _digest(path, ledger) for path in node.inputs if path not in digests}
-        named = {str(path): digests[path] for path in node.inputs}
-        named |= {outs[need]: keys[need] for need in node.needs} | {str(node.out): "out"}
+        named = {str(path): digests[path] for path in node.inputs} | {outs[need]: keys[need] for need in node.needs}
+        named[str(node.out)] = "out"
         inputs = [digests[path] for path in node.inputs] + [keys[need] for need in node.needs]
-        said = [entry, code, node.command, *inputs, *_said(node.words, named)]
-        keys[node.name] = hashlib.sha256(json.dumps(said).encode()).hexdigest()
+        keys[node.name] = hashlib.sha256(
+            json.dumps([entry, code, node.command, *inputs, *_said(node.words, named)]).encode()
+        ).hexdigest()
     return keys
 
 

@@ -208,8 +208,10 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
         "num_worse": len(alone) + sum(one.change is Change.WORSE for one in jobs),
         "num_better": sum(one.change is Change.BETTER for one in found),
     }
-    weighed = [(-one.share, one.metric, _of_figure(one, after.kind)) for one in alone]
-    weighed += [(-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE]
+    weighed = [
+        *((-one.share, one.metric, _of_figure(one, after.kind)) for one in alone),
+        *((-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE),
+    ]
     ordered = sorted(weighed, key=lambda one: one[:2])
     reasons = [*_of_verdicts(verdicts, after), *(reason for *_, reason in ordered), *_of_single(jobs)]
     lone = ((before, only_before), (after, only_after))

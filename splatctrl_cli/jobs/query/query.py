@@ -126,10 +126,9 @@ class SceneAnswers:
 
     def complete(self, points: Float64, of_grid: Answers) -> Answers:
         """Add the scene's answers to a grid's; probability is at the grid's distance."""
-        mine = self.at(points)
         probability = self._probability.at(points, of_grid.distance)
         return replace(
-            mine,
+            self.at(points),
             in_box=of_grid.in_box,
             distance=of_grid.distance,
             gradient=of_grid.gradient,

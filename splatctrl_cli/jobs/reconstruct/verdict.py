@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatctrl_cli.calibration.displacement import is_corrected, is_displaced
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import MISPLACED
+from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, verdict_of
 from splatctrl_cli.records import LossReport
@@ -173,7 +172,7 @@ def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
         criterion="calibration",
         sentence=sentence,
         value=row["distance_mm"],
-        threshold=1e3 * MISPLACED,
+        threshold=1e3 * fixed.MISPLACED,
         unit="mm",
         who=camera,
         remedy="find the cameras' poses ('splatctrl calibrate'), and give --calibration",
@@ -182,9 +181,8 @@ def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
 
 
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
-    for camera, row in made.metrics["displaced_cameras"].items():
-        if is_displaced(row):
-            yield displaced_camera(camera, row)
+    cameras = made.metrics["displaced_cameras"]
+    yield from (displaced_camera(camera, row) for camera, row in cameras.items() if is_displaced(row))
     told = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
     if not told:
         return

@@ -10,19 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import (
-    CLOCK_MIXED,
-    RECORDINGS_APART_NS,
-    SAME_CLEARANCE,
-    SAME_LENS_PIXELS,
-    SAME_LINK,
-    SAME_LINK_AREA,
-    SAME_MOTION_STATES,
-    SAME_PICTURE_LEVELS,
-    SAME_POSE_DEGREES,
-    SAME_POSE_METRES,
-)
+from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.evaluate.verdict import Reason, lacking
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder
 from splatctrl_cli.geometry import compare_poses
@@ -91,17 +79,17 @@ def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
     if then[4:].tolist() != now[4:].tolist():
         return [f"{camera}: images of {now[4]:g}x{now[5]:g}, not {then[4]:g}x{then[5]:g}"]
     gap = float(np.abs(then[:4] - now[:4]).max())
-    if gap > SAME_LENS_PIXELS:
+    if gap > fixed.SAME_LENS_PIXELS:
         lines.append(f"{camera}: intrinsics differ by {gap:.1f} px")
     if apart := (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9:
         side = "after" if apart > 0 else "before"
         lines.append(f"{camera}: its nearest frame is {abs(apart):.3g} s {side} the one that trained")
     then_pose = np.array(first["T_world_camera"], np.float64).reshape(4, 4)
     metres, degrees = compare_poses(then_pose, frame.T_world_camera)
-    if metres > SAME_POSE_METRES or degrees > SAME_POSE_DEGREES:
+    if metres > fixed.SAME_POSE_METRES or degrees > fixed.SAME_POSE_DEGREES:
         lines.append(f"{camera}: the pose differs by {1e3 * metres:.0f} mm and {degrees:.1f} degrees")
     levels = float(np.abs(np.array(first["tiles"]) - np.array(_tiles(frame.color))).max())
-    if levels > SAME_PICTURE_LEVELS:
+    if levels > fixed.SAME_PICTURE_LEVELS:
         lines.append(f"{camera}: the picture differs by up to {levels:.0f} of 255 levels")
     return lines
 
@@ -209,9 +197,9 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
         if link not in ours:
             return f"with link {link}, which this one lacks: nothing else stands for it"
         off = np.abs(np.subtract(corners, ours[link][:-1])).max()
-        if off > SAME_LINK:
+        if off > fixed.SAME_LINK:
             return f"whose link {link} reaches {1e3 * off:.1f} mm farther, or less far"
-        if abs(area / ours[link][-1] - 1) > SAME_LINK_AREA:
+        if abs(area / ours[link][-1] - 1) > fixed.SAME_LINK_AREA:
             return f"whose link {link} has a surface of {area:.4f} m^2, not {ours[link][-1]:.4f}"
     return ""
 
@@ -220,12 +208,12 @@ def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Reason | None:
     """Mismatch of states at stamps (T,) [ns], T > 0, and a scene's span; None if they (nearly) overlap."""
     first, last = int(states_ns[0]), int(states_ns[-1])
     apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
-    if apart_ns <= RECORDINGS_APART_NS:
+    if apart_ns <= fixed.RECORDINGS_APART_NS:
         return None
     ours, theirs = (f"from {start * 1e-9:.2f} to {end * 1e-9:.2f} s" for start, end in ((first, last), scene_ns))
     return lacking(
         sentence=f"joint states {ours} and a scene {theirs} are "
-        + ("on clocks that do not overlap" if (apart_ns > CLOCK_MIXED * 1e9) else "of different times"),
+        + ("on clocks that do not overlap" if (apart_ns > fixed.CLOCK_MIXED * 1e9) else "of different times"),
         remedy="record both by one clock, or reconstruct this log",
     )
 
@@ -269,12 +257,12 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Rea
     own = own.moved_by(truth.joint_names)
     moving = np.flatnonzero(own.moving_spheres)
     worst = 0.0
-    for stamp in shared[:: max(len(shared) // SAME_MOTION_STATES, 1)]:
+    for stamp in shared[:: max(len(shared) // fixed.SAME_MOTION_STATES, 1)]:
         q = states.position[int(np.searchsorted(stamps, stamp))]
         gap = truth.distance(own.sphere_centers(q)[moving], int(stamp)) - own.sphere_set.radii[moving]
         recorded = truth.clearance[int(np.searchsorted(truth.stamps, stamp))]
         worst = max(worst, abs(float(gap.min()) - float(recorded)))
-    if worst <= SAME_CLEARANCE:
+    if worst <= fixed.SAME_CLEARANCE:
         return None
     return lacking(
         sentence=f"{truth.path} is of another recording: the logged motion has clearances up to {1e3 * worst:.0f} mm "

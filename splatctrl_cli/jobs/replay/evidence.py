@@ -315,8 +315,7 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
     truth = Rows(clearances)
     events = _true_events(inputs, replay, np.asarray(truth), Rows(nearest_spheres))
     merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
-    found = replace(replay, true_clearance=truth, events=merged)
-    return found, TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
+    return replace(replay, true_clearance=truth, events=merged), TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
 
 
 def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
@@ -325,7 +324,7 @@ def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
     return replace(
         replay,
         agreement={
-            name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)
+            name: clearance_agreement(np.asarray(of), truth, surfaces.seen, replay.median_radius)
             for name, of in replay.audit.clearance.items()
         },
     )
@@ -348,7 +347,6 @@ def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spher
     model, truth, audit = inputs.model, inputs.truth, replay.audit
     assert truth is not None
     names = sphere_names(model.sphere_set)
-    nearest = np.asarray(spheres[: len(clearance)], np.int64)
     fold = EventFold()
 
     def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
@@ -359,5 +357,9 @@ def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spher
         x, y, z = (float(v) for v in surface[0])
         return Obstacle(distance=float(distance[0]), position=(x, y, z), name=least.name)
 
-    fold.add(audit.stamp_ns, clearance_signals("true", clearance, nearest, replay.margin, names), near)
+    fold.add(
+        audit.stamp_ns,
+        clearance_signals("true", clearance, np.asarray(spheres[: len(clearance)], np.int64), replay.margin, names),
+        near,
+    )
     return fold.events()

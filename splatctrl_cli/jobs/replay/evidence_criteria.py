@@ -301,9 +301,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
             remedy="find the cameras' poses ('splatctrl calibrate'), and give --calibration to reconstruct",
             count=int(figures["displaced_cameras"][camera[0]]["num_pixels"]),
         )
-    for name, row in (figures.get("displaced_cameras") or {}).items():
-        if is_corrected(row):
-            yield displaced_camera(name, row)
+    cameras = figures.get("displaced_cameras") or {}
+    yield from (displaced_camera(name, row) for name, row in cameras.items() if is_corrected(row))
     residual, by_link = figures.get("self_mask_residual_mm"), figures.get("self_mask")
     if residual is None or not isinstance(by_link, dict):
         return

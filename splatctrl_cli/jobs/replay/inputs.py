@@ -97,8 +97,9 @@ def measured_robot(
     except InputError as error:
         model, surfaces = model.with_coverage(None, str(error)), None
     else:
-        report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=COVERED_COARSE)
-        model = model.with_coverage(report)
+        model = model.with_coverage(
+            coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=COVERED_COARSE)
+        )
         surfaces = SelfSurfaces(model, solids, disabled, recorded)
     if config.coverage == "margin":
         _check_bounded(model)

@@ -6,8 +6,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import MOTION_WINDOW
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.events import first_intervention
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
@@ -53,7 +52,7 @@ def num_states(replay: Replay) -> int:
 
 def is_blank(replay: Replay) -> Bool:
     """(T,) True where a field has no distance."""
-    return np.asarray(np.any([np.isnan(of.distance) for of in replay.audit.clearance.values()], axis=0))
+    return np.asarray(np.any([np.isnan(np.asarray(of)) for of in replay.audit.clearance.values()], axis=0))
 
 
 def _single(
@@ -79,7 +78,9 @@ def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], 
 
 def _num_sudden(replay: Replay) -> int:
     since = replay.audit.stamp_ns - replay.audit.stamp_ns[0]
-    return int(np.sum(since >= 2 * MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
+    return (
+        int(np.sum(since >= 2 * fixed.MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
+    )
 
 
 def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
@@ -303,8 +304,8 @@ def metric_scales(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
     """Comparison scales of `metrics_of` and of the log's own figures, by name."""
-    scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)} | LOG_FIGURES
-    scales |= TWIST_FIGURES if has_twists else {}
+    of_states = {metric.name: metric.scale for metric in _declared(mode, of_fields)}
+    scales = of_states | LOG_FIGURES | (TWIST_FIGURES if has_twists else {})
     if has_truth:
         scales |= {f"truth_{figure}_{name}": scale for name in of_fields for figure, scale in AGREEMENT.items()}
         scales["truth_tolerance"] = LENGTH

@@ -43,7 +43,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
     clearance = judged.replay.audit.clearance
     if "certified" not in clearance:
         return
-    least, exact = (lowest(clearance[name].distance) for name in ("certified", "exact"))
+    least, exact = (lowest(np.asarray(clearance[name])) for name in ("certified", "exact"))
     if least is None or exact is None or not least < judged.threshold <= exact:
         yield from _by_source(judged, "certified")
         return
@@ -74,8 +74,7 @@ def true_clearance(judged: Judged) -> Iterator[Reason]:
 
 def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     replay = judged.replay
-    values = replay.true_clearance if source == "true" else replay.audit.clearance[source].distance
-    least = lowest(np.asarray(values))
+    least = lowest(np.asarray(replay.true_clearance if source == "true" else replay.audit.clearance[source]))
     if least is None:
         return
     if least >= judged.threshold:
@@ -101,7 +100,7 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
 
 def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
     replay = judged.replay
-    least = lowest(replay.audit.clearance["exact"].distance)
+    least = lowest(np.asarray(replay.audit.clearance["exact"]))
     assert least is not None
     if least >= judged.threshold:
         yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
@@ -142,8 +141,11 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     if least is None or not np.isfinite(least):
         return
     if not events:
-        apart = held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
-        yield _beside_fixture(judged) or _brought_together(judged) or apart
+        yield (
+            _beside_fixture(judged)
+            or _brought_together(judged)
+            or held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
+        )
         return
     worst = min(events, key=lambda event: event.worst)
     yield _at_worst(
@@ -346,7 +348,7 @@ def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
     The last two are None if unknown. If the spheres break the margin, they are None and the first is NaN.
     """
     clearance = judged.replay.audit.clearance
-    spheres = lowest(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
+    spheres = lowest(np.asarray(clearance["certified" if "certified" in clearance else "exact"]))  # as `surface` is
     if spheres is None or spheres < judged.threshold:
         return np.nan, None, None
     return spheres, lowest(judged.replay.between["surface"]), lowest(judged.replay.between["lower"])

@@ -92,13 +92,13 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
                 found = replace(found, map_error=map_error(evidence, inputs, found.audit, config.verdict))
         metrics = metrics_of(found) | logged.metrics()
         with stopwatch.stage("verdict"):
-            judged = Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
-            verdict = replay_verdict(judged)
+            verdict = replay_verdict(
+                Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
+            )
         with stopwatch.stage("worst_frames"):
             unseen = draw_worst_frames(folder, found, sights)
         write_json(folder / "states.json", logged.as_dict())
-        by_surface = () if found.closed_loop is None else found.closed_loop.by_surface
-        of_robot = words_of(robot, config.control, by_surface)
+        of_robot = words_of(robot, config.control, () if found.closed_loop is None else found.closed_loop.by_surface)
         write_replay(
             folder, found, metrics, verdict, of_robot, config=config, inputs=inputs.digests, stopwatch=stopwatch
         )
@@ -157,8 +157,7 @@ def _read(
     if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
         raise InputError(other.sentence, remedy=other.remedy)
     declared = declarations_of(request.declare, model)
-    meant = (*declared.expected_contact, *grasp_contacts(model, logged.states))
-    declared = replace(declared, expected_contact=meant)
+    declared = replace(declared, expected_contact=(*declared.expected_contact, *grasp_contacts(model, logged.states)))
     evidence = open_evidence(request, model)
     source = logged.source
     reads_all = request.lockstep and request.evidence not in source.cameras  # none of them is evidence

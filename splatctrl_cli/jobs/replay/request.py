@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from dataclasses import field as made_by
 from pathlib import Path
 
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.events import Event
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
@@ -55,7 +54,7 @@ class ReplayRequest(RobotOptions, RunOptions):
     lockstep: bool = False
     latency: float = 0.0
     allow_disagreement: bool = False
-    max_pose_jump: float = POSE_JUMP
+    max_pose_jump: float = fixed.POSE_JUMP
     self_model: Path | None = None
     srdf: Path | None = None
     mode: str = "audit"

@@ -266,15 +266,21 @@ def _cell(ran: Run | None, linked: set[str]) -> Cell:
 
 
 def _list(title: str, jobs: Sequence[_Job], linked: set[str]) -> Table:
-    rows = []
-    for job in jobs:
-        ran = job.ran
-        name = Cell(text=ran.node, link=ran.node if ran.node in linked else "")
-        least = None if job.least == math.inf else round(1e3 * job.least, 1)
-        words = ran.sentence or ran.cause
-        cost = (ran.seconds or None, ran.peak_mb or None)
-        cells = (name, f"{ran.label or ran.state}{ran.damage}", ran.expect, least, words, *cost)
-        rows.append((cells, ran.state))
+    rows = [
+        (
+            (
+                Cell(text=job.ran.node, link=job.ran.node if job.ran.node in linked else ""),
+                f"{job.ran.label or job.ran.state}{job.ran.damage}",
+                job.ran.expect,
+                None if job.least == math.inf else round(1e3 * job.least, 1),
+                job.ran.sentence or job.ran.cause,
+                job.ran.seconds or None,
+                job.ran.peak_mb or None,
+            ),
+            job.ran.state,
+        )
+        for job in jobs
+    ]
     return Table(title=title, header=("job", "verdict", "expected", "least mm", "sentence", "s", "MB"), rows=rows)
 
 
@@ -299,8 +305,14 @@ def view(request: ViewRequest) -> ViewResult:
     """Write a 3-D page. Raises InputError if there is nothing to show."""
     space = space_of(request.path, request.roots)
     name = request.path.absolute().name
-    section = RunSection(anchor="scene", title="", state="", sentence="", space="scene")
-    page = Page(title=name, state="", sentence="", runs=[section], scenes={"scene": packed(space)}, opens=True)
+    page = Page(
+        title=name,
+        state="",
+        sentence="",
+        runs=[RunSection(anchor="scene", title="", state="", sentence="", space="scene")],
+        scenes={"scene": packed(space)},
+        opens=True,
+    )
     file = _write(request, page)
     return ViewResult(
         file=file,

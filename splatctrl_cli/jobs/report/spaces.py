@@ -109,8 +109,9 @@ def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> Ro
     locks = tuple((name, float(value)) for name, _, value in (word.partition("=") for word in run.options("--lock")))
     packages = tuple(place for word in run.options("--packages") if (place := run.place_of(word, roots)))
     pose = None if base is None else tuple(float(part) for part in base.split(","))
-    digests = tuple(sha256(path) for path in found.values())
-    robot = _robot(found["urdf"], found.get("spheres"), pose, locks, packages, digests)
+    robot = _robot(
+        found["urdf"], found.get("spheres"), pose, locks, packages, tuple(sha256(path) for path in found.values())
+    )
     return robot.moved_by(tuple(states.joints))
 
 

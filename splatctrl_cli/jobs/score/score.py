@@ -141,9 +141,15 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
             surface = cloud_figures(cloud, scene, scorer.training, request.threads)
     protocol = _protocol(scorer)
     definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
-    metrics = total_score(scorer.views) | surface
-    metrics |= {"free_mass": _free_mass(request.scene, scene), "num_skipped": len(scorer.skipped)}
-    metrics["num_warnings"] = len(scorer.doubts) + len(same["differences"])
+    metrics = (
+        total_score(scorer.views)
+        | surface
+        | {
+            "free_mass": _free_mass(request.scene, scene),
+            "num_skipped": len(scorer.skipped),
+            "num_warnings": len(scorer.doubts) + len(same["differences"]),
+        }
+    )
     report = _report(request, scorer, same, protocol | {"definitions": definitions}, as_json(metrics))
     result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
     if folder:
@@ -214,8 +220,8 @@ def _free_mass(path: Path, scene: SceneFolder) -> float:
     """Free mass of the scene, NaN without an occupancy grid."""
     if not (path / "occupancy.npz").is_file():
         return nan
-    keys = ("config", "occupancy", "free_below")
-    free_below = run_value(scene.run, keys, float, where=str(path / "run.json"))
+    where = str(path / "run.json")
+    free_below = run_value(scene.run, ("config", "occupancy", "free_below"), float, where=where)
     spheres = obstacle_spheres(scene.splats(), scene.unrepresented_at(None), frozenset(Label))
     return free_mass(spheres.splats, scene.occupancy(), free_below)
 
@@ -283,13 +289,18 @@ def _score_scans(
         # gates and baseline apply to the means alone
         alone = replace(request, scene=scene, recording=of_scan(request.recording, scan), require=(), baseline=None)
         results[scan] = _score_scene(alone, folder and folder / scan, progress)
-    report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
-    report |= report_of_scans({scan: result.report for scan, result in results.items()})
+    report = {
+        "scenes": str(request.scene),
+        "reference": str(request.recording.path),
+        **report_of_scans({scan: result.report for scan, result in results.items()}),
+    }
     result = _concluded(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
     if folder is not None:
         names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
-        rows = [{"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items()]
-        _write_table(folder / "scans.csv", rows)
+        _write_table(
+            folder / "scans.csv",
+            [{"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items()],
+        )
         _write_result(folder, result, config={"scans": report["scans"]})
     return result
 

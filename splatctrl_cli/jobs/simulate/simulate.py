@@ -104,7 +104,19 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
         write_json(folder / "truth.json", truth_document(truth))
         if request.dtu:
             with stopwatch.stage("dtu"):
-                _write_scan(folder)
+                scan = [
+                    DtuView(
+                        name=frame.camera,
+                        color=frame.color,
+                        depth=frame.depth,
+                        intrinsics=frame.intrinsics,
+                        T_world_camera=frame.T_world_camera,
+                        mask=object_mask(frame),
+                    )
+                    for frame in turntable_views()
+                ]
+                write_dtu(folder / "dtu", "scan1", scan)
+                write_idr(folder / "idr", "scan1", scan)
         write_run(
             folder,
             command="simulate",
@@ -168,22 +180,6 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
     return Recording(options, robot, scene, request.unmodelled)
 
 
-def _write_scan(folder: Path) -> None:
-    scan = [
-        DtuView(
-            name=frame.camera,
-            color=frame.color,
-            depth=frame.depth,
-            intrinsics=frame.intrinsics,
-            T_world_camera=frame.T_world_camera,
-            mask=object_mask(frame),
-        )
-        for frame in turntable_views()
-    ]
-    write_dtu(folder / "dtu", "scan1", scan)
-    write_idr(folder / "idr", "scan1", scan)
-
-
 def _sizes(folder: Path) -> dict[str, int]:
     sizes = {}
     for path in sorted(folder.iterdir()):
@@ -215,8 +211,9 @@ def copied_arm(
         spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
     moved = [joint.name for joint in original.joints if joint.kind != "fixed" and joint.name not in original.grippers]
     model = RobotModel.from_urdf(copy, spheres).moved_by(moved)
-    report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=fixed.COVERED_COARSE)
-    model = model.with_coverage(report)
+    model = model.with_coverage(
+        coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=fixed.COVERED_COARSE)
+    )
     return model, SelfSurfaces(model, solids)
 
 
