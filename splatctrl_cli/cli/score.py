@@ -151,9 +151,9 @@ def _cloud_lines(metrics: Mapping[str, Any], words: str) -> list[str]:
     def share(name: str) -> str:
         return "-" if metrics[name] is None else f"{100 * metrics[name]:.1f}% farther"
 
-    parts = [f"accuracy {length('accuracy')} ({share('accuracy_beyond')})"]
-    for name, of in (("completeness", "all"), ("completeness_seen", "seen")):
-        parts.append(f"completeness of {of} {length(name)} ({share(name + '_beyond')})")
+    figures = {"accuracy": "accuracy", "completeness": "completeness of all"}
+    figures["completeness_seen"] = "completeness of seen"
+    parts = [f"{words} {length(name)} ({share(name + '_beyond')})" for name, words in figures.items()]
     return [f"surface: {', '.join(parts)}, Chamfer {length('chamfer')}", f"cloud: {words}"]
 
 

@@ -1,6 +1,5 @@
 """The whole configuration: defaults, a TOML file, single assignments; every key with value and source."""
 
-import copy
 import dataclasses
 import json
 import math
@@ -9,9 +8,9 @@ import types
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
-from splatctrl_cli.config.ranges import Declared, Section, Within, check, cut, shown
+from splatctrl_cli.config.ranges import Declared, Section, Within, check, copy_unchecked, cut, shown
 from splatctrl_cli.config.sections import (
     ControlConfig,
     FieldConfig,
@@ -39,12 +38,7 @@ class Config:
     def __post_init__(self) -> None:
         check_voxel(self.scene, self.occupancy)
 
-    def derived(self, **sections: Section) -> Self:
-        """A copy with unchecked sections from a recording (`Section.derived`)."""
-        made = copy.copy(self)
-        for name, section in sections.items():
-            object.__setattr__(made, name, section)
-        return made
+    derived = copy_unchecked
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values for ``run.json``."""
@@ -230,21 +224,18 @@ def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Se
         for where, section, values in _tables(path, assignments)
         for key in values
     }
-    settings = []
-    for section in fields(Config):
-        kind = getattr(default, section.name)
-        for key, declared in kind.declared.items():
-            settings.append(
-                Setting(
-                    section=section.name,
-                    key=key,
-                    value=getattr(getattr(used, section.name), key),
-                    default=getattr(kind, key),
-                    source=sources.get(f"{section.name}.{key}", DEFAULT),
-                    declared=declared,
-                )
-            )
-    return tuple(settings)
+    return tuple(
+        Setting(
+            section=section,
+            key=key,
+            value=getattr(getattr(used, section), key),
+            default=getattr(values, key),
+            source=sources.get(f"{section}.{key}", DEFAULT),
+            declared=declared,
+        )
+        for section, values in vars(default).items()
+        for key, declared in values.declared.items()
+    )
 
 
 def toml_of(settings: Sequence[Setting]) -> Iterator[str]:

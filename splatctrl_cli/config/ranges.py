@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, get_args, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
 
 from splatctrl_cli.errors import UsageError
 
@@ -61,6 +61,17 @@ class OneOf:
 Declared = Within | OneOf
 
 
+T = TypeVar("T")
+
+
+def copy_unchecked(original: T, **values: Any) -> T:
+    """A copy with unchecked values from a recording, in their units."""
+    made = copy.copy(original)
+    for key, value in values.items():
+        object.__setattr__(made, key, value)
+    return made
+
+
 class Section:
     """A table of the configuration, checked when created."""
 
@@ -73,12 +84,7 @@ class Section:
         hints = get_type_hints(cls, include_extras=True)
         cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
 
-    def derived(self, **values: float) -> Self:
-        """A copy with unchecked values from a recording, in its unit."""
-        made = copy.copy(self)
-        for key, value in values.items():
-            object.__setattr__(made, key, value)
-        return made
+    derived = copy_unchecked
 
     def __post_init__(self) -> None:
         for key, declared in self.declared.items():

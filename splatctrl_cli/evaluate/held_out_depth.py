@@ -66,17 +66,12 @@ def cloud_score(
             f" it spans {_box(reference)} m, the surface {_box(points)} m",
             remedy="is it the same scene, in the same frame? give the cloud's unit as --cloud-unit",
         )
-    accuracy, accuracy_beyond = _mean_below(to_reference, max_distance)
-    completeness, completeness_beyond = _mean_below(to_surface, max_distance)
-    completeness_seen, completeness_seen_beyond = _mean_below(to_surface[seen], max_distance)
+    of = {"accuracy": to_reference, "completeness": to_surface, "completeness_seen": to_surface[seen]}
+    found = {name: _mean_below(distances, max_distance) for name, distances in of.items()}
     return {
-        "accuracy": accuracy,
-        "completeness": completeness,
-        "completeness_seen": completeness_seen,
-        "chamfer": (accuracy + completeness) / 2,
-        "accuracy_beyond": accuracy_beyond,
-        "completeness_beyond": completeness_beyond,
-        "completeness_seen_beyond": completeness_seen_beyond,
+        **{name: mean for name, (mean, _) in found.items()},
+        "chamfer": (found["accuracy"][0] + found["completeness"][0]) / 2,
+        **{f"{name}_beyond": beyond for name, (_, beyond) in found.items()},
         "num_points": float(len(counted)),
         "num_reference": float(len(reference)),
     }
@@ -327,11 +322,11 @@ def depth_edges(depth: NDArray[np.float32]) -> Bool:
 
 def _interpolated(grid: DistanceGrid, distances: dict[str, GridDistance], points: Float64) -> dict[str, Float64]:
     points = np.ascontiguousarray(points)
-    found = {}
-    for name, distance in distances.items():
-        values = np.ascontiguousarray(distance.values, dtype=np.float32)
-        found[name] = interpolate(values, grid.origin, grid.voxel, points)[0] + distance.added
-    return found
+    return {
+        name: each.added
+        + interpolate(np.ascontiguousarray(each.values, dtype=np.float32), grid.origin, grid.voxel, points)[0]
+        for name, each in distances.items()
+    }
 
 
 def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame]) -> Bool:

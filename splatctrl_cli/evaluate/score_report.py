@@ -62,11 +62,11 @@ def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
                 f"{path}: not comparable: {name}: expected {now.get(name)}, got {then.get(name)}",
                 remedy="score the baseline anew, in the same way",
             )
-    changed: dict[str, float | None] = {}
-    for name, value in report["metrics"].items():
-        old = earlier["metrics"].get(name)
-        changed[PREFIX + name] = None if value is None or not isinstance(old, int | float) else value - old
-    return changed
+    old: Mapping[str, Any] = earlier["metrics"]
+    return {
+        PREFIX + name: value - old[name] if value is not None and isinstance(old.get(name), int | float) else None
+        for name, value in report["metrics"].items()
+    }
 
 
 def report_of_scans(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

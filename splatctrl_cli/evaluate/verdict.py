@@ -180,9 +180,7 @@ def verdict_of(
 
     Without any reason it is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
     """
-    given = list(reasons)
-    if not given:
-        given = [Reason(criterion="evidence", outcome=Outcome.NOT_EVALUABLE, sentence="nothing was judged")]
+    given = list(reasons) or [lacking(criterion="evidence", sentence="nothing was judged")]
     ordered = sorted(given, key=lambda reason: _WORST_FIRST.index(reason.outcome))
     outcome = ordered[0].outcome
     failure = next((r.label for r in ordered if r.outcome is Outcome.FAILED and r.label), "failed")

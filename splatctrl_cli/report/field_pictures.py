@@ -52,15 +52,15 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is veiled and hatched.
     """
+    never = "; hatched: never seen" if _knows_seen(grid) else ""
+    lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
+    field = grid.header.get("sdf", "positive outside")
     with _panels(path, grid, point) as (figure, panels):
         for axes, cut in panels:
             image = draw_distance(axes, cut.coordinates, cut.of(grid, "sdf"), cut.voxel, names_lines=False)
             if _knows_seen(grid):
                 draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
         figure.colorbar(image, ax=[axes for axes, _ in panels], extend="both", label="distance [cm]", pad=0.01)
-        never = "; hatched: never seen" if _knows_seen(grid) else ""
-        lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
-        field = grid.header.get("sdf", "positive outside")
         figure.suptitle(f"Distance in world: {field}; lines at {lines} cm{never}", fontsize=12)
 
 

@@ -168,9 +168,10 @@ def open_loop_picture(
 
     shaped: intervals [s] in which a row shaped the command, shaded.
     """
+    room, largest = np.asarray(margin), 0.0
+    low = envelope(seconds, room)
     with drawn_figure(path, 7.2) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
-        largest = 0.0
         for color, style, (j, joint) in zip(
             cycle(CURVE_COLORS), cycle(["-"] * 6 + ["--"] * 6), enumerate(joints), strict=False
         ):
@@ -182,8 +183,6 @@ def open_loop_picture(
         most = max(1.1 * largest, SMALLEST)
         above.set(ylabel="difference [rad/s]", ylim=(-most, most))
         above.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        room = np.asarray(margin)
-        low = envelope(seconds, room)
         _curve(below, seconds, room, color=CURVE_COLORS[0], width=1.8)
         below.fill_between(
             low.seconds, low.lowest, 0.0, where=low.lowest < 0, color=CURVE_COLORS[1], alpha=0.35, linewidth=0

@@ -140,15 +140,13 @@ def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request:
             newest[record.camera] = record, state
     if not newest:
         raise NotEvaluableError(f"{log}: no frame of {', '.join(cameras)} up to the time of the scene")
-    robot = None
-    if request.urdf is not None:
-        robot = RobotModel.from_urdf(request.urdf, request.spheres).moved_by(recording.joint_names)
+    urdf, names = request.urdf, recording.joint_names
+    robot = None if urdf is None else RobotModel.from_urdf(urdf, request.spheres).moved_by(names)
     counted = []
     for frame, at in newest.values():
         spheres = None
         if robot is not None and at is not None:
-            centers = robot.sphere_centers(robot.positions_of(recording.joint_names, at.position))
-            spheres = centers, robot.sphere_set.radii
+            spheres = robot.sphere_centers(robot.positions_of(names, at.position)), robot.sphere_set.radii
         counted.append(counted_pixels(frame, source.workspace, spheres))
     return compare_with_held_out_depth(
         grid, [frame for frame, _ in newest.values()], seed=request.seed, counted=counted

@@ -51,7 +51,7 @@ from splatctrl_cli.jobs.bake.request import (
 )
 from splatctrl_cli.jobs.running.device import Device, named
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
-from splatctrl_cli.jobs.running.resume import deciding_versions, told_how_to_go_on
+from splatctrl_cli.jobs.running.resume import check_resumption, deciding_versions, told_how_to_go_on
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import (
@@ -159,7 +159,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
     check_request(request)
     stopwatch, out = Stopwatch(), request.out
     checkpoint = partial_path(out) / CHECKPOINT
-    _tell_of_partial(request, checkpoint, progress)
+    check_resumption(checkpoint, "bake", progress, resume=request.resume)
     with (
         told_how_to_go_on(checkpoint),
         output_path(
@@ -216,14 +216,6 @@ def check_request(request: BakeRequest) -> None:
         raise UsageError("--previous-scene: belongs to --update", remedy="give the field folder to --update as well")
     of_truth = () if request.truth is None else field_accuracy.metric_scales(FIELDS)
     check_gate_names(request.require, (*SUMMARY_METRICS, *of_truth))
-
-
-def _tell_of_partial(request: BakeRequest, checkpoint: Path, progress: Progress) -> None:
-    partial = checkpoint.parent.parent
-    if request.resume and not checkpoint.is_file():
-        progress.log(f"{partial}: nothing to continue from; starts at the beginning")
-    elif checkpoint.is_file() and not request.resume:
-        progress.log(f"warning: {partial}: an interrupted bake is replaced; --resume would have continued it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,9 +301,8 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
             kept = Kept(
                 grid=previous.grid, mask=changes.mask, occupancy=source.occupancy, thresholds=config.occupancy
             )
-    unknown = None
-    if config.field.unknown != "free":
-        unknown = UnknownSpace(baker.layout, config.field, source.occupancy, config.occupancy)
+    is_free = config.field.unknown == "free"
+    unknown = None if is_free else UnknownSpace(baker.layout, config.field, source.occupancy, config.occupancy)
     store = bake_to_disk(job, kept, unknown, partial, progress)
     if kept is not None and old is not None and previous is not None:
         counts: Any = previous.grid.header["kernel_counts"]

@@ -3,7 +3,6 @@
 A key covers a node's words, the content of its inputs, and the code.
 """
 
-import csv
 import fcntl
 import hashlib
 import json
@@ -24,7 +23,7 @@ from uuid import uuid4
 import splatctrl_cli
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import damage_mark
-from splatctrl_cli.files.output import PACKAGES, sha256, write_durably
+from splatctrl_cli.files.output import PACKAGES, sha256, write_durably, write_table
 from splatctrl_cli.jobs.batch.graph import Node
 
 NAME, OWNERS = "ledger.sqlite", ".owners"
@@ -228,13 +227,8 @@ class Ledger(AbstractContextManager["Ledger"]):
 
 
 def write_csv(path: Path, runs: Iterable[Run]) -> None:
-    def write(place: Path) -> None:
-        with place.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            writer.writerows(asdict(run).values() for run in runs)
-
-    write_durably(path, write)
+    """Write runs with every column."""
+    write_durably(path, lambda place: write_table(place, COLUMNS, map(asdict, runs)))
 
 
 def run_of_document(plain: Mapping[str, Any]) -> Run:

@@ -31,14 +31,12 @@ REPLAY_FIELDS = ("exact", "barrier", "certified")
 @cache
 def scales() -> Mapping[str, Mapping[str, Scale]]:
     """Comparison scale of each figure, by command and name."""
-    replay: dict[str, Scale] = {}
-    for mode in MODES:
-        replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True)
+    by_mode = [metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True) for mode in MODES]
     return {
         "reconstruct": reconstruct_verdict.GATED,
         "sdf-bake": SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS),
         "score": score_report.SCALES,
-        "replay": replay,
+        "replay": {name: scale for scales in by_mode for name, scale in scales.items()},
         "robot": robot.SCALES,
     }
 

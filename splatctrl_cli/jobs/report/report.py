@@ -132,15 +132,13 @@ class _Job:
         values = [metrics.get(name) for name in ("min_clearance", "min_clearance_true")]
         return min((float(value) for value in values if isinstance(value, int | float)), default=math.inf)
 
-    @property
-    def order(self) -> tuple[bool, bool, bool, float]:
-        ran = self.ran
-        return (ran.state == DONE, not self.is_changed, ran.outcome in ("passed", ""), self.least)
-
 
 def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
     changes, changed = changes_since(request.against, request.path, has_links=True)
-    jobs = sorted((_job(batch, ran, ran.node in changed) for ran in batch.runs), key=lambda job: job.order)
+    jobs = sorted(
+        (_job(batch, ran, ran.node in changed) for ran in batch.runs),
+        key=lambda job: (job.ran.state == DONE, not job.is_changed, job.ran.outcome in ("passed", ""), job.least),
+    )
     replayed = {job.ran.recording for job in jobs if job.ran.command == REPLAY}
     told = [job for job in jobs if _is_told(job, is_seen=request.all_scenes and job.ran.recording not in replayed)]
     wanted = [job for job in told if job.run is not None and job.run.command in WITH_SPACE]

@@ -96,10 +96,9 @@ def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
 
     Raises UsageError if unusable.
     """
-    device = demanded(name, FIELD)
-    if device is None:
-        device = automatic(progress, source=FIELD) if is_enough else Device()
-    return device
+    if (device := demanded(name, FIELD)) is not None:
+        return device
+    return automatic(progress, source=FIELD) if is_enough else Device()
 
 
 class FitDevice:

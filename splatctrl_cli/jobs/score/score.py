@@ -1,6 +1,5 @@
 """A score of scenes against held-out views of one or several scans."""
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from splatctrl_cli.evaluate.score_report import (
 )
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
 from splatctrl_cli.field.unknown import field_splats, obstacle_spheres
-from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run, write_table
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, run_value
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
@@ -153,7 +152,7 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
     report = _report(request, scorer, same, protocol | {"definitions": definitions}, as_json(metrics))
     result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
     if folder:
-        _write_table(folder / "views.csv", report["views"])
+        write_table(folder / "views.csv", list(report["views"][0]), report["views"])
         with stopwatch.stage("pictures"):
             for (_, best), (_, worst) in scorer.extremes.values() if request.images != "none" else ():
                 comparison = [best] if worst.title == best.title else [best, worst]
@@ -239,13 +238,6 @@ def _view_drawer(folder: Path) -> Callable[[ComparisonRow], None]:
     return lambda row: view_picture(folder / f"{row.title}.png", row)
 
 
-def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        table = csv.DictWriter(stream, fieldnames=list(rows[0]), lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-
-
 def _write_result(
     folder: Path,
     result: ScoreResult,
@@ -297,10 +289,8 @@ def _score_scans(
     result = _concluded(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
     if folder is not None:
         names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
-        _write_table(
-            folder / "scans.csv",
-            [{"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items()],
-        )
+        rows = ({"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items())
+        write_table(folder / "scans.csv", ["scan", *names], rows)
         _write_result(folder, result, config={"scans": report["scans"]})
     return result
 

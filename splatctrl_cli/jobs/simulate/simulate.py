@@ -331,9 +331,8 @@ def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) 
     is_late = slowed.times[-1] > leg.times[-1]
     if is_late and any(primitive.track is not None for primitive in scene.primitives):
         return np.inf
-    solids: Sequence[Primitive] = scene.primitives
-    if is_late:
-        solids = [replace(primitive, from_ns=ALWAYS[0], to_ns=ALWAYS[1]) for primitive in solids]
+    always = [replace(primitive, from_ns=ALWAYS[0], to_ns=ALWAYS[1]) for primitive in scene.primitives]
+    solids: Sequence[Primitive] = always if is_late else scene.primitives
     seconds = np.linspace(leg.times[0], leg.times[-1], fixed.SIMULATED_SAMPLES)
     positions = np.array([leg.at(second)[0] for second in seconds])
     centers = model.sphere_centers_batch(positions)
