@@ -11,7 +11,7 @@ import numpy as np
 from experiments.standstill import Separation
 from experiments.tables import aligned, shown
 from experiments.yardstick import MotionFigures
-from splatctrl_cli.blocks import CURVE_COLORS, INK, Float64, PlannedPath, drawn_figure, save_figure
+from splatctrl_cli.blocks import CURVE_COLORS, INK, Float64, PlannedPath, drawn_figure
 
 MOTION = (
     *("success", "goal_reached", "duration_s", "joint_path_rad", "effector_path_m", "effector_path_deg"),
@@ -117,7 +117,7 @@ def clearance_picture(path: Path, clearance: Mapping[str, Float64], period: floa
     """Write a curve [cm] for the clearance (T,) [m] of each method, a state every `period` [s], with its least value
     marked, the end of each as a bar, and the margin [m] as a line. Gaps (NaN) stay gaps.
     """
-    with drawn_figure(4.8) as figure:
+    with drawn_figure(path, 4.8) as figure:
         axes = figure.subplots()
         for number, (name, values) in enumerate(clearance.items()):
             color, centimetres = CURVE_COLORS[number % len(CURVE_COLORS)], 100.0 * np.asarray(values)
@@ -140,7 +140,6 @@ def clearance_picture(path: Path, clearance: Mapping[str, Float64], period: floa
         axes.set_title("Clearance of every method, by the controller's field")
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=10, loc="center left", bbox_to_anchor=(1.0, 0.5))
-        save_figure(figure, path)
 
 
 def _table(columns: Mapping[str, Values]) -> list[str]:

@@ -25,7 +25,6 @@ from splatctrl_cli.blocks import (
     look_at,
     mpl,
     project,
-    save_figure,
     transform_points,
 )
 
@@ -49,14 +48,13 @@ def trials_picture(
 ) -> None:
     """Write panels side by side; groups (T,): what the trials are told apart by, a colour each."""
     colors = dict(zip(dict.fromkeys(groups), CURVE_COLORS, strict=False))
-    with drawn_figure(HEIGHT) as figure:
+    with drawn_figure(path, HEIGHT) as figure:
         for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
             _draw(axes, panel, methods, [colors[group] for group in groups])
         figure.suptitle(title, fontsize=12, x=0.01, ha="left")
         if len(colors) > 1:
             marks = [mpl.lines.Line2D([], [], color=color, marker="o", label=name) for name, color in colors.items()]
             figure.legend(handles=marks, frameon=False, loc="outside lower center", ncols=len(colors))
-        save_figure(figure, path)
 
 
 def _draw(axes: "mpl.axes.Axes", panel: Panel, methods: Sequence[str], colors: Sequence[str]) -> None:
@@ -124,7 +122,7 @@ class TrialScene:
 
 def trial_picture(path: Path, scene: TrialScene, views: Sequence[tuple[str, Float64, Float64]], caption: str) -> None:
     """Write views side by side, each a title, its eye (3,) and what it looks at (3,) [m]; the caption above."""
-    with drawn_figure(6.2) as figure:
+    with drawn_figure(path, 6.2, caption) as figure:
         for axes, (title, eye, target) in zip(figure.subplots(1, len(views)), views, strict=True):
             T_world_camera = look_at(eye, target)
             axes.imshow(_rendered(scene, T_world_camera), interpolation="nearest")
@@ -134,7 +132,6 @@ def trial_picture(path: Path, scene: TrialScene, views: Sequence[tuple[str, Floa
         figure.suptitle(caption, fontsize=10, x=0.01, ha="left")
         marks = [mpl.patches.Patch(color=color, label=name) for name, color in COLORS.items()]
         figure.legend(handles=marks, frameon=False, fontsize=9, loc="outside lower center", ncols=len(marks))
-        save_figure(figure, path, caption)
 
 
 def _rendered(scene: TrialScene, T_world_camera: Float64) -> Float64:

@@ -96,7 +96,7 @@ from splatctrl_cli.records import (
     Stamps,
     UInt8,
 )
-from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure
+from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
 from splatctrl_cli.robot.surface import RobotSurface
@@ -266,7 +266,6 @@ __all__ = [
     "replayed",
     "resampled",
     "runs_of",
-    "save_figure",
     "scan_folders",
     "seen_of",
     "self_mask",

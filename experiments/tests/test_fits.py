@@ -16,7 +16,7 @@ from splatctrl_cli import (
     ScoreResult,
 )
 from splatctrl_cli.config import Config
-from splatctrl_cli.evaluate.verdict import noted, verdict_of
+from splatctrl_cli.evaluate.verdict import note, verdict_of
 from splatctrl_cli.recording.folder.dtu import read_dtu
 from splatctrl_cli.recording.folder.idr import write_idr
 from tests.recording.folder.make_layout import half_size
@@ -103,7 +103,7 @@ def test_what_cannot_be_fitted_is_refused_by_name(
 
 def test_a_fit_whose_verdict_does_not_pass_is_not_scored(monkeypatch: pytest.MonkeyPatch) -> None:
     def damaged(request: ReconstructRequest, settings: object) -> ReconstructResult:
-        verdict = verdict_of("reconstruct", [noted("x", "y")], scope="7 views", is_damaged=True)
+        verdict = verdict_of("reconstruct", [note(criterion="x", sentence="y")], scope="7 views", is_damaged=True)
         return ReconstructResult(out=request.out, metrics={}, verdict=verdict, removed={}, seconds={})
 
     monkeypatch.setattr(fits, "reconstruct_gaussians", damaged)

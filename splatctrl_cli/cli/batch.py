@@ -46,19 +46,22 @@ def run(args: argparse.Namespace) -> int:
     if args.dry_run:
         planned_nodes = dry_run(request, command_line)
         rows = [(node.name, state, ", ".join(node.needs) or "-") for node, state in planned_nodes]
-        found = [{"id": n.name, "state": s, "needs": n.needs, "words": n.words} for n, s in planned_nodes]
-        lines = [*table(("node", "state", "needs"), rows), ""]
+        commands = (f"splatctrl {shlex.join(node.words)}" for node, _ in planned_nodes)
         return console.result(
-            {"nodes": found}, [*lines, *(f"splatctrl {shlex.join(n.words)}" for n, _ in planned_nodes)]
+            {"nodes": [{"id": n.name, "state": s, "needs": n.needs, "words": n.words} for n, s in planned_nodes]},
+            [*table(("node", "state", "needs"), rows), "", *commands],
         )
     result = batch(request, command_line, console)
-    printed = {
-        "out": str(result.out),
-        "suite": result.suite,
-        "kept": result.num_kept,
-        "nodes": [run.document() for run in result.runs],
-    }
-    code = console.concluded(result.verdict, printed, _lines(result, is_long=args.verbose > 0))
+    code = console.concluded(
+        result.verdict,
+        {
+            "out": str(result.out),
+            "suite": result.suite,
+            "kept": result.num_kept,
+            "nodes": [run.document() for run in result.runs],
+        },
+        _lines(result, is_long=args.verbose > 0),
+    )
     publish(suites_of(result), junit=args.junit, is_fatal=code != 0)
     return code
 
@@ -76,8 +79,7 @@ class OfThisProgram:
         parser, places, words = _parser_of(command), list[str](), [command]
         given = {"threads": self._threads, **options}
         known = [name for name in given if name not in OWN or f"--{name}" in parser._option_string_actions]
-        actions = {name: _action(parser, command, name) for name in known}
-        for name, action in actions.items():
+        for name, action in {name: _action(parser, command, name) for name in known}.items():
             made = _words_of(name, action, given[name], folder)
             places += made if not action.option_strings else []
             words += made if action.option_strings else []
@@ -105,8 +107,7 @@ class OfThisProgram:
 
 
 def run_words(words: list[str]) -> int:
-    main = importlib.import_module("splatctrl_cli.cli.main").main
-    code: int = main(words)
+    code: int = importlib.import_module("splatctrl_cli.cli.main").main(words)
     return code
 
 
@@ -127,11 +128,14 @@ def _parser_of(command: str) -> Parser:
 
 
 def _action(parser: Parser, command: str, name: str) -> argparse.Action:
-    by_name = {option.removeprefix("--"): action for option, action in parser._option_string_actions.items()}
-    by_name |= {action.dest: action for action in parser._actions if not action.option_strings}
+    by_name = {option.removeprefix("--"): action for option, action in parser._option_string_actions.items()} | {
+        action.dest: action for action in parser._actions if not action.option_strings
+    }
     if name not in by_name:
-        remedy = did_you_mean(name, by_name, f"see splatctrl {command} --help-all")
-        raise UsageError(f"{command} has no option {name!r}", remedy=remedy)
+        raise UsageError(
+            f"{command} has no option {name!r}",
+            remedy=did_you_mean(name, by_name, f"see splatctrl {command} --help-all"),
+        )
     return by_name[name]
 
 
@@ -197,5 +201,7 @@ def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, c
         write_csv(args.csv, runs)
         console.log(f"wrote {len(runs)} runs to {args.csv}")
     rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
-    lines = table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"]
-    return console.result({"nodes": [run.document() for run in runs]}, lines)
+    return console.result(
+        {"nodes": [run.document() for run in runs]},
+        table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"],
+    )

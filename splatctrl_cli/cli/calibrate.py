@@ -12,15 +12,17 @@ from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, cali
 
 def run(args: argparse.Namespace) -> int:
     console = Console(args)
-    request = request_of(
-        CalibrateRequest,
-        args,
-        paths=tuple(args.source),
-        options=source_options(args),
-        locked=locked_joints(args),
-        board=None if args.board is None else board_of(args.board),
+    result = calibrate(
+        request_of(
+            CalibrateRequest,
+            args,
+            paths=tuple(args.source),
+            options=source_options(args),
+            locked=locked_joints(args),
+            board=None if args.board is None else board_of(args.board),
+        ),
+        console,
     )
-    result = calibrate(request, console)
     return console.result({"out": str(result.out), **result.metrics}, _lines(result))
 
 
@@ -33,8 +35,10 @@ def _lines(result: CalibrateResult) -> Iterator[str]:
     unsure = f"{num_unsure} of them only in the directions that the recording shows"
     yield f"calibrate: {len(free)} of {len(calibration.cameras)} cameras placed, {unsure if num_unsure else sure}"
     yield ""
-    header = ("camera", "moved mm", "turned deg", "sigma mm", "sigma deg", "depth", "")
-    yield from table(header, [_row(result, name) for name in calibration.cameras])
+    yield from table(
+        ("camera", "moved mm", "turned deg", "sigma mm", "sigma deg", "depth", ""),
+        [_row(result, name) for name in calibration.cameras],
+    )
     yield ""
     if result.before is not None and result.after is not None:
         before, after = _mm(result.before), _mm(result.after)

@@ -17,15 +17,16 @@ WIDTH = 118  # columns of text
 
 
 def run(args: argparse.Namespace) -> int:
-    request = request_of(
-        CheckRequest,
-        args,
-        paths=tuple(args.source),
-        options=source_options(args),
-        num_images=args.quick,
-        locked=locked_joints(args),
+    result = check(
+        request_of(
+            CheckRequest,
+            args,
+            paths=tuple(args.source),
+            options=source_options(args),
+            num_images=args.quick,
+            locked=locked_joints(args),
+        )
     )
-    result = check(request)
     report, lines = result.report.as_dict(), _lines(result.report)
     return Console(args).concluded(result.verdict, report, lines, code=result.exit_code, has_findings=True)
 
@@ -45,17 +46,19 @@ def _lines(report: CheckReport) -> Iterator[str]:
     rates = [rate for rate in report.rates if rate.is_read]
     if rates:
         yield ""
-        rows = [
-            (
-                rate.topic,
-                rate.messages,
-                format_cell(rate.hz, ".2f"),
-                format_cell(rate.longest_s, ".3f"),
-                format_cell(rate.delay_s, ".3f"),
-            )
-            for rate in rates
-        ]
-        yield from table(["topic", "messages", "hz", "longest gap s", "delay s"], rows)
+        yield from table(
+            ["topic", "messages", "hz", "longest gap s", "delay s"],
+            [
+                (
+                    rate.topic,
+                    rate.messages,
+                    format_cell(rate.hz, ".2f"),
+                    format_cell(rate.longest_s, ".3f"),
+                    format_cell(rate.delay_s, ".3f"),
+                )
+                for rate in rates
+            ],
+        )
     if len(rates) < len(report.rates):
         yield from () if rates else ("",)
         others = len(report.rates) - len(rates)
@@ -65,16 +68,13 @@ def _lines(report: CheckReport) -> Iterator[str]:
 
 
 def _needs(report: CheckReport) -> Iterator[str]:
-    ready = [need.command for need in report.needs if not report.lacks(need)]
-    if ready:
+    if ready := [need.command for need in report.needs if not report.lacks(need)]:
         yield f"can start: {', '.join(ready)}"
     kept: dict[str, list[str]] = {}
     for need in report.needs:
-        codes = dict.fromkeys(finding.code for finding in report.refusing(need))
-        if codes:
+        if codes := dict.fromkeys(finding.code for finding in report.refusing(need)):
             kept.setdefault(", ".join(f"[{code}]" for code in codes), []).append(need.command)
-    for why, commands in kept.items():
-        yield f"cannot start, or would be wrong: {', '.join(commands)}; see {why}"
+    yield from (f"cannot start, or would be wrong: {', '.join(names)}; see {why}" for why, names in kept.items())
     for need in report.needs:
         for lack in need.lacks:
             yield from textwrap.wrap(f"missing for {need.command}: {lack}", WIDTH, subsequent_indent="  ")
@@ -125,14 +125,19 @@ def _fact(value: object) -> str:
 
 def run_ingest(args: argparse.Namespace) -> int:
     console = Console(args)
-    request = request_of(IngestRequest, args, paths=tuple(args.source), options=source_options(args))
-    return show_ingested(console, ingest(request, console))
+    return show_ingested(
+        console,
+        ingest(request_of(IngestRequest, args, paths=tuple(args.source), options=source_options(args)), console),
+    )
 
 
 def show_ingested(console: Console, result: IngestResult) -> int:
     lost = asdict(result.summary.loss)
-    lines = table(["camera", "frames"], sorted(result.summary.num_frames.items()))
-    lines += [f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"]
-    lines += [f"note: {note}" for note in lost["notes"]]
-    lines += [f"joint states: {result.summary.num_joint_states}", f"wrote {result.capture}"]
+    lines = [
+        *table(["camera", "frames"], sorted(result.summary.num_frames.items())),
+        *(f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"),
+        *(f"note: {note}" for note in lost["notes"]),
+        f"joint states: {result.summary.num_joint_states}",
+        f"wrote {result.capture}",
+    ]
     return console.result({"capture": str(result.capture), **result.metrics}, lines, code=result.exit_code)

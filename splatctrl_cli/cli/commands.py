@@ -64,8 +64,12 @@ def build_parser(command: str | None = None) -> Parser:
 def _add_commands(parser: Parser, commands: dict[str, Command], *, dest: str, only: str | None = None) -> None:
     below = parser.add_subparsers(dest=dest, metavar=dest.upper(), required=True)
     for name, command in commands.items():
-        description = command.summary[0].upper() + command.summary[1:] + "."
-        one = below.add_parser(name, help=command.summary, description=description, examples=command.examples)
+        one = below.add_parser(
+            name,
+            help=command.summary,
+            description=command.summary[0].upper() + command.summary[1:] + ".",
+            examples=command.examples,
+        )
         if only not in (None, name):
             continue
         if command.actions is not None:

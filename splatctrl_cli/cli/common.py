@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 
 from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several, whole
 from splatctrl_cli.cli.reports import enveloped, reports_of
-from splatctrl_cli.config import PRESETS
-from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.config import PRESETS, fixed
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, shown
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Verdict, gate
@@ -256,7 +255,7 @@ DISAGREEMENT = (  # by how much a log may contradict itself
         "--max-pose-jump M",
         "how far a camera may move between frames less than a second apart",
         real(1e-3, MAX_PLACE, "m"),
-        POSE_JUMP,
+        fixed.POSE_JUMP,
     ),
     option("--allow-disagreement", "continue although cameras disagree about surfaces"),
 )

@@ -21,8 +21,10 @@ def run(args: argparse.Namespace) -> int:
         text = SCHEMA_FILE.read_text(encoding="utf-8")
         return console.result({"json_schema": json.loads(text)}, text.splitlines())
     settings = resolved_settings(args.file, args.set)
-    lines = template_of(settings) if args.template else toml_of(settings)
-    return console.result({"settings": {setting.name: setting.as_dict() for setting in settings}}, lines)
+    return console.result(
+        {"settings": {setting.name: setting.as_dict() for setting in settings}},
+        template_of(settings) if args.template else toml_of(settings),
+    )
 
 
 def run_completion(args: argparse.Namespace) -> int:

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
         """Print a step's output, with the final folder name."""
         text = io.StringIO()
         with contextlib.redirect_stdout(text):
-            _show(step_console, result)
+            SHOWN[type(result)](step_console, result)
         print(text.getvalue().replace(str(folder), str(request.out)), end="", flush=True)
 
     is_silent = console.is_quiet or console.is_json
@@ -48,19 +48,19 @@ def run(args: argparse.Namespace) -> int:
     )
 
 
-def _show(console: Console, result: StepResult) -> int:
-    if isinstance(result, ReplayResult):
-        return show_replayed(console, result, code=result.exit_code(report_only=False))
-    return SHOWN[type(result)](console, result)
-
-
 def run_simulate(args: argparse.Namespace) -> int:
     console = Console(args)
     given = {"duration_s": args.duration, "with_person": args.person, "is_free": args.free}
     options = request_of(RecordingOptions, args, **{name: v for name, v in given.items() if v is not None})
     parts = () if args.unmodelled is None else names_of(args.unmodelled, tuple(UNMODELLED), "--unmodelled")
-    of_arm: dict[str, Any] = {"is_slim": args.slim, "unmodelled": parts}
-    request = request_of(SimulateRequest, args, out=args.out or Path("simulated"), options=options, **of_arm)
+    request = request_of(
+        SimulateRequest,
+        args,
+        out=args.out or Path("simulated"),
+        options=options,
+        is_slim=args.slim,
+        unmodelled=parts,
+    )
     return show_simulated(console, simulate(request, console))
 
 
@@ -70,22 +70,24 @@ def show_simulated(console: Console, result: SimulateResult) -> int:
 
 def _simulated(result: SimulateResult) -> list[str]:
     truth = result.truth
-    cameras = [
-        (
-            camera.name,
-            "training" if camera.is_training else "scoring",
-            result.num_frames[camera.name],
-            f"{camera.intrinsics.width}x{camera.intrinsics.height}",
-            f"{truth.luminance_std[camera.name]:.3f}",
-        )
-        for camera in truth.cameras
-    ]
     return [
         f"{result.out}",
         "",
         *table(("file", "bytes"), list(result.sizes.items())),
         "",
-        *table(("camera", "role", "frames", "size", "luminance std"), cameras),
+        *table(
+            ("camera", "role", "frames", "size", "luminance std"),
+            [
+                (
+                    camera.name,
+                    "training" if camera.is_training else "scoring",
+                    result.num_frames[camera.name],
+                    f"{camera.intrinsics.width}x{camera.intrinsics.height}",
+                    f"{truth.luminance_std[camera.name]:.3f}",
+                )
+                for camera in truth.cameras
+            ],
+        ),
         "",
         f"joint states {len(truth.stamps)}, true clearance at least {truth.clearance.min() * 100:.1f} cm",
     ]
@@ -99,4 +101,5 @@ SHOWN: Mapping[type, Callable[[Console, Any], int]] = {
     ExportResult: show_exported,
     BakeResult: show_baked,
     ScoreResult: show_scored,
+    ReplayResult: lambda console, result: show_replayed(console, result, code=result.exit_code()),
 }

@@ -21,19 +21,15 @@ SHOWN = {  # of Differences: what the table calls it, and the unit it is shown i
 def run(args: argparse.Namespace) -> int:
     console = Console(args)
     if args.mcap:
-        return _run_mcap(console, args)
+        for name in ("labels", "layout", "isotropic"):
+            if getattr(args, name):
+                raise UsageError(f"--{name}: not with --mcap", remedy="leave it out")
+        logged = export_run(request_of(ExportRunRequest, args, path=args.scene, roots=tuple(args.root)))
+        rows = [*logged.messages.items()]
+        return console.result(
+            logged.as_dict(), [f"{logged.file}: {logged.bytes} bytes", *table(("topic", "messages"), rows)]
+        )
     return show_exported(console, export(request_of(ExportRequest, args, labels=_labels(args.labels)), console))
-
-
-def _run_mcap(console: Console, args: argparse.Namespace) -> int:
-    for name in ("labels", "layout", "isotropic"):
-        if getattr(args, name):
-            raise UsageError(f"--{name}: not with --mcap", remedy="leave it out")
-    result = export_run(request_of(ExportRunRequest, args, path=args.scene, roots=tuple(args.root)))
-    rows = [(topic, count) for topic, count in result.messages.items()]
-    return console.result(
-        result.as_dict(), [f"{result.file}: {result.bytes} bytes", *table(("topic", "messages"), rows)]
-    )
 
 
 def show_exported(console: Console, result: ExportResult) -> int:
@@ -45,8 +41,7 @@ def _labels(names: str | None) -> list[Label] | None:
         return None
     known = {label.name.lower(): label for label in Label}
     chosen = [name.strip() for name in names.split(",")]
-    unknown = [name for name in chosen if name not in known]
-    if unknown:
+    if unknown := [name for name in chosen if name not in known]:
         raise UsageError(f"--labels {names}: unknown label {unknown[0]!r}", remedy=f"known here: {', '.join(known)}")
     return [known[name] for name in chosen]
 
@@ -63,8 +58,10 @@ def _lines(result: ExportResult) -> Iterator[str]:
     if result.num_outside:
         yield f"{result.num_outside} splats have a size or colour beyond the format's range: put at its edge"
     found, allowed = vars(result.differences), vars(result.allowed)
-    rows = [(name, f"{found[key] * unit:.3g}", f"{allowed[key] * unit:.3g}") for key, (name, unit) in SHOWN.items()]
-    yield from table(["largest difference", "found", "allowed"], rows)
+    yield from table(
+        ["largest difference", "found", "allowed"],
+        [(name, f"{found[key] * unit:.3g}", f"{allowed[key] * unit:.3g}") for key, (name, unit) in SHOWN.items()],
+    )
     yield (
         f"read back and rendered from {result.num_views_compared} views ({100 * result.covered_share:.0f} % of their"
         f" pixels covered): {_decibels(result.psnr)}, largest pixel difference {result.largest_pixel_difference:.2g}"

@@ -57,8 +57,12 @@ def _run(argv: Sequence[str] | None) -> int:
         sys.stderr.close()
         return 0
     except (Exception, KeyboardInterrupt) as error:
-        is_json = "--json" in words and not hasattr(args, "is_printed")
-        line, code = _fail(error, words, is_json=is_json, is_verbose=args is not None and args.verbose > 0)
+        line, code = _fail(
+            error,
+            words,
+            is_json="--json" in words and not hasattr(args, "is_printed"),
+            is_verbose=args is not None and args.verbose > 0,
+        )
         if judges(words):
             tell_of_failure(words, args, line, code, start)
         return code

@@ -27,8 +27,9 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None or console.is_json:
         result = query(request, console)
         out = None if result.out is None else str(result.out)
-        found = {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}
-        return console.result(found, _lines(result))
+        return console.result(
+            {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}, _lines(result)
+        )
     with tempfile.TemporaryDirectory() as folder:  # a table with a wrong line is refused before anything is printed
         answers = Path(folder) / "answers.csv"
         result = query(replace(request, out=answers), console)
@@ -40,8 +41,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lines(result: QueryResult) -> Iterator[str]:
-    rows = [(name.replace("_", " "), _shown(name, value)) for name, value in result.metrics.items()]
-    yield from table((result.kind, ""), rows)
+    yield from table(
+        (result.kind, ""), [(name.replace("_", " "), _shown(name, value)) for name, value in result.metrics.items()]
+    )
     yield from (f"note: {note}" for note in result.notes)
     rate = (result.metrics["num_points"] or 0) / max(result.seconds["answer"], 1e-9)
     wrote = [] if result.out is None else [f"wrote {result.out}"]

@@ -25,17 +25,16 @@ def run(args: argparse.Namespace) -> int:
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
     allowed = {"views-agreement", "views-scale"} if args.allow_disagreement or args.refine_poses else set()
-    source = open_to_train(
-        recording_of(args, args.source),
-        max_pose_jump=args.max_pose_jump,
-        needs_depth=args.points is None,
-        allowed=allowed | ({"alignment"} if args.allow_disagreement else set()),
-    )
     request = request_of(
         ReconstructRequest,
         args,
         config=config,
-        source=source,
+        source=open_to_train(
+            recording_of(args, args.source),
+            max_pose_jump=args.max_pose_jump,
+            needs_depth=args.points is None,
+            allowed=allowed | ({"alignment"} if args.allow_disagreement else set()),
+        ),
         recording=args.source,
         out=args.out or Path("scene"),
         box=None if args.box is None else Box.from_text(args.box),
@@ -48,9 +47,8 @@ def run(args: argparse.Namespace) -> int:
 
 def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
     """The recording at `path`, or at --dtu."""
-    is_dtu = args.dtu is not None
-    given = {"path": args.dtu or path, "is_dtu": is_dtu, "options": source_options(args), "masks": masks}
-    return request_of(RecordingRequest, args, **given)
+    options, is_dtu = source_options(args), args.dtu is not None
+    return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=is_dtu, options=options, masks=masks)
 
 
 def show_reconstructed(console: Console, result: ReconstructResult) -> int:

@@ -14,7 +14,7 @@ from splatctrl_cli.cli.common import (
     table,
 )
 from splatctrl_cli.config import load_config
-from splatctrl_cli.jobs.replay.files import chunks_of, when_and_why
+from splatctrl_cli.jobs.replay.files import Columns, chunks_of, when_and_why
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replay.request import Replay, ReplayRequest
 
@@ -26,17 +26,24 @@ HEADLINE = (
 
 def run(args: argparse.Namespace) -> int:
     console = Console(args)
-    request = request_of(
-        ReplayRequest,
-        args,
-        out=args.out or Path("replay"),
-        config=load_config(args.config, args.set),
-        options=source_options(args),
-        locked=locked_joints(args),
+    result = replay(
+        request_of(
+            ReplayRequest,
+            args,
+            out=args.out or Path("replay"),
+            config=load_config(args.config, args.set),
+            options=source_options(args),
+            locked=locked_joints(args),
+        ),
+        console,
     )
-    result = replay(request, console)
-    code = result.exit_code(report_only=args.report_only)
-    return show_replayed(console, result, code=code, is_long=args.verbose > 0, with_steps=args.steps)
+    return show_replayed(
+        console,
+        result,
+        code=result.exit_code(report_only=args.report_only),
+        is_long=args.verbose > 0,
+        with_steps=args.steps,
+    )
 
 
 def show_replayed(
@@ -49,9 +56,9 @@ def show_replayed(
 def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator[str]:
     replay, metrics = result.replay, result.metrics
     shown = metrics if is_long else {name: metrics[name] for name in HEADLINE if metrics.get(name) is not None}
-    lines = when_and_why(replay)
-    lines += ["", *table(("replay", "value"), [(name, format_cell(value)) for name, value in shown.items()])]
-    yield from lines
+    yield from when_and_why(replay)
+    yield ""
+    yield from table(("replay", "value"), [(name, format_cell(value)) for name, value in shown.items()])
     yield from result.notes
     if not is_long:
         yield f"wrote {result.out}; -v prints every figure"
@@ -61,12 +68,12 @@ def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator
 
 
 def _step_lines(replay: Replay) -> Iterator[str]:
-    def is_shown(name: str) -> bool:
-        return name != "stamp_ns" and not name.startswith(("q_", "v_", "dv_"))
+    def shown(columns: Columns) -> Columns:
+        hidden = ("stamp_ns", "q_", "v_", "dv_")
+        return {name: values for name, values in columns.items() if not name.startswith(hidden)}
 
     def rows() -> Iterator[list[str]]:
         for chunk in chunks_of(replay):
-            shown = [values for name, values in chunk.items() if is_shown(name)]
-            yield from ([format_cell(value) for value in row] for row in zip(*shown, strict=True))
+            yield from ([format_cell(value) for value in row] for row in zip(*shown(chunk).values(), strict=True))
 
-    return long_table([name for name in next(chunks_of(replay)) if is_shown(name)], rows)
+    return long_table([*shown(next(chunks_of(replay)))], rows)

@@ -16,10 +16,13 @@ MOST_NOTES = 5
 def run(args: argparse.Namespace) -> int:
     console = Console(args)
     result = write_report(request_of(WriteReportRequest, args, roots=tuple(args.root)), console)
-    lines = [f"{result.file}: {result.num_runs} runs, {result.num_scenes} in 3-D, {result.bytes} bytes"]
-    lines += result.notes[:MOST_NOTES]
     more = len(result.notes) - MOST_NOTES
-    return console.result(result.as_dict(), [*lines, *([f"and {more} more not in 3-D"] if more > 0 else [])])
+    lines = [
+        f"{result.file}: {result.num_runs} runs, {result.num_scenes} in 3-D, {result.bytes} bytes",
+        *result.notes[:MOST_NOTES],
+        *([f"and {more} more not in 3-D"] if more > 0 else []),
+    ]
+    return console.result(result.as_dict(), lines)
 
 
 def run_view(args: argparse.Namespace) -> int:

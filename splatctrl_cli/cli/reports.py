@@ -66,10 +66,13 @@ def publish(suites: Sequence[Suite], *, junit: Path | None, is_fatal: bool) -> N
 
 def reports_of(args: argparse.Namespace) -> Reports:
     action = getattr(args, "action", None)
-    command = f"{args.command} {action}" if action else args.command
     given = next((value for name in RECORDINGS if (value := getattr(args, name, None))), "")
-    path = " ".join(map(str, given if isinstance(given, list) else [given]))
-    return Reports(command=command, path=path, junit=args.junit, start=args.began)
+    return Reports(
+        command=f"{args.command} {action}" if action else args.command,
+        path=" ".join(map(str, given if isinstance(given, list) else [given])),
+        junit=args.junit,
+        start=args.began,
+    )
 
 
 def tell_of_failure(

@@ -34,17 +34,26 @@ def run_spheres(args: argparse.Namespace) -> int:
     if args.max_spheres is None and args.max_protrusion is None:
         fit = request_of(FitOptions, args, max_spheres=DEFAULT_SPHERES)
     result = fit_robot(request_of(RobotRequest, args, fit=fit), console)
-    found = {"urdf": str(args.urdf), "spheres": str(result.spheres), "seed": args.seed, **result.as_dict()}
-    lines = [*_coverage_lines(result), "", f"written: {result.spheres}"]
-    return console.concluded(result.verdict, found, lines, has_findings=True)
+    return console.concluded(
+        result.verdict,
+        {"urdf": str(args.urdf), "spheres": str(result.spheres), "seed": args.seed, **result.as_dict()},
+        [*_coverage_lines(result), "", f"written: {result.spheres}"],
+        has_findings=True,
+    )
 
 
 def run_check(args: argparse.Namespace) -> int:
     result = check_robot(request_of(RobotRequest, args))
     file, left_out = result.file, list(result.links_left_out)
     assert file is not None
-    facts = {"urdf": str(args.urdf), "spheres": str(result.spheres), "layout": file.layout}
-    found = {**facts, "num_switched_off": file.num_off, "links_left_out": left_out, **result.as_dict()}
+    found = {
+        "urdf": str(args.urdf),
+        "spheres": str(result.spheres),
+        "layout": file.layout,
+        "num_switched_off": file.num_off,
+        "links_left_out": left_out,
+        **result.as_dict(),
+    }
     lines = [*_coverage_lines(result)]
     if file.num_off:
         lines.append(f"{file.num_off} spheres are switched off (radius 0 or less) and cover nothing")
@@ -60,8 +69,14 @@ def run_pairs(args: argparse.Namespace) -> int:
     lines = _pairs_lines(result)
     if result.num_foreign:
         lines.append(f"{result.num_foreign} pairs of {args.srdf.name} name links that {args.urdf.name} does not have")
-    found = {"urdf": str(args.urdf), "seed": args.seed, "num_foreign_pairs": result.num_foreign, **result.as_dict()}
-    return Console(args).result({**found, "doubts": list(result.doubts)}, [*lines, *result.doubts])
+    found = {
+        "urdf": str(args.urdf),
+        "seed": args.seed,
+        "num_foreign_pairs": result.num_foreign,
+        **result.as_dict(),
+        "doubts": list(result.doubts),
+    }
+    return Console(args).result(found, [*lines, *result.doubts])
 
 
 def run_info(args: argparse.Namespace) -> int:
@@ -73,23 +88,31 @@ def run_learn(args: argparse.Namespace) -> int:
     console = Console(args)
     request = request_of(LearnRequest, args, options=source_options(args), locked=locked_joints(args))
     model = learn_robot(request, console)
-    header = ("link", "pixels", "postures", "parts cm2", "outside 95 % mm", "most mm", "at x, y, z mm", "since s")
     having, links = ({part.link for part in parts} for parts in (model.parts, model.learned))
     lines = [
         f"{len(having)} of {len(links)} learned links have parts that {args.urdf.name} does not have",
         "",
-        *table(header, [_learned_row(part) for part in model.learned]),
+        *table(
+            ("link", "pixels", "postures", "parts cm2", "outside 95 % mm", "most mm", "at x, y, z mm", "since s"),
+            [_learned_row(part) for part in model.learned],
+        ),
         "",
         *(part.words(part.first_ns) for part in model.parts),
         *(f"not learned (what is fixed to it is scene): {link} {why}" for link, why in model.unknown.items()),
         f"written: {request.out}",
     ]
-    found = [
-        {name: finite(getattr(part, name)) for name in LEARNED}
-        | {"link": part.link, "words": part.words(part.first_ns), "place": [*map(finite, part.place)]}
-        for part in model.learned
-    ]
-    return console.result({"out": str(request.out), "links": found, "unknown": dict(model.unknown)}, lines)
+    return console.result(
+        {
+            "out": str(request.out),
+            "links": [
+                {name: finite(getattr(part, name)) for name in LEARNED}
+                | {"link": part.link, "words": part.words(part.first_ns), "place": [*map(finite, part.place)]}
+                for part in model.learned
+            ],
+            "unknown": dict(model.unknown),
+        },
+        lines,
+    )
 
 
 def _learned_row(part: LearnedLink) -> tuple[object, ...]:
@@ -101,8 +124,14 @@ def _learned_row(part: LearnedLink) -> tuple[object, ...]:
 
 def _coverage_lines(result: CoverageResult) -> Iterator[str]:
     report = result.report
-    header = ("link", "spheres", "area cm2", "uncovered %", "deficit mm", "at x, y, z mm", "sticks out mm")
-    yield from (*table(header, [_row(link) for link in report.links]), "", coverage_summary(report))
+    yield from (
+        *table(
+            ("link", "spheres", "area cm2", "uncovered %", "deficit mm", "at x, y, z mm", "sticks out mm"),
+            [_row(link) for link in report.links],
+        ),
+        "",
+        coverage_summary(report),
+    )
     if report.bare_links:
         yield bare_links(report)
     if report.open_links:
@@ -129,7 +158,10 @@ def _pairs_lines(result: PairsResult) -> list[str]:
 def _robot_lines(result: RobotResult) -> list[str]:
     model, urdf = result.model, result.model.urdf
     kinds = {joint.name: joint.kind for joint in urdf.joints}
-    joints = [(name, kinds[name], *map(_number, limits)) for name, *limits in result.joints]
+    joints = [
+        (name, kinds[name], *(f"{value:.4f}" if math.isfinite(value) else "-" for value in limits))
+        for name, *limits in result.joints
+    ]
     shapes = [*(shape.link for shape in urdf.shapes), *(mesh.link for mesh in urdf.meshes)]
     bodies = urdf.rigid_bodies(model.joint_names)
     links = [(link, bodies[link][0], shapes.count(link), model.sphere_set.links.count(link)) for link in urdf.links]
@@ -160,7 +192,3 @@ def _gap(pair: LinkPair) -> tuple[str, str]:
     if math.isnan(pair.least_gap):
         return "-", "-"
     return f"{1e3 * pair.least_gap:.0f} to {1e3 * pair.largest_gap:.0f}", f"{100 * pair.hit_share:.1f}"
-
-
-def _number(value: float) -> str:
-    return f"{value:.4f}" if math.isfinite(value) else "-"

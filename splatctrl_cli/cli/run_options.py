@@ -16,10 +16,6 @@ def _shard(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(text.split(","))
-
-
 REPORT = (
     option("PATH", "the folder of a run, or of a batch", Path),
     *output("HTML file to write", default="PATH.html, beside PATH"),

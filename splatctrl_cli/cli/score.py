@@ -44,9 +44,13 @@ def show_scored(console: Console, result: ScoreResult) -> int:
 
 def _request(args: argparse.Namespace) -> ScoreRequest:
     first, *beside = args.reference or [None]
-    recording = replace(recording_of(args, first, args.masks), beside=tuple(beside))
-    given = {"recording": recording, "newest": args.snapshots == "newest", "cloud": _cloud(args)}
-    return request_of(ScoreRequest, args, **given)
+    return request_of(
+        ScoreRequest,
+        args,
+        recording=replace(recording_of(args, first, args.masks), beside=tuple(beside)),
+        newest=args.snapshots == "newest",
+        cloud=_cloud(args),
+    )
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
@@ -59,9 +63,12 @@ def _cloud(args: argparse.Namespace) -> CloudSettings | None:
     if args.dtu is None and (args.cloud_masks is not None or args.cloud.is_dir()):
         what = "--cloud-masks" if args.cloud_masks is not None else f"--cloud {args.cloud}"
         raise UsageError(f"{what}: a folder of scans, only with --dtu", remedy="give the file of this recording")
-    unit = args.cloud_unit if args.cloud_unit is not None else (MILLIMETRE if args.dtu is not None else 1.0)
     return CloudSettings(
-        path=args.cloud, unit=unit, max_distance=args.cloud_max, spacing=args.cloud_spacing, masks=args.cloud_masks
+        path=args.cloud,
+        unit=args.cloud_unit if args.cloud_unit is not None else (MILLIMETRE if args.dtu is not None else 1.0),
+        max_distance=args.cloud_max,
+        spacing=args.cloud_spacing,
+        masks=args.cloud_masks,
     )
 
 
@@ -97,12 +104,14 @@ def _lines_of_scans(report: Mapping[str, Any]) -> Iterator[str]:
     metrics, results = report["metrics"], report["results"]
     columns = [name for name in COLUMNS if name in metrics]
     rows = [[s, one["metrics"]["num_views"], *_cells(columns, one["metrics"])] for s, one in results.items()]
-    mean = [f"mean of {len(results)}", metrics["num_views"]]
-    yield from _with_mean(("scan", "views"), columns, rows, mean, metrics)
+    yield from _with_mean(
+        ("scan", "views"), columns, rows, [f"mean of {len(results)}", metrics["num_views"]], metrics
+    )
     yield from ("", *_protocol_lines(report["protocol"]))
     if "chamfer" in metrics:
-        words = (one["protocol"]["definitions"]["cloud"] for one in results.values())
-        yield from _cloud_lines(metrics, "; ".join(words))
+        yield from _cloud_lines(
+            metrics, "; ".join(one["protocol"]["definitions"]["cloud"] for one in results.values())
+        )
 
 
 def _with_mean(
@@ -142,9 +151,9 @@ def _cloud_lines(metrics: Mapping[str, Any], words: str) -> list[str]:
     def share(name: str) -> str:
         return "-" if metrics[name] is None else f"{100 * metrics[name]:.1f}% farther"
 
-    parts = [f"accuracy {length('accuracy')} ({share('accuracy_beyond')})"]
-    for name, of in (("completeness", "all"), ("completeness_seen", "seen")):
-        parts.append(f"completeness of {of} {length(name)} ({share(name + '_beyond')})")
+    figures = {"accuracy": "accuracy", "completeness": "completeness of all"}
+    figures["completeness_seen"] = "completeness of seen"
+    parts = [f"{words} {length(name)} ({share(name + '_beyond')})" for name, words in figures.items()]
     return [f"surface: {', '.join(parts)}, Chamfer {length('chamfer')}", f"cloud: {words}"]
 
 

@@ -6,8 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, format_cell, names_of, request_of, table
-from splatctrl_cli.config import load_config
-from splatctrl_cli.config.fixed import PROBABILITY_NEAR
+from splatctrl_cli.config import fixed, load_config
 from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, TruthComparison
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.formats.grid.grid_formats import FORMATS
@@ -28,8 +27,9 @@ def run(args: argparse.Namespace) -> int:
 def show_baked(console: Console, result: BakeResult) -> int:
     console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
     compared = result.accuracy.as_dict()
-    printed = {**result.summary, **({"accuracy": compared} if compared else {})}
-    return console.concluded(result.verdict, printed, _lines(result))
+    return console.concluded(
+        result.verdict, {**result.summary, **({"accuracy": compared} if compared else {})}, _lines(result)
+    )
 
 
 def _request(args: argparse.Namespace) -> BakeRequest:
@@ -61,8 +61,9 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
 
 def _lines(result: BakeResult) -> Iterator[str]:
     shown_values = {**result.summary, "shape": " x ".join(map(str, result.summary["shape"]))}
-    rows = [(name.replace("_", " "), format_cell(value)) for name, value in shown_values.items()]
-    yield from table(("field", ""), rows)
+    yield from table(
+        ("field", ""), [(name.replace("_", " "), format_cell(value)) for name, value in shown_values.items()]
+    )
     truth, mesh, held_out = result.accuracy.truth, result.accuracy.reference_mesh, result.accuracy.held_out_depth
     if truth is not None:
         yield from ("", *_truth_lines(truth))
@@ -105,7 +106,7 @@ def _truth_lines(compared: TruthComparison) -> list[str]:
     if compared.error_mean is not None and compared.error_sigma:
         mean, sigma = compared.error_mean, compared.error_sigma
         expected.append(
-            f"within {PROBABILITY_NEAR * 100:g} cm of seen surfaces sdf errs by {mean * 1e3:.1f} +- "
+            f"within {fixed.PROBABILITY_NEAR * 100:g} cm of seen surfaces sdf errs by {mean * 1e3:.1f} +- "
             f"{sigma * 1e3:.1f} mm: calibrate the probability with --set "
             f"field.error_mean={mean:.4f} --set field.error={sigma:.4f}"
         )

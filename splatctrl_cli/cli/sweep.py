@@ -12,16 +12,21 @@ from splatctrl_cli.jobs.sweep.sweep import KeyFlip, SweepRequest, SweepResult, T
 
 def run(args: argparse.Namespace) -> int:
     console, workers = Console(args), args.workers or os.cpu_count() or 1
-    request = request_of(SweepRequest, args, out=args.out or Path("sweep"), workers=workers)
-    result = sweep(request, OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1)), console)
+    result = sweep(
+        request_of(SweepRequest, args, out=args.out or Path("sweep"), workers=workers),
+        OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1)),
+        console,
+    )
     return console.result({"out": str(result.out), **result.as_dict()}, _lines(result, is_long=args.verbose > 0))
 
 
 def _lines(result: SweepResult, *, is_long: bool) -> Iterator[str]:
     yield str(result.before["sentence"])
     yield ""
-    header = ("key", "from", "to", "unit", "verdict until", "", "verdict from", "", "tried")
-    yield from table(header, [_flip_row(flip) for flip in result.flips])
+    yield from table(
+        ("key", "from", "to", "unit", "verdict until", "", "verdict from", "", "tried"),
+        [_flip_row(flip) for flip in result.flips],
+    )
     yield ""
     for flip in result.flips:
         yield flip.sentence
@@ -38,8 +43,10 @@ def _lines(result: SweepResult, *, is_long: bool) -> Iterator[str]:
     if is_long:
         yield ""
         for flip in result.flips:
-            rows = [(f"{each.values[flip.key.name]:.6g}", each.label.upper(), each.folder) for each in flip.tried]
-            yield from table((flip.key.name, "verdict", "folder"), rows)
+            yield from table(
+                (flip.key.name, "verdict", "folder"),
+                [(f"{each.values[flip.key.name]:.6g}", each.label.upper(), each.folder) for each in flip.tried],
+            )
     yield ""
     yield f"{result.num_runs} runs, {result.num_new} of them new; wrote {result.out / 'sweep.json'}"
 

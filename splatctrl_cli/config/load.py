@@ -1,18 +1,16 @@
 """The whole configuration: defaults, a TOML file, single assignments; every key with value and source."""
 
-import copy
 import dataclasses
 import json
 import math
 import tomllib
 import types
-import typing
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, get_args, get_origin, get_type_hints
 
-from splatctrl_cli.config.ranges import Declared, Section, Within, check, cut, shown
+from splatctrl_cli.config.ranges import Declared, Section, Within, check, copy_unchecked, cut, shown
 from splatctrl_cli.config.sections import (
     ControlConfig,
     FieldConfig,
@@ -40,12 +38,7 @@ class Config:
     def __post_init__(self) -> None:
         check_voxel(self.scene, self.occupancy)
 
-    def derived(self, **sections: Section) -> Self:
-        """A copy with unchecked sections from a recording (`Section.derived`)."""
-        made = copy.copy(self)
-        for name, section in sections.items():
-            object.__setattr__(made, name, section)
-        return made
+    derived = copy_unchecked
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values for ``run.json``."""
@@ -102,11 +95,9 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
 
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    presets = [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]
-    for name in presets:
+    for name in [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]:
         _check_known(name, PRESETS, "--preset", "")
-        for section, values in PRESETS[name].items():
-            yield f"--preset {name}", section, values
+        yield from ((f"--preset {name}", section, values) for section, values in PRESETS[name].items())
     for section, values in ({} if path is None else _read_toml(path)).items():
         _check_known(section, [field.name for field in fields(Config)], str(path), "")
         if not isinstance(values, dict):
@@ -134,12 +125,12 @@ def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
     """Typed values. Raises UsageError for unknown keys or types."""
     kind = type(getattr(Config(), section))
     assert issubclass(kind, Section)
-    hints, declared = typing.get_type_hints(kind), kind.declared
+    hints, declared = get_type_hints(kind), kind.declared
     typed: dict[str, Any] = {}
     for key, value in values.items():
         _check_known(key, declared, where, f"{section}.")
         typed[key] = _of_type(value, hints[key])
-        if type(typed[key]) not in [typing.get_origin(option) or option for option in _options(hints[key])]:
+        if type(typed[key]) not in [get_origin(option) or option for option in _options(hints[key])]:
             expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
             expected += declared[key].expected
             raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {shown(value)}")
@@ -177,7 +168,7 @@ def type_name(hint: Any) -> str:
 
 
 def _options(hint: Any) -> tuple[Any, ...]:
-    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    return get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
 
 
 def _of_type(value: Any, hint: Any) -> Any:
@@ -231,21 +222,18 @@ def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Se
         for where, section, values in _tables(path, assignments)
         for key in values
     }
-    settings = []
-    for section in fields(Config):
-        kind = getattr(default, section.name)
-        for key, declared in kind.declared.items():
-            settings.append(
-                Setting(
-                    section=section.name,
-                    key=key,
-                    value=getattr(getattr(used, section.name), key),
-                    default=getattr(kind, key),
-                    source=sources.get(f"{section.name}.{key}", DEFAULT),
-                    declared=declared,
-                )
-            )
-    return tuple(settings)
+    return tuple(
+        Setting(
+            section=section,
+            key=key,
+            value=getattr(getattr(used, section), key),
+            default=getattr(values, key),
+            source=sources.get(f"{section}.{key}", DEFAULT),
+            declared=declared,
+        )
+        for section, values in vars(default).items()
+        for key, declared in values.declared.items()
+    )
 
 
 def toml_of(settings: Sequence[Setting]) -> Iterator[str]:

@@ -2,10 +2,9 @@
 
 import copy
 import math
-import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
 
 from splatctrl_cli.errors import UsageError
 
@@ -62,6 +61,17 @@ class OneOf:
 Declared = Within | OneOf
 
 
+T = TypeVar("T")
+
+
+def copy_unchecked(original: T, **values: Any) -> T:
+    """A copy with unchecked values from a recording, in their units."""
+    made = copy.copy(original)
+    for key, value in values.items():
+        object.__setattr__(made, key, value)
+    return made
+
+
 class Section:
     """A table of the configuration, checked when created."""
 
@@ -71,15 +81,10 @@ class Section:
 
     def __init_subclass__(cls, *, section: str) -> None:
         """Raises TypeError for a key without a range."""
-        hints = typing.get_type_hints(cls, include_extras=True)
+        hints = get_type_hints(cls, include_extras=True)
         cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
 
-    def derived(self, **values: float) -> Self:
-        """A copy with unchecked values from a recording, in its unit."""
-        made = copy.copy(self)
-        for key, value in values.items():
-            object.__setattr__(made, key, value)
-        return made
+    derived = copy_unchecked
 
     def __post_init__(self) -> None:
         for key, declared in self.declared.items():
@@ -92,7 +97,7 @@ class Section:
 
 
 def _declared(hint: Any) -> Declared:
-    for note in typing.get_args(hint)[1:]:
+    for note in get_args(hint)[1:]:
         if isinstance(note, Within | OneOf):
             return note
     raise TypeError(f"{hint}: expected Annotated with a range or words")

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_GOOD_OVERLAP, CLOUD_NO_OVERLAP
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.field_accuracy import (
     BandAccuracy,
@@ -39,7 +38,7 @@ def cloud_score(
     reference: Float64,
     seen: Bool,
     *,
-    max_distance: float = CLOUD_DISTANCE,
+    max_distance: float = fixed.CLOUD_DISTANCE,
     counts: Bool | None = None,
     unit: float = 1.0,
     threads: int = 1,
@@ -67,17 +66,12 @@ def cloud_score(
             f" it spans {_box(reference)} m, the surface {_box(points)} m",
             remedy="is it the same scene, in the same frame? give the cloud's unit as --cloud-unit",
         )
-    accuracy, accuracy_beyond = _mean_below(to_reference, max_distance)
-    completeness, completeness_beyond = _mean_below(to_surface, max_distance)
-    completeness_seen, completeness_seen_beyond = _mean_below(to_surface[seen], max_distance)
+    of = {"accuracy": to_reference, "completeness": to_surface, "completeness_seen": to_surface[seen]}
+    found = {name: _mean_below(distances, max_distance) for name, distances in of.items()}
     return {
-        "accuracy": accuracy,
-        "completeness": completeness,
-        "completeness_seen": completeness_seen,
-        "chamfer": (accuracy + completeness) / 2,
-        "accuracy_beyond": accuracy_beyond,
-        "completeness_beyond": completeness_beyond,
-        "completeness_seen_beyond": completeness_seen_beyond,
+        **{name: mean for name, (mean, _) in found.items()},
+        "chamfer": (found["accuracy"][0] + found["completeness"][0]) / 2,
+        **{f"{name}_beyond": beyond for name, (_, beyond) in found.items()},
         "num_points": float(len(counted)),
         "num_reference": float(len(reference)),
     }
@@ -88,7 +82,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
     factors = (1.0, 1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
     fits = {factor: _overlap(some, factor * others, margin) for factor in factors}
     best = max(fits, key=lambda factor: fits[factor])
-    if fits[1.0] < CLOUD_NO_OVERLAP and fits[best] > CLOUD_GOOD_OVERLAP:
+    if fits[1.0] < fixed.CLOUD_NO_OVERLAP and fits[best] > fixed.CLOUD_GOOD_OVERLAP:
         raise NotEvaluableError(
             f"the reference cloud: expected the size of the scene's surface, which spans {_box(points)} m, got"
             f" {_box(reference)} m; {best:g} times as large it overlaps by {100 * fits[best]:.0f}%",
@@ -240,8 +234,7 @@ def compare_with_held_out_depth(
     a measured point in the grid.
     """
     distances = grid_distances(grid)
-    upper = grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1)
-    box = Box(lower=grid.origin, upper=upper)
+    box = Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1))
     measured, eyes, num_edges = _measured(frames, counted, Box(lower=box.lower - REACH, upper=box.upper + REACH))
     if not box.contains(measured).any():
         raise NotEvaluableError(
@@ -305,8 +298,9 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
             is_chosen &= counted[index]
         is_edge = depth_edges(frame.depth)
         num_edges += int(np.count_nonzero(is_chosen & is_edge))
-        here = back_project(frame.intrinsics, frame.depth)[is_chosen & ~is_edge]
-        points_world = transform_points(frame.T_world_camera, here)
+        points_world = transform_points(
+            frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[is_chosen & ~is_edge]
+        )
         points.append(points_world[box.contains(points_world)])
         eyes.append(np.broadcast_to(frame.T_world_camera[:3, 3], points[-1].shape))
     return np.concatenate(points), np.concatenate(eyes), num_edges
@@ -327,11 +321,11 @@ def depth_edges(depth: NDArray[np.float32]) -> Bool:
 
 def _interpolated(grid: DistanceGrid, distances: dict[str, GridDistance], points: Float64) -> dict[str, Float64]:
     points = np.ascontiguousarray(points)
-    found = {}
-    for name, distance in distances.items():
-        values = np.ascontiguousarray(distance.values, dtype=np.float32)
-        found[name] = interpolate(values, grid.origin, grid.voxel, points)[0] + distance.added
-    return found
+    return {
+        name: each.added
+        + interpolate(np.ascontiguousarray(each.values, dtype=np.float32), grid.origin, grid.voxel, points)[0]
+        for name, each in distances.items()
+    }
 
 
 def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame]) -> Bool:

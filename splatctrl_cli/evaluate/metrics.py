@@ -67,14 +67,6 @@ class Shown:
     pick: str
 
 
-def least_of(column: str) -> Shown:
-    return Shown(column=column, pick="least")
-
-
-def largest_of(column: str) -> Shown:
-    return Shown(column=column, pick="largest")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Metric(Generic[R]):
     """One figure: its value, and the number of states, views or points behind it.

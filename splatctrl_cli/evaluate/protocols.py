@@ -74,8 +74,7 @@ class ScoreProtocol:
         if self.every:
             scored = tuple(n for i, n in enumerate(numbers) if i % self.every == self.first)
         else:
-            missing = sorted(set(self.training + self.scored) - set(numbers))
-            if missing:
+            if missing := sorted(set(self.training + self.scored) - set(numbers)):
                 raise InputError(
                     f"{where}: protocol {self.name}: expected views {_ranges(self.training + self.scored)}, got no "
                     f"view {_ranges(missing)}",
@@ -146,8 +145,9 @@ def score_protocol(name: str) -> ScoreProtocol:
     if name in PROTOCOLS:
         return PROTOCOLS[name]
     choices = (*PROTOCOLS, "holdout:RULE")
-    remedy = did_you_mean(name, choices, f"use one of: {', '.join(choices)}")
-    raise UsageError(f"--protocol {name}: unknown", remedy=remedy)
+    raise UsageError(
+        f"--protocol {name}: unknown", remedy=did_you_mean(name, choices, f"use one of: {', '.join(choices)}")
+    )
 
 
 def _holdout(name: str) -> ScoreProtocol:
@@ -163,8 +163,7 @@ def _holdout(name: str) -> ScoreProtocol:
             )
         return ScoreProtocol(name=name, every=step, first=first, source=source)
     if re.fullmatch(r"\d+(,\d+)*", rule):
-        scored = tuple(sorted({int(word) for word in rule.split(",")}))
-        return ScoreProtocol(name=name, scored=scored, source=source)
+        return ScoreProtocol(name=name, scored=tuple(sorted({int(word) for word in rule.split(",")})), source=source)
     raise UsageError(
         f"--protocol {name}: expected holdout:everyN, holdout:everyN+FIRST or holdout:2,5",
         remedy="such as holdout:every8",
@@ -178,8 +177,7 @@ def _ranges(numbers: Sequence[int]) -> str:
             runs[-1].append(number)
         else:
             runs.append([number])
-    parts = [str(r[0]) if len(r) == 1 else f"{r[0]}-{r[-1]}" for r in runs]
-    return ", ".join(parts) or "none"
+    return ", ".join(str(r[0]) if len(r) == 1 else f"{r[0]}-{r[-1]}" for r in runs) or "none"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.held_out_depth import CLOUD_SCALES
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS
 from splatctrl_cli.evaluate.score import metric_scales
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, gate_reasons, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, gate_reasons, note, verdict_of
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.records import Bool, Float64
@@ -61,11 +61,11 @@ def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
                 f"{path}: not comparable: {name}: expected {now.get(name)}, got {then.get(name)}",
                 remedy="score the baseline anew, in the same way",
             )
-    changed: dict[str, float | None] = {}
-    for name, value in report["metrics"].items():
-        old = earlier["metrics"].get(name)
-        changed[PREFIX + name] = None if value is None or not isinstance(old, int | float) else value - old
-    return changed
+    old: Mapping[str, Any] = earlier["metrics"]
+    return {
+        PREFIX + name: value - old[name] if value is not None and isinstance(old.get(name), int | float) else None
+        for name, value in report["metrics"].items()
+    }
 
 
 def report_of_scans(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -116,8 +116,10 @@ def other_scans(protocol: Mapping[str, Any], scans: Sequence[str]) -> list[str]:
     others = [name for name in scans if name not in {f"scan{number}" for number in published or ()}]
     if not published or not (missing or others):
         return []
-    parts = [f"lacks scans {', '.join(map(str, missing))}"] if missing else []
-    parts += [f"has {', '.join(others)} more"] if others else []
+    parts = [
+        *([f"lacks scans {', '.join(map(str, missing))}"] if missing else []),
+        *([f"has {', '.join(others)} more"] if others else []),
+    ]
     return [f"{protocol['name']}: this mean {' and '.join(parts)}; the published one is of {len(published)} scans"]
 
 
@@ -132,10 +134,14 @@ def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damag
         threshold=1.0,
         count=int(num_views),
     )
-    notes = [noted("score", line) for line in report["warnings"]]
-    gates = gate_reasons(require, dict.fromkeys(NAMES_WITH_CHANGES, None) | metrics, counts)
-    scope = counted(num_views, "view") + ("" if num_scans is None else f" of {counted(num_scans, 'scan')}")
-    return verdict_of("score", [compared, *notes, *gates], scope=scope, is_damaged=is_damaged, counts=counts)
+    notes = [note(criterion="score", sentence=line) for line in report["warnings"]]
+    return verdict_of(
+        "score",
+        [compared, *notes, *gate_reasons(require, dict.fromkeys(NAMES_WITH_CHANGES, None) | metrics, counts)],
+        scope=counted(num_views, "view") + ("" if num_scans is None else f" of {counted(num_scans, 'scan')}"),
+        is_damaged=is_damaged,
+        counts=counts,
+    )
 
 
 def counts_of(report: Mapping[str, Any]) -> dict[str, int]:
@@ -163,9 +169,7 @@ class Doubts:
     is_still: bool
     may_train: bool = False
     mask_rule: str = "none"
-    _names: list[str] = field(default_factory=list)
-    _photos: list[Float64] = field(default_factory=list)
-    _renders: list[Float64] = field(default_factory=list)
+    _thumbnails: list[tuple[str, Float64, Float64]] = field(default_factory=list)
     _masks: list[str] = field(default_factory=list)
     _twins: list[str] = field(default_factory=list)
 
@@ -184,9 +188,8 @@ class Doubts:
         if not self.is_still:
             return
         self._twins += [] if self.may_train else _twin(view)
-        self._names.append(view.name)
-        self._photos.append(_thumbnail(view.frame.color / 255.0))
-        self._renders.append(_thumbnail(np.clip(render, 0.0, 1.0)))
+        photo, drawn = _thumbnail(view.frame.color / 255.0), _thumbnail(np.clip(render, 0.0, 1.0))
+        self._thumbnails.append((view.name, photo, drawn))
 
     def lines(self) -> list[str]:
         """A sentence per doubt, with its figure."""
@@ -201,8 +204,7 @@ class Doubts:
                 f"{self._twins[0]}{_and_more(self._twins)}: a view that trained says nothing about others; is a view"
                 " there twice?"
             )
-        strangers = _strangers(self._names, self._photos, self._renders)
-        if strangers:
+        if strangers := _strangers(self._thumbnails):
             lines.append(
                 f"{strangers[0]}{_and_more(strangers)}: do the cameras belong to these images, and in this order?"
             )
@@ -234,10 +236,11 @@ def _thumbnail(image: NDArray[np.floating]) -> Float64:
     return np.asarray(small, np.float64).ravel()
 
 
-def _strangers(names: Sequence[str], photos: Sequence[Float64], renders: Sequence[Float64]) -> list[str]:
-    """Views whose photo is clearly nearer another's render."""
-    if len(names) < 2:
+def _strangers(thumbnails: Sequence[tuple[str, Float64, Float64]]) -> list[str]:
+    """Views whose photo is clearly nearer another's render; of names, photos and renders."""
+    if len(thumbnails) < 2:
         return []
+    names, photos, renders = zip(*thumbnails, strict=True)
     x, y = np.stack(photos), np.stack(renders)
     squared = np.square(x).sum(axis=1)[:, None] + np.square(y).sum(axis=1) - 2 * x @ y.T
     decibels = -10 * np.log10(np.maximum(squared / x.shape[1], 1e-8))

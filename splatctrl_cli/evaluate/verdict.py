@@ -177,18 +177,14 @@ def verdict_of(
 
     Without any reason it is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
     """
-    given = list(reasons)
-    if not given:
-        nothing = Reason(criterion="evidence", outcome=Outcome.NOT_EVALUABLE, sentence="nothing was judged")
-        given = [nothing]
+    given = list(reasons) or [lacking(criterion="evidence", sentence="nothing was judged")]
     ordered = sorted(given, key=lambda reason: _WORST_FIRST.index(reason.outcome))
     outcome = ordered[0].outcome
     failure = next((r.label for r in ordered if r.outcome is Outcome.FAILED and r.label), "failed")
-    label = {Outcome.PASSED: passed, Outcome.FAILED: failure}.get(outcome, str(outcome))
     return Verdict(
         command=command,
         outcome=outcome,
-        label=label,
+        label={Outcome.PASSED: passed, Outcome.FAILED: failure}.get(outcome, str(outcome)),
         scope=scope,
         reasons=tuple(ordered),
         how=how,
@@ -218,11 +214,6 @@ def counted(number: float, noun: str) -> str:
     return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
 
 
-def noted(criterion: str, sentence: str) -> Reason:
-    """A `note` without a figure."""
-    return note(criterion=criterion, sentence=sentence)
-
-
 def _plain(reason: Reason) -> dict[str, Any]:
     plain = asdict(reason) | {"outcome": str(reason.outcome)}
     for name in ("value", "threshold", "time_s"):
@@ -247,8 +238,10 @@ def check_gate_names(
             if name not in names and name in others:
                 raise UsageError(f"--require {requirement}: a figure of {options}", remedy="give it, or gate another")
         if name not in names:
-            remedy = did_you_mean(name, names, f"known here: {', '.join(names)}")
-            raise UsageError(f"--require {requirement}: unknown metric", remedy=remedy)
+            raise UsageError(
+                f"--require {requirement}: unknown metric",
+                remedy=did_you_mean(name, names, f"known here: {', '.join(names)}"),
+            )
 
 
 def gate_reasons(

@@ -210,5 +210,4 @@ def _window_mean(image: Float64, border: Literal["reflect", "constant"]) -> Floa
     offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
     weights /= weights.sum()
-    rows = correlate1d(image, weights, axis=0, mode=border)
-    return np.asarray(correlate1d(rows, weights, axis=1, mode=border))
+    return np.asarray(correlate1d(correlate1d(image, weights, axis=0, mode=border), weights, axis=1, mode=border))

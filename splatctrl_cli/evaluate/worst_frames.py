@@ -35,17 +35,8 @@ class Moment:
     caption: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sight:
-    """The image that shows a moment best."""
-
-    moment: Moment
-    frame: RgbdFrame
-
-    @property
-    def age_s(self) -> float:
-        """Age [s] of the image at the moment."""
-        return (self.moment.stamp_ns - self.frame.stamp_ns) * 1e-9
+Sight = tuple[Moment, RgbdFrame]
+"""A moment, and the image that shows it best."""
 
 
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
@@ -89,9 +80,8 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
     return found
 
 
-def draw_sight(path: Path, sight: Sight) -> None:
+def draw_sight(path: Path, moment: Moment, frame: RgbdFrame) -> None:
     """Write the image with the spheres' silhouettes, a line to the obstacle, and the caption."""
-    moment, frame = sight.moment, sight.frame
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
     picture = np.asarray(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
@@ -114,7 +104,7 @@ def draw_sight(path: Path, sight: Sight) -> None:
 
 def _best(moment: Moment, newest: dict[str, RgbdFrame]) -> Sight | None:
     frames = [newest[camera] for camera in sorted(newest)]
-    return Sight(moment=moment, frame=max(frames, key=lambda frame: _view(moment, frame))) if frames else None
+    return (moment, max(frames, key=lambda frame: _view(moment, frame))) if frames else None
 
 
 def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:

@@ -1,5 +1,6 @@
 """Atomic outputs with one writer at a time, and ``run.json`` with their digests."""
 
+import csv
 import errno
 import fcntl
 import hashlib
@@ -10,9 +11,9 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -206,8 +207,11 @@ def output_path(
         try:
             stack.enter_context(held(partial, is_folder=is_folder))
             is_resumed = resume and can_go_on()
-            if not is_resumed:
-                _empty(partial)
+            if is_folder and not is_resumed:
+                for entry in partial.iterdir():
+                    remove(entry)
+            elif not is_resumed:
+                os.truncate(partial, 0)
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
         try:
@@ -300,14 +304,6 @@ def _check_not_there(path: Path, *, force: bool) -> None:
         raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
 
 
-def _empty(partial: Path) -> None:
-    if partial.is_dir():
-        for entry in partial.iterdir():
-            remove(entry)
-    else:
-        os.truncate(partial, 0)
-
-
 def _replace(partial: Path, path: Path) -> None:
     old = path.with_name(path.name + ".partial.old")  # no name that a person gives to a copy
     if path.is_dir() and not path.is_symlink():
@@ -319,11 +315,11 @@ def _replace(partial: Path, path: Path) -> None:
     remove(old)  # also of a run killed right above
 
 
+@dataclass
 class Stopwatch:
     """Wall time by stage [s]."""
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+    seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -375,6 +371,14 @@ def write_run(
     if command in WITH_PARTS:
         run["parts"] = part_digests(folder)
     write_json(folder / "run.json", run)
+
+
+def write_table(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write rows as CSV under a header of names."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.DictWriter(stream, fieldnames=names, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
 
 
 def write_json(path: Path, value: object) -> None:

@@ -117,8 +117,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
         begin = {camera: np.eye(4) for camera in cameras}
         if request.board is not None:
             by_stamp = {c: {f.stamp_ns: f.T_world_camera for f in frames if f.camera == c} for c in cameras}
-            rig = Rig(recorded=by_stamp, moving=moving, arm=arm, held=held)
-            begin = board_start(request.board, sightings, rig)
+            begin = board_start(request.board, sightings, Rig(recorded=by_stamp, moving=moving, arm=arm, held=held))
         frames = [replace(frame, T_world_camera=frame.T_world_camera @ begin[frame.camera]) for frame in frames]
         evidence = evidence_of(frames, arm)
         progress.log(f"calibrate: {len(frames)} frames of {', '.join(evidence.cameras)}")

@@ -59,8 +59,10 @@ def check(request: CheckRequest) -> CheckResult:
     model = posed_robot(request.paths, request.urdf, request)
     other = "" if request.urdf is None or model is None else differs(model.urdf, request.paths)
     report = _report(request, model)
-    findings = [warning("robot-model", str(request.urdf), other, TAKE)] if other else []
-    report = replace(report, findings=[*report.findings, *findings])
+    report = replace(
+        report,
+        findings=[*report.findings, *([warning("robot-model", str(request.urdf), other, TAKE)] if other else [])],
+    )
     verdict = _verdict(report, request.fail_on)
     return CheckResult(
         report=report, verdict=verdict, exit_code=0 if request.fail_on == "never" else verdict.exit_code
@@ -70,8 +72,7 @@ def check(request: CheckRequest) -> CheckResult:
 def refuse_errors(path: Path, options: SourceOptions, allowed: Collection[str] = ()) -> None:
     """Raise InputError if `check` finds an error for reconstruct, except `allowed` codes."""
     report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
-    errors = [f for f in report.refusing(Need(command="reconstruct", lacks=())) if f.code not in allowed]
-    if errors:
+    if errors := [f for f in report.refusing(Need(command="reconstruct", lacks=())) if f.code not in allowed]:
         first, more = errors[0], f"; {len(errors) - 1} more: splatctrl check {path}" if len(errors) > 1 else ""
         remedy = first.remedy or CHECKS[first.code].remedy
         remedy += f"; if it is right, give {_ALLOWING[first.code]}" if first.code in _ALLOWING else ""
@@ -80,10 +81,11 @@ def refuse_errors(path: Path, options: SourceOptions, allowed: Collection[str] =
 
 def _report(request: CheckRequest, model: RobotModel | None, *, only_errors: bool = False) -> CheckReport:
     log, options, num = open_logs(request.paths), request.options, request.num_images
-    if log is None:
-        report = check_folder(request.paths[0], options, model=model, num_images=num, only_errors=only_errors)
-    else:
-        report = check_log(log, options, model=model, num_images=num, only_errors=only_errors)
+    report = (
+        check_folder(request.paths[0], options, model=model, num_images=num, only_errors=only_errors)
+        if log is None
+        else check_log(log, options, model=model, num_images=num, only_errors=only_errors)
+    )
     return replace(report, findings=[*report.findings, *_agreement(report)])
 
 

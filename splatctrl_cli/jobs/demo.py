@@ -133,14 +133,17 @@ def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda 
             stopwatch=stopwatch,
             verdict=verdict.as_dict(),
         )
-    pictures = {out / name: description for name, description in PICTURES.items()}
-    return DemoResult(out=out, verdict=verdict, seconds=time.perf_counter() - start, pictures=pictures)
+    return DemoResult(
+        out=out,
+        verdict=verdict,
+        seconds=time.perf_counter() - start,
+        pictures={out / name: description for name, description in PICTURES.items()},
+    )
 
 
 def _refuse_unusable(data: Path, out: Path) -> None:
     """Raise InputError if `data` is no recording, UsageError if it is the output."""
-    missing = [name for name in INPUTS if not (data / name).is_file()]
-    if missing:
+    if missing := [name for name in INPUTS if not (data / name).is_file()]:
         raise InputError(
             f"{data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
         )
@@ -173,16 +176,18 @@ def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step
 
     def reconstructed() -> ReconstructResult:
         source, options = open_to_train(training), {**DECIDING_OPTIONS, "cameras": ",".join(TRAINING)}
-        asked = ReconstructRequest(
-            source=source,
-            out=scene,
-            config=Config(scene=BUDGET),
-            urdf=urdf,
-            spheres=spheres,
-            options=options,
-            threads=threads,
+        return reconstruct(
+            ReconstructRequest(
+                source=source,
+                out=scene,
+                config=Config(scene=BUDGET),
+                urdf=urdf,
+                spheres=spheres,
+                options=options,
+                threads=threads,
+            ),
+            progress,
         )
-        return reconstruct(asked, progress)
 
     steps: tuple[tuple[str, Callable[[], StepResult], str], ...] = (
         ("info {data}/log.mcap", lambda: describe(log, SourceOptions()), "done"),

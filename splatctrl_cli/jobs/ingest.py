@@ -77,8 +77,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
         told_how_to_go_on(journal, journal.parent),
         output_path(out, force=request.force, is_folder=True, checkpoint=JOURNAL, resume=request.resume) as partial,
     ):
-        before = read_identity(partial)
-        if before is not None:
+        if (before := read_identity(partial)) is not None:
             check_same_run(partial, before, identity)
         with stopwatch.stage("write"):
             summary = write_capture(
@@ -105,6 +104,9 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
 
 def _identity(options: SourceOptions, inputs: Mapping[str, str]) -> dict[str, Any]:
     versions = {name: metadata.version(name) for name in ("numpy", "opencv-python-headless")}
-    values = {"splatctrl": __version__, **versions, "options": asdict(options), "sha256": dict(inputs)}
-    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
+    plain: dict[str, Any] = json.loads(
+        json.dumps(
+            {"splatctrl": __version__, **versions, "options": asdict(options), "sha256": dict(inputs)}, default=str
+        )
+    )
     return plain

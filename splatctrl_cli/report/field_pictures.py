@@ -21,7 +21,6 @@ from splatctrl_cli.report.pictures import (
     draw_never_seen,
     drawn_figure,
     extent_of,
-    save_figure,
     set_grid,
 )
 from splatctrl_cli.voxels import VoxelState
@@ -53,24 +52,21 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is veiled and hatched.
     """
-    with _panels(grid, point) as (figure, panels):
+    never = "; hatched: never seen" if _knows_seen(grid) else ""
+    lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
+    field = grid.header.get("sdf", "positive outside")
+    with _panels(path, grid, point) as (figure, panels):
         for axes, cut in panels:
-            distance = cut.of(grid, "sdf")
-            image = draw_distance(axes, cut.coordinates, distance, cut.voxel, names_lines=False)
+            image = draw_distance(axes, cut.coordinates, cut.of(grid, "sdf"), cut.voxel, names_lines=False)
             if _knows_seen(grid):
-                never_seen = cut.of(grid, "observed") == VoxelState.NEVER_SEEN
-                draw_never_seen(axes, cut.coordinates, never_seen, cut.voxel)
+                draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
         figure.colorbar(image, ax=[axes for axes, _ in panels], extend="both", label="distance [cm]", pad=0.01)
-        never = "; hatched: never seen" if _knows_seen(grid) else ""
-        lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
-        field = grid.header.get("sdf", "positive outside")
         figure.suptitle(f"Distance in world: {field}; lines at {lines} cm{never}", fontsize=12)
-        save_figure(figure, path)
 
 
 def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
     """Write slices of `probability` through the cell nearest to `point` [m], with the surface."""
-    with _panels(grid, point) as (figure, panels):
+    with _panels(path, grid, point) as (figure, panels):
         for axes, cut in panels:
             image = axes.imshow(
                 cut.of(grid, "probability"),
@@ -84,7 +80,6 @@ def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) 
             _surface(axes, cut, grid, "white")
         figure.colorbar(image, ax=[axes for axes, _ in panels], label="probability of collision", pad=0.01)
         figure.suptitle(f"Probability of collision, {grid.header.get('probability', '')}; white line: sdf = 0")
-        save_figure(figure, path)
 
 
 def gradient_picture(
@@ -98,11 +93,10 @@ def gradient_picture(
     (cut,) = _cuts(grid, point, axes=(2,))
     sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]
     height = float(np.clip(0.5 * (WIDTH - 2.5) * sides[1] / sides[0] + 1.2, 4.0, 8.0))
-    with drawn_figure(height) as figure:
+    with drawn_figure(path, height) as figure:
         left, right = figure.subplots(1, 2)
-        length = np.linalg.norm(cut.of(grid, "gradient"), axis=2)
         image = left.imshow(
-            length,
+            np.linalg.norm(cut.of(grid, "gradient"), axis=2),
             origin="lower",
             extent=extent_of(cut.coordinates, cut.voxel),
             cmap="RdBu_r",
@@ -114,7 +108,6 @@ def gradient_picture(
         figure.colorbar(image, ax=left, extend="both", label="length of the gradient", fraction=0.05, pad=0.02)
         _label(left, cut)
         _draw_histogram(right, histogram, bin_width)
-        save_figure(figure, path)
 
 
 def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> None:
@@ -141,13 +134,13 @@ def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> No
 
 @contextmanager
 def _panels(
-    grid: DistanceGrid, point: Sequence[float]
+    path: Path, grid: DistanceGrid, point: Sequence[float]
 ) -> Iterator[tuple["mpl.figure.Figure", list[tuple[Any, Cut]]]]:
-    """Axes for slices across z, y and x, at one scale."""
+    """Axes for slices across z, y and x, at one scale, written to `path`."""
     cuts = _cuts(grid, point, axes=(2, 1, 0))
     sides = np.array([[float(np.ptp(c)) + cut.voxel for c in cut.coordinates] for cut in cuts])
     height = float(np.clip((WIDTH - 3.2) * sides[:, 1].max() / sides[:, 0].sum() + 1.5, 3.2, 9.0))
-    with drawn_figure(height) as figure:
+    with drawn_figure(path, height) as figure:
         panels = figure.subplots(1, 3, gridspec_kw={"width_ratios": sides[:, 0]})
         for axes, cut in zip(panels, cuts, strict=True):
             _label(axes, cut)
@@ -162,9 +155,15 @@ def _cuts(grid: DistanceGrid, point: Sequence[float], *, axes: Sequence[int]) ->
         first, second = (other for other in range(3) if other != axis)
         step = max(1, -(-max(shape[first], shape[second]) // 600))
         right, up = (grid.origin[i] + grid.voxel * np.arange(0, shape[i], step) for i in (first, second))
-        plane = float(grid.origin[axis]) + grid.voxel * index
         cuts.append(
-            Cut(axis=axis, index=index, step=step, plane=plane, coordinates=(right, up), voxel=step * grid.voxel)
+            Cut(
+                axis=axis,
+                index=index,
+                step=step,
+                plane=float(grid.origin[axis]) + grid.voxel * index,
+                coordinates=(right, up),
+                voxel=step * grid.voxel,
+            )
         )
     return cuts
 
@@ -211,7 +210,6 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
     if not ((probability >= 0) & (probability <= 1)).all():
         i = int(np.argmin((probability >= 0) & (probability <= 1)))
         raise UsageError(f"reliability: point {i}: expected a probability in [0, 1], got {probability[i]}")
-    edges = np.linspace(0.0, 1.0, bins + 1)
     which = np.minimum((probability * bins).astype(np.int64), bins - 1)
     count = np.bincount(which, minlength=bins)
     total, collided = (
@@ -219,7 +217,7 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
         for values in (probability, is_colliding.astype(np.float64))
     )
     return Reliability(
-        edges=edges,
+        edges=np.linspace(0.0, 1.0, bins + 1),
         predicted=np.divide(total, count, out=np.full(bins, np.nan), where=count > 0),
         observed=np.divide(collided, count, out=np.full(bins, np.nan), where=count > 0),
         count=count,
@@ -232,7 +230,7 @@ def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: st
 
     A calibrated probability lies on the diagonal.
     """
-    with drawn_figure(5.6) as figure:
+    with drawn_figure(path, 5.6) as figure:
         axes, bars = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1, 1]})
         axes.plot([0, 1], [0, 1], color=INK, linewidth=1.0, linestyle=(0, (6, 3)))
         axes.annotate(
@@ -240,8 +238,14 @@ def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: st
         )
         for index, (name, curve) in enumerate(curves.items()):
             color = CURVE_COLORS[index % len(CURVE_COLORS)]
-            label = f"{name}  calibration error {curve.calibration_error:.3f}"
-            axes.plot(curve.predicted, curve.observed, "o-", color=color, linewidth=1.8, label=label)
+            axes.plot(
+                curve.predicted,
+                curve.observed,
+                "o-",
+                color=color,
+                linewidth=1.8,
+                label=f"{name}  calibration error {curve.calibration_error:.3f}",
+            )
             width = np.diff(curve.edges) / (len(curves) + 1)
             bars.bar(curve.edges[:-1] + (index + 1) * width, curve.count, width, color=color)
         axes.set(xlabel="predicted probability", ylabel="share that collides", xlim=(0, 1), ylim=(-0.02, 1.02))
@@ -251,4 +255,3 @@ def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: st
         for panel in (axes, bars):
             set_grid(panel, "both")
         figure.legend(frameon=False, loc="outside lower center", ncols=2)
-        save_figure(figure, path)

@@ -99,9 +99,13 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
 
     line: its message; lines: the end of its log.
     """
-    name = "killed" if exit_code is None else WORDS.get(exit_code, "error")
-    text = "\n".join([line, *lines, *([] if exit_code is None else [f"exit code: {exit_code}"])])
-    return Case(name=name, group=group, kind=Kind.ERROR, sentence=line, text=text)
+    return Case(
+        name="killed" if exit_code is None else WORDS.get(exit_code, "error"),
+        group=group,
+        kind=Kind.ERROR,
+        sentence=line,
+        text="\n".join([line, *lines, *([] if exit_code is None else [f"exit code: {exit_code}"])]),
+    )
 
 
 def skipped_case(group: str, why: str) -> Case:
@@ -178,8 +182,10 @@ def check_replaceable(path: Path) -> None:
 
 def junit_text(suites: Sequence[Suite]) -> str:
     """The suites as reproducible XML 1.0; characters that XML cannot hold are escaped."""
-    seconds = _seconds(sum(suite.seconds for suite in suites))
-    root = ElementTree.Element("testsuites", {"name": "splatctrl", **_counts(suites), "time": seconds})
+    root = ElementTree.Element(
+        "testsuites",
+        {"name": "splatctrl", **_counts(suites), "time": _seconds(sum(suite.seconds for suite in suites))},
+    )
     for suite in suites:
         _add_suite(root, suite)
     ElementTree.indent(root)
@@ -187,8 +193,13 @@ def junit_text(suites: Sequence[Suite]) -> str:
 
 
 def _add_suite(root: ElementTree.Element, suite: Suite) -> None:
-    attributes = {"name": _clean(suite.name), **_counts([suite]), "skipped": str(suite.count(Kind.SKIPPED))}
-    attributes |= {"time": _seconds(suite.seconds)} | ({"timestamp": suite.started} if suite.started else {})
+    attributes = {
+        "name": _clean(suite.name),
+        **_counts([suite]),
+        "skipped": str(suite.count(Kind.SKIPPED)),
+        "time": _seconds(suite.seconds),
+        **({"timestamp": suite.started} if suite.started else {}),
+    }
     element = ElementTree.SubElement(root, "testsuite", attributes)
     if suite.properties:
         properties = ElementTree.SubElement(element, "properties")
@@ -201,8 +212,11 @@ def _add_suite(root: ElementTree.Element, suite: Suite) -> None:
 
 
 def _add_case(suite: ElementTree.Element, case: Case) -> None:
-    attributes = {"classname": _clean(case.group), "name": _clean(case.name), "time": _seconds(case.seconds)}
-    element = ElementTree.SubElement(suite, "testcase", attributes)
+    element = ElementTree.SubElement(
+        suite,
+        "testcase",
+        {"classname": _clean(case.group), "name": _clean(case.name), "time": _seconds(case.seconds)},
+    )
     if case.kind is Kind.PASSED:
         if case.text:
             ElementTree.SubElement(element, "system-out").text = _clean(case.text)
@@ -269,8 +283,10 @@ def summary(suites: Sequence[Suite], room: int) -> str:
     cases = worst_first(suites)
     total = sum(len(suite.cases) for suite in suites)
     of = suites[0].name if len(suites) == 1 else f"{len(suites)} recordings"
-    counts = [f"{_cell(of)}: {total - len(cases)} of {total} criteria passed"]
-    counts += [f"{number} {kind}" for kind in Kind if (number := sum(case.kind is kind for _, case in cases))]
+    counts = [
+        f"{_cell(of)}: {total - len(cases)} of {total} criteria passed",
+        *(f"{number} {kind}" for kind in Kind if (number := sum(case.kind is kind for _, case in cases))),
+    ]
     head = "\n".join([f"### splatctrl: {', '.join(counts)}", "", *(TABLE_HEAD if cases else [])]) + "\n"
     rows = [
         f"| {' | '.join(map(_cell, (suite.name, case.name, str(case.kind), case.sentence)))} |\n"

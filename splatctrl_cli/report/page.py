@@ -102,8 +102,9 @@ def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
     ):
         parts.setdefault(surface.links[link], []).append(_primitive(kind, size).apply_transform(T))
     for number in np.unique(surface.triangle_links):
-        corners = surface.triangles[surface.triangle_links == number]
-        mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners), process=True)
+        mesh = trimesh.Trimesh(
+            **trimesh.triangles.to_kwargs(surface.triangles[surface.triangle_links == number]), process=True
+        )
         parts.setdefault(surface.links[number], []).append(mesh)
     whole = {link: trimesh.util.concatenate(meshes) for link, meshes in parts.items()}
     return {
@@ -137,8 +138,7 @@ def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most
         full = 2 * cells.sum(axis=(1, 3, 5), dtype=np.int32) >= factor**3
         borders = np.argwhere(full & ~binary_erosion(full, border_value=1))
         if len(borders) <= most:
-            centers = origin + voxel * (factor * borders + (factor - 1) / 2)
-            return np.asarray(centers, np.float32), factor * voxel
+            return np.asarray(origin + voxel * (factor * borders + (factor - 1) / 2), np.float32), factor * voxel
         factor += 1
 
 
@@ -325,8 +325,9 @@ def rendered(page: Page) -> str:
         name: Markup((PARTS / file).read_text(encoding="utf-8"))
         for name, file in {"css": "page.css", "script": "page.js", "viewer": "viewer.js"}.items()
     }
-    three = Markup(json.dumps(three_js())) if page.scenes else ""
-    return environment.get_template("page.html").render(page=page, three=three, **parts)
+    return environment.get_template("page.html").render(
+        page=page, three=Markup(json.dumps(three_js())) if page.scenes else "", **parts
+    )
 
 
 def picture(path: Path, title: str, most: int) -> Picture:
@@ -339,8 +340,7 @@ def picture(path: Path, title: str, most: int) -> Picture:
         height, width = round(height * most / width), most
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     # JPEG: WebP is a third smaller, and takes ten times as long
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
-    text = base64.b64encode(data).decode("ascii")
+    text = base64.b64encode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()).decode("ascii")
     return Picture(title=title, data=f"data:image/jpeg;base64,{text}", width=width, height=height)
 
 

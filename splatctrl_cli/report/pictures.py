@@ -62,13 +62,12 @@ def comparison_picture(path: Path, rows: Sequence[ComparisonRow]) -> None:
         raise NotEvaluableError(f"{path}: no view to draw: expected at least one, got 0")
     height, width = rows[0].photo.shape[:2]
     row_height = (WIDTH - 1.2) / 3 * height / width + 0.42
-    with drawn_figure(len(rows) * row_height + 0.15) as figure:
+    with drawn_figure(path, len(rows) * row_height + 0.15) as figure:
         grid = figure.subplots(
             len(rows), 4, squeeze=False, gridspec_kw={"width_ratios": [1, 1, 1, 0.035], "wspace": 0.04}
         )
         for row, axes in zip(rows, grid, strict=True):
             _draw_comparison(figure, axes, row)
-        save_figure(figure, path)
 
 
 def field_slice_picture(
@@ -97,7 +96,7 @@ def field_slice_picture(
     coordinates = [grid.origin[i] + grid.voxel * np.arange(grid.channels["sdf"].shape[i]) for i in (first, second)]
     spans = [float(np.ptp(c)) + grid.voxel for c in coordinates]
     height = float(np.clip((WIDTH - 2.6) * spans[1] / spans[0] + 1.5, 4.5, 12.0))
-    with drawn_figure(height) as figure:
+    with drawn_figure(path, height) as figure:
         axes = figure.subplots()
         image = draw_distance(axes, coordinates, distance, grid.voxel)
         figure.colorbar(image, ax=axes, extend="both", label="distance [cm]", fraction=0.05, pad=0.02)
@@ -109,7 +108,6 @@ def field_slice_picture(
         _explain(axes, has_spheres=spheres is not None, has_observed="observed" in grid.channels)
         axes.set(xlabel=f"{'xyz'[first]} [m]", ylabel=f"{'xyz'[second]} [m]", aspect="equal")
         axes.set_title(f"{title or 'Distance field'}   {'xyz'[axis]} = {plane:.2f} m", pad=12)
-        save_figure(figure, path)
 
 
 def span_of(seconds: Float64) -> tuple[float, float]:
@@ -118,22 +116,20 @@ def span_of(seconds: Float64) -> tuple[float, float]:
 
 
 @contextmanager
-def drawn_figure(height: float) -> Iterator["mpl.figure.Figure"]:
-    """A figure of the house style, 1200 pixels wide."""
+def drawn_figure(path: Path, height: float, told: str = "") -> Iterator["mpl.figure.Figure"]:
+    """A figure of the house style, 1200 pixels wide, written without a date when the block ends.
+
+    told: its description in the file.
+    """
     with mpl.rc_context(STYLE):
         layout = mpl.layout_engine.ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08)
-        yield mpl.figure.Figure(figsize=(WIDTH, height), dpi=DPI, layout=layout)
-
-
-def save_figure(figure: "mpl.figure.Figure", path: Path, told: str = "") -> None:
-    """Write the figure without a date; told: its description in the file."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-        figure.set_layout_engine(None)  # else savefig lays out once more, and draws everything for it
-    figure.savefig(
-        path, dpi=DPI, facecolor="white", metadata={"Software": "splatctrl"} | ({"Description": told} if told else {})
-    )
+        figure = mpl.figure.Figure(figsize=(WIDTH, height), dpi=DPI, layout=layout)
+        yield figure
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)
+            figure.set_layout_engine(None)  # else savefig lays out once more, and draws everything for it
+        metadata = {"Software": "splatctrl"} | ({"Description": told} if told else {})
+        figure.savefig(path, dpi=DPI, facecolor="white", metadata=metadata)
 
 
 def _draw_comparison(figure: "mpl.figure.Figure", axes: Sequence[Any], row: ComparisonRow) -> None:
@@ -237,7 +233,7 @@ def view_picture(path: Path, row: ComparisonRow) -> None:
     render = np.clip(row.render, 0.0, 1.0)
     color_error = np.asarray(100.0 * np.abs(render - row.photo / 255.0).mean(axis=2))
     hole = (row.photo_depth > 0) & ~(row.render_depth > 0)
-    with drawn_figure(2 * ((WIDTH - 1.9) / 2 * height / width + 0.4) + 0.2) as figure:
+    with drawn_figure(path, 2 * ((WIDTH - 1.9) / 2 * height / width + 0.4) + 0.2) as figure:
         axes = figure.subplots(2, 2)
         axes[0, 0].imshow(row.photo, interpolation="nearest")
         axes[0, 1].imshow(render, interpolation="nearest")
@@ -257,7 +253,6 @@ def view_picture(path: Path, row: ComparisonRow) -> None:
         )
         for panel, text in zip(axes.flat, titles, strict=True):
             _finish(panel, text)
-        save_figure(figure, path)
 
 
 def _outline(panels: Any, mask: NDArray[np.bool_]) -> None:
@@ -300,7 +295,7 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
     corners = [triangles.reshape(-1, 3), centers - radii[:, None], centers + radii[:, None]]
     lower = np.min([points.min(axis=0) for points in corners], axis=0) - EDGE
     upper = np.max([points.max(axis=0) for points in corners], axis=0) + EDGE
-    with drawn_figure(6.0) as figure:
+    with drawn_figure(path, 6.0) as figure:
         widths = [float(upper[across] - lower[across]) for _, across, _, _ in VIEWS]
         axes = figure.subplots(1, len(VIEWS), width_ratios=widths)
         for view, (title, across, along, viewer) in zip(axes, VIEWS, strict=True):
@@ -323,7 +318,6 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
         figure.suptitle(
             f"{len(radii)} spheres; red: surface outside the spheres of every link, in this posture", color=INK
         )
-        save_figure(figure, path)
 
 
 def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int, int], viewer: Float64) -> None:

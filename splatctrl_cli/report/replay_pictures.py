@@ -10,7 +10,7 @@ import numpy as np
 
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Float64, FloatRows
-from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure, set_grid, span_of
+from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, set_grid, span_of
 from splatctrl_cli.voxels import EvidenceClass
 
 Intervals = Sequence[tuple[float, float]]
@@ -75,7 +75,7 @@ def clearance_picture(
     NaN leaves gaps; below the margin is shaded, minima are marked.
     """
     shown = {kind: intervals for kind, intervals in events.items() if intervals}
-    with drawn_figure(4.8 + _strip_height(shown)) as figure:
+    with drawn_figure(path, 4.8 + _strip_height(shown)) as figure:
         axes, strip = figure.subplots(2, 1, sharex=True, height_ratios=[4.4, max(_strip_height(shown), 0.05)])
         lowest = min(0.0, *[_clearance_curve(axes, seconds, values, name) for name, values in curves.items()])
         bottom = lowest * 1.15 - 0.2 if lowest < 0 else 0.0
@@ -99,7 +99,6 @@ def clearance_picture(
         )
         _tidy(axes, seconds)
         _draw_strip(strip, axes, shown, seconds)
-        save_figure(figure, path)
 
 
 def evidence_picture(path: Path, seconds: Float64, shares: Float64) -> None:
@@ -109,7 +108,7 @@ def evidence_picture(path: Path, seconds: Float64, shares: Float64) -> None:
     """
     is_asked = np.isfinite(shares).all(axis=1)
     there = [kind for kind in EVIDENCE_COLORS if shares[is_asked, kind].any()]
-    with drawn_figure(3.6) as figure:
+    with drawn_figure(path, 3.6) as figure:
         axes = figure.subplots()
         axes.stackplot(
             seconds[is_asked],
@@ -124,7 +123,6 @@ def evidence_picture(path: Path, seconds: Float64, shares: Float64) -> None:
             frameon=False, loc="lower left", bbox_to_anchor=(-0.01, 0.99), ncols=4, fontsize=10, borderaxespad=0.2
         )
         _tidy(axes, seconds)
-        save_figure(figure, path)
 
 
 def commands_picture(
@@ -141,7 +139,7 @@ def commands_picture(
     logged (T, J): drawn behind.
     """
     height = 0.78 * len(joints)
-    with drawn_figure(height + 0.6 + _strip_height(interventions)) as figure:
+    with drawn_figure(path, height + 0.6 + _strip_height(interventions)) as figure:
         *rows, strip = figure.subplots(
             len(joints) + 1, 1, sharex=True, height_ratios=[0.78] * len(joints) + [_strip_height(interventions)]
         )
@@ -158,7 +156,6 @@ def commands_picture(
         )
         _draw_strip(strip, rows[-1], interventions, seconds)
         figure.align_ylabels(rows)
-        save_figure(figure, path)
 
 
 def open_loop_picture(
@@ -168,20 +165,21 @@ def open_loop_picture(
 
     shaped: intervals [s] in which a row shaped the command, shaded.
     """
-    with drawn_figure(7.2) as figure:
+    room, largest = np.asarray(margin), 0.0
+    low = envelope(seconds, room)
+    with drawn_figure(path, 7.2) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
-        largest = 0.0
         for color, style, (j, joint) in zip(
             cycle(CURVE_COLORS), cycle(["-"] * 6 + ["--"] * 6), enumerate(joints), strict=False
         ):
-            peak = _curve(above, seconds, column(difference, j), color=color, width=1.5, style=style, label=joint)
-            largest = max(largest, peak)
+            largest = max(
+                largest,
+                _curve(above, seconds, column(difference, j), color=color, width=1.5, style=style, label=joint),
+            )
         above.set_title("Commanded less logged joint velocity; shaded: a row shapes the command", pad=10)
         most = max(1.1 * largest, SMALLEST)
         above.set(ylabel="difference [rad/s]", ylim=(-most, most))
         above.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        room = np.asarray(margin)
-        low = envelope(seconds, room)
         _curve(below, seconds, room, color=CURVE_COLORS[0], width=1.8)
         below.fill_between(
             low.seconds, low.lowest, 0.0, where=low.lowest < 0, color=CURVE_COLORS[1], alpha=0.35, linewidth=0
@@ -195,7 +193,6 @@ def open_loop_picture(
             for start, length in spans(shaped, span_of(seconds)):
                 axes.axvspan(start, start + length, color="#000000", alpha=0.06, linewidth=0)
             _tidy(axes, seconds)
-        save_figure(figure, path)
 
 
 def divergence_picture(
@@ -207,7 +204,7 @@ def divergence_picture(
         ("frame, position [cm]", position, 100.0),
         ("frame, rotation [degrees]", rotation, float(np.degrees(1.0))),
     )
-    with drawn_figure(7.8) as figure:
+    with drawn_figure(path, 7.8) as figure:
         for color, axes, (label, values, factor) in zip(
             CURVE_COLORS, figure.subplots(3, 1, sharex=True), curves, strict=False
         ):
@@ -217,7 +214,6 @@ def divergence_picture(
             _tidy(axes, seconds)
         figure.axes[0].set_title("Distance of the driven arm from the log at the same time", pad=10)
         figure.axes[-1].set_xlabel("time [s]")
-        save_figure(figure, path)
 
 
 def _curve(

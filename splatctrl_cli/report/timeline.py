@@ -46,8 +46,10 @@ def timeline(
         ]
     parts = [*axis.ticks(), *axis.margin_line(), *_curves(axis, seconds, curves), *_strips(axis, strips)]
     height = axis.bottom + 34 + STRIP * len(strips)
-    facts = {"left": LEFT, "right": WIDTH - RIGHT, "start": axis.span[0], "end": axis.span[1]}
-    facts |= {"top": TOP, "bottom": axis.bottom, "high": axis.high, "low": axis.low}
+    facts = {
+        **{"left": LEFT, "right": WIDTH - RIGHT, "start": axis.span[0], "end": axis.span[1]},
+        **{"top": TOP, "bottom": axis.bottom, "high": axis.high, "low": axis.low},
+    }
     data = " ".join(f'data-{name}="{value:.6g}"' for name, value in facts.items())
     start = (
         f'<svg class="timeline" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="clearance over time" {data}>'

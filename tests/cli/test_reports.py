@@ -14,7 +14,7 @@ from junitparser import Error, Failure, JUnitXml, TestSuite
 from splatctrl_cli import __version__
 from splatctrl_cli.cli import check, demo
 from splatctrl_cli.cli.commands import COMMANDS
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.jobs.demo import DemoRequest, DemoResult, Told
 from tests.cli.here import splatctrl
 from tests.recording.log.make_log import LogRecipe, make_log
@@ -155,7 +155,7 @@ def test_a_demo_tells_of_itself_and_not_of_its_steps(tmp_path: Path, monkeypatch
         return DemoResult(out=request.out, verdict=verdict_of("demo", [whole]), seconds=1.0, pictures={})
 
     monkeypatch.setattr(demo, "demo", one_step)
-    monkeypatch.setattr(demo, "_show", lambda console, verdict: console.concluded(verdict, {}, ()))
+    monkeypatch.setitem(demo.SHOWN, Verdict, lambda console, verdict: console.concluded(verdict, {}, ()))
     monkeypatch.setenv("GITHUB_ACTIONS", "true")
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary.md"))
     told = splatctrl("demo", "-o", tmp_path / "out", "--junit", tmp_path / "j.xml")

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.worst_frames import WORST, Moment, Sight, draw_sight, sights_of, worst_moments
+from splatctrl_cli.evaluate.worst_frames import WORST, Moment, draw_sight, sights_of, worst_moments
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.plain import plain_frame
@@ -56,8 +56,9 @@ def test_a_moment_is_shown_by_the_newest_image_not_later() -> None:
     frames = iter([frame(k * SECOND // 10) for k in range(0, 40, 4)])
     late, early, before = sights_of([replace(MOMENT, stamp_ns=s) for s in (SECOND, SECOND // 2, -1)], frames)
     assert late is not None and early is not None and before is None
-    assert (late.frame.stamp_ns, early.frame.stamp_ns) == (8 * SECOND // 10, 4 * SECOND // 10)
-    assert late.age_s == pytest.approx(0.2) and next(frames).stamp_ns == 16 * SECOND // 10
+    assert (late[0].stamp_ns, early[0].stamp_ns) == (SECOND, SECOND // 2)
+    assert (late[1].stamp_ns, early[1].stamp_ns) == (8 * SECOND // 10, 4 * SECOND // 10)
+    assert next(frames).stamp_ns == 16 * SECOND // 10
 
 
 @pytest.mark.parametrize(
@@ -70,11 +71,11 @@ def test_a_moment_is_shown_by_the_newest_image_not_later() -> None:
 )
 def test_the_camera_that_sees_the_worst_sphere_best_is_taken(others: list[RgbdFrame], best: str) -> None:
     (sight,) = sights_of([MOMENT], [frame(0, "near"), *others])
-    assert sight is not None and sight.frame.camera == best
+    assert sight is not None and sight[1].camera == best
 
 
 def drawn(path: Path, moment: Moment, view: RgbdFrame) -> Float64:
-    draw_sight(path, Sight(moment=moment, frame=view))
+    draw_sight(path, moment, view)
     return np.asarray(cv2.imread(str(path)), dtype=np.float64)
 
 

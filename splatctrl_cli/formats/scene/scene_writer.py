@@ -1,6 +1,5 @@
 """A writer of the ``scene/`` folder and its checkpoints."""
 
-import csv
 import json
 from collections import deque
 from collections.abc import Mapping
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.output import Parts, flush, sha256, write_durably
+from splatctrl_cli.files.output import Parts, flush, sha256, write_durably, write_table
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL, SHELL_FILE, Snapshot
 from splatctrl_cli.formats.scene.voxel_file import write_occupancy, write_states
@@ -172,7 +171,8 @@ class SceneWriter:
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
         self._write_shell(self.folder / SHELL_FILE, stamp_ns, shell)
         write_occupancy(self.folder / "occupancy.npz", known)
-        with (self.folder / "snapshots.csv").open("w", newline="", encoding="utf-8") as stream:
-            table = csv.writer(stream, lineterminator="\n")
-            table.writerow(["stamp_ns", "file", "num_splats"])
-            table.writerows([s.stamp_ns, f"snapshots/{s.path.name}", s.num_splats] for s in self.snapshots)
+        rows = (
+            {"stamp_ns": s.stamp_ns, "file": f"snapshots/{s.path.name}", "num_splats": s.num_splats}
+            for s in self.snapshots
+        )
+        write_table(self.folder / "snapshots.csv", ("stamp_ns", "file", "num_splats"), rows)

@@ -20,7 +20,7 @@ from splatctrl_cli.evaluate.field_accuracy import (
 )
 from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, verdict_of
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import LOSS, exact_channel
@@ -79,8 +79,9 @@ def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, requ
     stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
     shape = grid.channels["sdf"].shape
     num_cells = int(np.prod(shape))
-    count = min(num_cells, COMPARED_CELLS)
-    drawn = np.sort(np.random.default_rng(request.seed).choice(num_cells, count, replace=False))
+    drawn = np.sort(
+        np.random.default_rng(request.seed).choice(num_cells, min(num_cells, COMPARED_CELLS), replace=False)
+    )
     points = grid.origin + grid.voxel * np.stack(np.unravel_index(drawn, shape), axis=1)
     chunks = np.array_split(points, -(-len(points) // 50_000))  # else large (points x primitives) arrays
     distances, surfaces = zip(*(truth.closest(chunk, stamp_ns) for chunk in chunks), strict=True)
@@ -138,18 +139,17 @@ def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request:
             newest[record.camera] = record, state
     if not newest:
         raise NotEvaluableError(f"{log}: no frame of {', '.join(cameras)} up to the time of the scene")
-    robot = None
-    if request.urdf is not None:
-        robot = RobotModel.from_urdf(request.urdf, request.spheres).moved_by(recording.joint_names)
+    urdf, names = request.urdf, recording.joint_names
+    robot = None if urdf is None else RobotModel.from_urdf(urdf, request.spheres).moved_by(names)
     counted = []
     for frame, at in newest.values():
         spheres = None
         if robot is not None and at is not None:
-            centers = robot.sphere_centers(robot.positions_of(recording.joint_names, at.position))
-            spheres = centers, robot.sphere_set.radii
+            spheres = robot.sphere_centers(robot.positions_of(names, at.position)), robot.sphere_set.radii
         counted.append(counted_pixels(frame, source.workspace, spheres))
-    frames = [frame for frame, _ in newest.values()]
-    return compare_with_held_out_depth(grid, frames, seed=request.seed, counted=counted)
+    return compare_with_held_out_depth(
+        grid, [frame for frame, _ in newest.values()], seed=request.seed, counted=counted
+    )
 
 
 def _held_out_cameras(
@@ -160,11 +160,9 @@ def _held_out_cameras(
     Raises UsageError for another camera, or if none is left.
     """
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
-    wrong = [name for name in names if name not in known]
-    if wrong:
+    if wrong := [name for name in names if name not in known]:
         raise UsageError(f"--held-out: {log} has no camera {wrong[0]}", remedy=f"it has: {', '.join(known)}")
-    also = [name for name in names if trained is not None and name in trained]
-    if also:
+    if also := [name for name in names if trained is not None and name in trained]:
         raise UsageError(f"--held-out: camera {also[0]} trained the scene", remedy="name one that did not")
     chosen = names or tuple(name for name in known if trained is None or name not in trained)
     if not chosen:
@@ -273,7 +271,7 @@ def bake_verdict(
                 count=num_cells,
             )
         )
-    reasons += [noted("field", text) for text in report.warnings]
+    reasons += [note(criterion="field", sentence=text) for text in report.warnings]
     shape, counts = report.grid.channels["sdf"].shape, counts_of(metrics)
     return verdict_of(
         "sdf-bake",

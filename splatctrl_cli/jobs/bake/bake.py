@@ -27,7 +27,7 @@ from splatctrl_cli.field.slabs import (
     slabs,
 )
 from splatctrl_cli.field.unknown import ObstacleSpheres, obstacle_spheres
-from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
+from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, remove, write_json, write_run
 from splatctrl_cli.formats.grid.grid_format import CHANNELS, GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
 from splatctrl_cli.jobs.bake.accuracy import (
@@ -51,7 +51,7 @@ from splatctrl_cli.jobs.bake.request import (
 )
 from splatctrl_cli.jobs.running.device import Device, named
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
-from splatctrl_cli.jobs.running.resume import deciding_versions, told_how_to_go_on
+from splatctrl_cli.jobs.running.resume import check_resumption, deciding_versions, told_how_to_go_on
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import (
@@ -100,8 +100,9 @@ def bake_to_disk(
         if unknown is not None:
             unknown.num_never_seen, unknown.num_changed = store.counts["never_seen"], store.counts["changed"]
     wait = Wait(progress, "bakes", "planes", layout.shape[0])
-    hidden = True if progress.is_quiet else None
-    with tqdm(total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=hidden) as bar:
+    with tqdm(
+        total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=True if progress.is_quiet else None
+    ) as bar:
         for first, last in slabs(layout, baker.channels, store.num_layers):
             planes = baked_planes(baker, first, last, kept)
             counts = baker.counts
@@ -113,13 +114,6 @@ def bake_to_disk(
             if bar.disable:
                 wait.at(last)
     return store
-
-
-def clear_leftovers(partial: Path) -> None:
-    """Remove everything but the channels of an interrupted bake: it is written again."""
-    for path in partial.iterdir():
-        if path.name != FOLDER:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
@@ -165,7 +159,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
     check_request(request)
     stopwatch, out = Stopwatch(), request.out
     checkpoint = partial_path(out) / CHECKPOINT
-    _tell_of_partial(request, checkpoint, progress)
+    check_resumption(checkpoint, "bake", progress, resume=request.resume)
     with (
         told_how_to_go_on(checkpoint),
         output_path(
@@ -173,7 +167,9 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
         ) as partial,
     ):
         job = _read(request, stopwatch, progress)
-        clear_leftovers(partial)
+        for path in partial.iterdir():  # all but the channels of an interrupted bake: it is written again
+            if path.name != FOLDER:
+                remove(path)
         with stopwatch.stage("bake"):
             try:
                 grid, changes = _baked(job, partial, progress)
@@ -222,14 +218,6 @@ def check_request(request: BakeRequest) -> None:
     check_gate_names(request.require, (*SUMMARY_METRICS, *of_truth))
 
 
-def _tell_of_partial(request: BakeRequest, checkpoint: Path, progress: Progress) -> None:
-    partial = checkpoint.parent.parent
-    if request.resume and not checkpoint.is_file():
-        progress.log(f"{partial}: nothing to continue from; starts at the beginning")
-    elif checkpoint.is_file() and not request.resume:
-        progress.log(f"warning: {partial}: an interrupted bake is replaced; --resume would have continued it")
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Job:
     request: BakeRequest
@@ -276,8 +264,8 @@ def _read(request: BakeRequest, stopwatch: Stopwatch, progress: Progress) -> _Jo
 def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...]:
     """Channels to bake, in order. Raises UsageError if a request needs another."""
     usual = DEFAULT_CHANNELS if previous is None else tuple(previous.grid.channels)
-    names = {"sdf", *(usual if request.channels is None else request.channels)}
-    names |= {"probability"} if request.with_probability else set()
+    wanted = usual if request.channels is None else request.channels
+    names = {"sdf", *wanted, *(("probability",) if request.with_probability else ())}
     chosen = (*(name for name in CHANNELS if name in names), *sorted(names - set(CHANNELS)))
     for option in ("truth", "reference_mesh", "held_out"):
         if getattr(request, option) is not None and not {"bound", "hard"} & names:
@@ -299,8 +287,13 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
     changes = kept = old = None
     if previous is not None:
         before = obstacle_spheres(previous.source.splats, previous.source.unrepresented, job.request.labels).splats
-        needed = [name for name in ("sdf", "se", "gpdf") if name in baker.channels]
-        old = Baker(before, baker.layout, config.field, channels=needed, threads=job.request.threads)
+        old = Baker(
+            before,
+            baker.layout,
+            config.field,
+            channels=[name for name in ("sdf", "se", "gpdf") if name in baker.channels],
+            threads=job.request.threads,
+        )
         changes = changed_blocks(before, old, job.obstacles.splats, baker)
         if changes.reason:
             progress.log(f"--update: every block is baked anew: {changes.reason}")
@@ -308,9 +301,8 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
             kept = Kept(
                 grid=previous.grid, mask=changes.mask, occupancy=source.occupancy, thresholds=config.occupancy
             )
-    unknown = None
-    if config.field.unknown != "free":
-        unknown = UnknownSpace(baker.layout, config.field, source.occupancy, config.occupancy)
+    is_free = config.field.unknown == "free"
+    unknown = None if is_free else UnknownSpace(baker.layout, config.field, source.occupancy, config.occupancy)
     store = bake_to_disk(job, kept, unknown, partial, progress)
     if kept is not None and old is not None and previous is not None:
         counts: Any = previous.grid.header["kernel_counts"]
@@ -323,9 +315,9 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
         has_occupancy=source.occupancy is not None,
         num_unrepresented=job.obstacles.num_unrepresented,
     )
-    treated = {} if unknown is None else unknown.header()
+    header |= {} if unknown is None else unknown.header()
     made = {"digests": source.digests, "stamp_ns": source.stamp_ns, "made_from": source.made_from}
-    return store.grid({**header, **treated, **made}), changes
+    return store.grid({**header, **made}), changes
 
 
 def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence[float]) -> None:
@@ -337,8 +329,7 @@ def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence
     if "probability" in grid.channels:
         probability_picture(folder / "probability.png", grid, point)
     if accuracy.truth is not None and accuracy.truth.reliability:
-        curves = accuracy.truth.reliability
-        reliability_picture(folder / "reliability.png", curves, "Probability against the truth")
+        reliability_picture(folder / "reliability.png", accuracy.truth.reliability, "Probability against the truth")
 
 
 def _middle(job: _Job) -> list[float]:

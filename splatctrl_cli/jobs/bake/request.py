@@ -161,8 +161,13 @@ def read_previous(path: Path, scene: Path) -> Previous:
             f"{run.get('command')} of {run.get('splatctrl')}",
             remedy="bake it once without --update",
         )
-    source = source_of_grid(f"--update {path}", grid, scene)
-    return Previous(path=path, grid=grid, run=run, source=source, digests={str(file): sha256(file)})
+    return Previous(
+        path=path,
+        grid=grid,
+        run=run,
+        source=source_of_grid(f"--update {path}", grid, scene),
+        digests={str(file): sha256(file)},
+    )
 
 
 def check_same(
@@ -181,8 +186,7 @@ def check_same(
         "labels": (grid.header.get("labels"), labels),
         **{f"field.{name}": (used.get(name), value) for name, value in settings.items()},
     }
-    differing = [f"{name} was {then}, is {now}" for name, (then, now) in then_and_now.items() if then != now]
-    if differing:
+    if differing := [f"{name} was {then}, is {now}" for name, (then, now) in then_and_now.items() if then != now]:
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise UsageError(
             f"--update {previous.path}: that field was baked with other settings: {', '.join(differing[:3])}{more}",
@@ -229,5 +233,6 @@ def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progre
             raise UsageError(f"--device {request.device}: --update bakes on the processor", remedy=TO_CPU)
         return Device()
     is_matern = KERNEL_OF[request.config.field.distance] == "gpdf"
-    is_enough = layout.num_cells * (num_splats if is_matern else CARD_SPLATS) >= CARD_LEAST_BAKE
-    return chosen(request.device, is_enough, progress)
+    return chosen(
+        request.device, layout.num_cells * (num_splats if is_matern else CARD_SPLATS) >= CARD_LEAST_BAKE, progress
+    )

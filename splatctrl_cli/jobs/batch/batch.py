@@ -145,10 +145,9 @@ def _is_damaged(run: Run) -> bool:
 
 def _reason(run: Run) -> Reason:
     lacks = run.state == SKIPPED or (run.state != ERROR and run.outcome == Outcome.NOT_EVALUABLE)
-    outcome = Outcome.PASSED if run.state == DONE else Outcome.NOT_EVALUABLE if lacks else Outcome.FAILED
     return Reason(
         criterion=run.node,
-        outcome=outcome,
+        outcome=Outcome.PASSED if run.state == DONE else Outcome.NOT_EVALUABLE if lacks else Outcome.FAILED,
         sentence=told(run) + (f": {run.sentence}" if run.sentence and run.state != DONE else ""),
         label="error" if run.state == ERROR else "not as expected",
         remedy="" if run.state in (DONE, SKIPPED) else f"see {run.log}",
@@ -161,15 +160,21 @@ def suites_of(result: BatchResult) -> list[Suite]:
     suites = list[Suite]()
     for recording in dict.fromkeys(run.recording for run in result.runs):
         runs = [run for run in result.runs if run.recording == recording]
-        began = datetime.fromtimestamp(min(run.started for run in runs), UTC).isoformat(timespec="seconds")
         cases = [
             replace(case, seconds=0.0 if number else run.seconds)  # the first case of a node has its time
             for run in runs
             for number, case in enumerate(_cases_of(run, result.out))
         ]
         properties = {} if suites else {"splatctrl": __version__, "batch": result.suite}  # once: readers join suites
-        seconds = sum(run.seconds for run in runs)
-        suites.append(Suite(name=recording, cases=cases, properties=properties, started=began, seconds=seconds))
+        suites.append(
+            Suite(
+                name=recording,
+                cases=cases,
+                properties=properties,
+                started=datetime.fromtimestamp(min(run.started for run in runs), UTC).isoformat(timespec="seconds"),
+                seconds=sum(run.seconds for run in runs),
+            )
+        )
     return suites
 
 
@@ -177,8 +182,14 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
     if run.state == SKIPPED:
         return [skipped_case(run.node, run.cause)]
     if run.state == ERROR:
-        said = run.cause or run.sentence or run.label
-        return [error_case(run.node, said, exit_code=run.exit_code, lines=last_lines(out / run.log))]
+        return [
+            error_case(
+                run.node,
+                run.cause or run.sentence or run.label,
+                exit_code=run.exit_code,
+                lines=last_lines(out / run.log),
+            )
+        ]
     verdict = verdict_in(out / run.result)
     if run.state == FAILED:
         wrong = Case(name="expected", group=run.node, kind=Kind.FAILED, sentence=told(run), text=str(_reason(run)))
@@ -200,8 +211,9 @@ def write_batch(
     for node in nodes:
         run = latest.get(node.name)
         if node.name in keys and (run is None or run.key != keys[node.name]):
-            cause = "has not run since the suite, its inputs or the program changed"
-            run = not_run(node, "", out, state=TO_DO, cause=cause)
+            run = not_run(
+                node, "", out, state=TO_DO, cause="has not run since the suite, its inputs or the program changed"
+            )
         found += [] if run is None else [run]
     document = {
         "format": FORMAT,

@@ -178,8 +178,11 @@ def _nodes_of(
                 chosen = dict(zip(job.matrix, picked, strict=True))
                 variant = {**inherited, **{f"{job.name}.{option}": value for option, value in chosen.items()}}
                 node = _node(recording, job, variant, _suffix(variant, (each for each, _ in jobs)), before, out)
-                values: dict[str, Any] = {each.job: str(each.out) for each in before}
-                values |= {RECORDING: [str(path) for path in recording.paths], NAME: recording.name}
+                values: dict[str, Any] = {
+                    **{each.job: str(each.out) for each in before},
+                    RECORDING: [str(path) for path in recording.paths],
+                    NAME: recording.name,
+                }
                 options = _placed(_merged(job.options, chosen), values.__getitem__)
                 options |= {} if node.out is None else {"out": str(node.out), "force": True, "resume": True}
                 try:

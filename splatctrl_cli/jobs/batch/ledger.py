@@ -3,7 +3,6 @@
 A key covers a node's words, the content of its inputs, and the code.
 """
 
-import csv
 import fcntl
 import hashlib
 import json
@@ -24,7 +23,7 @@ from uuid import uuid4
 import splatctrl_cli
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import damage_mark
-from splatctrl_cli.files.output import PACKAGES, sha256, write_durably
+from splatctrl_cli.files.output import PACKAGES, sha256, write_durably, write_table
 from splatctrl_cli.jobs.batch.graph import Node
 
 NAME, OWNERS = "ledger.sqlite", ".owners"
@@ -142,7 +141,11 @@ class Ledger(AbstractContextManager["Ledger"]):
             row = self._base.execute("SELECT owner FROM claims WHERE node = ?", (node,)).fetchone()
             if row is not None and row["owner"] != self._owner and self._is_alive(row["owner"]):
                 return False
-            self._hold()
+            if self._lock is None:  # a file of this process, locked until it ends
+                place = self.folder / OWNERS / self._owner
+                place.parent.mkdir(exist_ok=True)
+                self._lock = place.open("w")
+                fcntl.flock(self._lock, fcntl.LOCK_EX)
             self._base.execute("INSERT OR REPLACE INTO claims VALUES (?, ?)", (node, self._owner))
         return True
 
@@ -207,14 +210,6 @@ class Ledger(AbstractContextManager["Ledger"]):
             raise
         self._base.execute("COMMIT")
 
-    def _hold(self) -> None:
-        """Lock a file of this process, until it ends."""
-        if self._lock is None:
-            place = self.folder / OWNERS / self._owner
-            place.parent.mkdir(exist_ok=True)
-            self._lock = place.open("w")
-            fcntl.flock(self._lock, fcntl.LOCK_EX)
-
     def _is_alive(self, owner: str) -> bool:
         place = self.folder / OWNERS / owner
         try:
@@ -229,13 +224,8 @@ class Ledger(AbstractContextManager["Ledger"]):
 
 
 def write_csv(path: Path, runs: Iterable[Run]) -> None:
-    def write(place: Path) -> None:
-        with place.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            writer.writerows(asdict(run).values() for run in runs)
-
-    write_durably(path, write)
+    """Write runs with every column."""
+    write_durably(path, lambda place: write_table(place, COLUMNS, map(asdict, runs)))
 
 
 def run_of_document(plain: Mapping[str, Any]) -> Run:
@@ -272,11 +262,12 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
     outs = {node.name: str(node.out) for node in nodes}
     for node in nodes:
         digests |= {path: _digest(path, ledger) for path in node.inputs if path not in digests}
-        named = {str(path): digests[path] for path in node.inputs}
-        named |= {outs[need]: keys[need] for need in node.needs} | {str(node.out): "out"}
+        named = {str(path): digests[path] for path in node.inputs} | {outs[need]: keys[need] for need in node.needs}
+        named[str(node.out)] = "out"
         inputs = [digests[path] for path in node.inputs] + [keys[need] for need in node.needs]
-        said = [entry, code, node.command, *inputs, *_said(node.words, named)]
-        keys[node.name] = hashlib.sha256(json.dumps(said).encode()).hexdigest()
+        keys[node.name] = hashlib.sha256(
+            json.dumps([entry, code, node.command, *inputs, *_said(node.words, named)]).encode()
+        ).hexdigest()
     return keys
 
 

@@ -44,8 +44,7 @@ class Scheduler:
 
     def run(self, nodes: Sequence[Node]) -> dict[str, Run]:
         """The run of each node by name, kept or new."""
-        keys, latest = keys_of(nodes, self.ledger, self.entry), self.ledger.latest()
-        self.keys = keys
+        self.keys, latest = keys_of(nodes, self.ledger, self.entry), self.ledger.latest()
         waiting = {node.name: node for node in nodes}
         futures: dict[Future[End], Node] = {}
         tries: Counter[str] = Counter()
@@ -57,18 +56,18 @@ class Scheduler:
                     break
                 if any(need not in self.runs for need in node.needs):
                     continue
-                run = self._without_running(node, keys[node.name], latest.get(node.name))
+                run = self._without_running(node, self.keys[node.name], latest.get(node.name))
                 if run is not None:
                     self._settle(waiting.pop(node.name), run, clock)
                 elif self.ledger.claim(node.name):
-                    run = self._without_running(node, keys[node.name], self.ledger.last(node.name))
+                    run = self._without_running(node, self.keys[node.name], self.ledger.last(node.name))
                     if run is not None:
                         self.ledger.release(node.name)
                         self._settle(waiting.pop(node.name), run, clock)
                         continue
                     del waiting[node.name]
                     Path(self._place(node, ".end")).unlink(missing_ok=True)
-                    futures[self.executor.submit(run_task, self._task(node, keys[node.name]))] = node
+                    futures[self.executor.submit(run_task, self._task(node, self.keys[node.name]))] = node
                 else:
                     is_busy = True
             ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
@@ -90,7 +89,7 @@ class Scheduler:
                     self.progress.log(f"batch: {node.name}: {end.cause or 'disk full'}, once more")
                     waiting[node.name] = node
                     continue
-                run = run_of(node, keys[node.name], end, self.ledger.folder)
+                run = run_of(node, self.keys[node.name], end, self.ledger.folder)
                 self.ledger.record(run)
                 self._settle(node, run, clock)
         return {node.name: self.runs[node.name] for node in nodes}

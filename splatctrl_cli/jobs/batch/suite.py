@@ -91,8 +91,13 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
         lacking = "the first" if jobs else "the second"
         raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {lacking}")
     _check_recordings(recordings, [job.name for job in jobs])
-    out = folder / _text(path.name, document, "out", f"{path.stem}.out")
-    return Suite(name=name, folder=folder, out=out, recordings=tuple(recordings), jobs=jobs)
+    return Suite(
+        name=name,
+        folder=folder,
+        out=folder / _text(path.name, document, "out", f"{path.stem}.out"),
+        recordings=tuple(recordings),
+        jobs=jobs,
+    )
 
 
 def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str]) -> list[Job]:
@@ -112,8 +117,9 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     _checked_name(where, name)
     command = _text(where, table, "command", base.command if base else name)
     if command not in commands:
-        remedy = _near(command, commands, "give command = one of")
-        raise UsageError(f"{where}: no job is called {command!r}", remedy=remedy)
+        raise UsageError(
+            f"{where}: no job is called {command!r}", remedy=_near(command, commands, "give command = one of")
+        )
     own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
     if own is not None:
         raise UsageError(f"{where}: a batch gives {own} itself", remedy="leave it out")

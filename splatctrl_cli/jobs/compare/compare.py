@@ -9,7 +9,7 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
-from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, note, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
     Judged,
     JudgedRun,
@@ -183,9 +183,9 @@ def _check_alike(before: Judged, after: Judged) -> None:
             raise InputError(f"{after.path}: {name}: expected a run of {old.command}, got one of {new.command}")
         lost = sorted(old.metrics.keys() - new.metrics.keys())
         if before.is_baseline and new.outcome and lost:
-            remedy = "run it with the options of then, or write the baseline anew with --update-baseline"
             raise InputError(
-                f"{before.path}: {name}: has figures that this run has not: {_named(lost)}", remedy=remedy
+                f"{before.path}: {name}: has figures that this run has not: {_named(lost)}",
+                remedy="run it with the options of then, or write the baseline anew with --update-baseline",
             )
 
 
@@ -208,12 +208,16 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
         "num_worse": len(alone) + sum(one.change is Change.WORSE for one in jobs),
         "num_better": sum(one.change is Change.BETTER for one in found),
     }
-    weighed = [(-one.share, one.metric, _of_figure(one, after.kind)) for one in alone]
-    weighed += [(-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE]
+    weighed = [
+        *((-one.share, one.metric, _of_figure(one, after.kind)) for one in alone),
+        *((-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE),
+    ]
     ordered = sorted(weighed, key=lambda one: one[:2])
     reasons = [*_of_verdicts(verdicts, after), *(reason for *_, reason in ordered), *_of_single(jobs)]
     lone = ((before, only_before), (after, only_after))
-    reasons += [noted("runs", f"only in {side.path}: {_named(names)}") for side, names in lone if names]
+    reasons += [
+        note(criterion="runs", sentence=f"only in {side.path}: {_named(names)}") for side, names in lone if names
+    ]
     return CompareResult(
         verdict=verdict_of(
             "compare",
@@ -242,8 +246,9 @@ def _overall(metrics: Mapping[str, int]) -> Reason:
     num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
     if not num_figures and not num_verdicts:
         return lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides")
-    return noted(
-        "comparison", f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
+    return note(
+        criterion="comparison",
+        sentence=f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}",
     )
 
 
@@ -310,8 +315,9 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
             change = Change.WORSE
         elif harm.high < 0 and -harm.mean > allowed:
             change = Change.BETTER
-        worst = max(changes, key=lambda one: one.share)
-        yield JobChange(job=job, metric=metric, harm=harm, change=change, worst=worst)
+        yield JobChange(
+            job=job, metric=metric, harm=harm, change=change, worst=max(changes, key=lambda one: one.share)
+        )
 
 
 def _of_verdicts(verdicts: Sequence[VerdictChange], after: Judged) -> Iterator[Reason]:
@@ -319,7 +325,7 @@ def _of_verdicts(verdicts: Sequence[VerdictChange], after: Judged) -> Iterator[R
         words = f"{one.run}: the verdict went from '{one.before}' to '{one.after}'"
         if one.change is not Change.WORSE:
             better = ", an improvement" if one.change is Change.BETTER else ""
-            yield noted(f"verdict of {one.run}", words + better)
+            yield note(criterion=f"verdict of {one.run}", sentence=words + better)
             continue
         why = next((reason for reason in after.runs[one.run].reasons if reason["outcome"] != "passed"), None)
         yield failed(
@@ -367,11 +373,13 @@ def _of_job(one: JobChange) -> Reason:
 
 
 def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
-    single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
-    if single:
+    if single := [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]:
         first = single[0]
         more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
-        yield noted("single recordings", f"{first.metric} of {first.worst.run}: {first.worst.sentence}{more}")
+        yield note(
+            criterion="single recordings",
+            sentence=f"{first.metric} of {first.worst.run}: {first.worst.sentence}{more}",
+        )
 
 
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:

@@ -31,14 +31,12 @@ REPLAY_FIELDS = ("exact", "barrier", "certified")
 @cache
 def scales() -> Mapping[str, Mapping[str, Scale]]:
     """Comparison scale of each figure, by command and name."""
-    replay: dict[str, Scale] = {}
-    for mode in MODES:
-        replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True)
+    by_mode = [metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True) for mode in MODES]
     return {
         "reconstruct": reconstruct_verdict.GATED,
         "sdf-bake": SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS),
         "score": score_report.SCALES,
-        "replay": replay,
+        "replay": {name: scale for scales in by_mode for name, scale in scales.items()},
         "robot": robot.SCALES,
     }
 
@@ -102,8 +100,11 @@ def read_judged(path: Path) -> Judged:
         raise InputError(
             f"{path}: a run of {command}, which judges nothing", remedy=f"give one of {', '.join(scales())}"
         )
-    one = _judged_run(command, path.absolute().name, command, command, run.run, path)
-    return Judged(path=path, kind="run", runs={command: one})
+    return Judged(
+        path=path,
+        kind="run",
+        runs={command: _judged_run(command, path.absolute().name, command, command, run.run, path)},
+    )
 
 
 def _judged_run(
@@ -140,8 +141,10 @@ def _nodes_of(batch: BatchFolder) -> Iterator[JudgedRun]:
         has_run = (folder / "run.json").is_file()
         document = open_run(folder).run if has_run else read_object(printed) if printed.is_file() else {}
         if ran.outcome and isinstance(document.get("verdict"), dict):
-            judged = _judged_run(ran.node, ran.recording, job, command, document, folder if has_run else None)
-            yield replace(judged, is_green=is_green)
+            yield replace(
+                _judged_run(ran.node, ran.recording, job, command, document, folder if has_run else None),
+                is_green=is_green,
+            )
         else:
             yield JudgedRun(
                 name=ran.node,
@@ -161,12 +164,10 @@ def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
             yield from ((f"{section}.{key}", value) for key, value in values.items())
         else:
             yield section, values
-    for name in ("seed", "splatctrl", "python", "machine"):
-        if name in document:
-            yield name, document[name]
+    named = ("seed", "splatctrl", "python", "machine")
+    yield from ((name, document[name]) for name in named if name in document)
     yield from (document.get("versions") or {}).items()
-    for name, digest in (document.get("inputs") or {}).items():
-        yield f"input {name}", str(digest)[:12]
+    yield from ((f"input {name}", str(digest)[:12]) for name, digest in (document.get("inputs") or {}).items())
 
 
 def read_baseline(path: Path) -> Judged:
@@ -184,19 +185,25 @@ def read_baseline(path: Path) -> Judged:
             f"{path}: expected a baseline, got another TOML file", remedy="give one of --update-baseline"
         )
     if (found := document.get("version")) != VERSION:
-        remedy = "update splatctrl" if (found or 0) > VERSION else ANEW
-        raise InputError(f"{path}: a baseline of version {found}, this splatctrl reads {VERSION}", remedy=remedy)
+        raise InputError(
+            f"{path}: a baseline of version {found}, this splatctrl reads {VERSION}",
+            remedy="update splatctrl" if (found or 0) > VERSION else ANEW,
+        )
     version, runs = str(document.get("splatctrl", "")), {}
     try:
         kind = str(document["kind"])
         for name, one in document["run"].items():
             metrics = one.pop("metrics", {})
-            unknown = [metric for metric in metrics if metric not in scales().get(one["command"], {})]
-            if unknown:
-                what = f"{path}: {name}: no figures of {one['command']}: {', '.join(unknown[:5])}"
-                raise InputError(what, remedy=ANEW)
-            figures = {metric: float(value) for metric, value in metrics.items()}
-            runs[name] = JudgedRun(name=name, metrics=figures, settings={"splatctrl": version}, **one)
+            if unknown := [metric for metric in metrics if metric not in scales().get(one["command"], {})]:
+                raise InputError(
+                    f"{path}: {name}: no figures of {one['command']}: {', '.join(unknown[:5])}", remedy=ANEW
+                )
+            runs[name] = JudgedRun(
+                name=name,
+                metrics={metric: float(value) for metric, value in metrics.items()},
+                settings={"splatctrl": version},
+                **one,
+            )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: damaged: {type(error).__name__}: {error}", remedy=ANEW) from None
     return Judged(path=path, kind=kind, runs=runs, is_baseline=True)

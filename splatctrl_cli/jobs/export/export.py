@@ -198,8 +198,7 @@ def _checked_differences(
     if len(held) != len(back) or not np.array_equal(held.labels, back.labels):
         raise WriteError(f"{out}: differs from its source: {len(back)} of {len(held)} splats, or other labels")
     found = differences(held, back, exact)
-    beyond = found.beyond(bound)
-    if beyond:
+    if beyond := found.beyond(bound):
         raise WriteError(f"{out}: differs from its source: {'; '.join(beyond)}")
     return found
 
@@ -342,8 +341,7 @@ def _cloud(stamp: int, snapshot: Snapshot, log: FoxgloveLog) -> None:
 
 
 def _space(stamp: int, snapshot: Snapshot, log: FoxgloveLog) -> None:
-    grid = snapshot.occupancy()
-    if grid is not None:
+    if (grid := snapshot.occupancy()) is not None:
         log.add_voxels(SPACE, stamp, "state", grid.states(FREE_BELOW, OCCUPIED_ABOVE), grid.origin, grid.voxel)
 
 

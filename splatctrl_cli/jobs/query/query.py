@@ -126,10 +126,9 @@ class SceneAnswers:
 
     def complete(self, points: Float64, of_grid: Answers) -> Answers:
         """Add the scene's answers to a grid's; probability is at the grid's distance."""
-        mine = self.at(points)
         probability = self._probability.at(points, of_grid.distance)
         return replace(
-            mine,
+            self.at(points),
             in_box=of_grid.in_box,
             distance=of_grid.distance,
             gradient=of_grid.gradient,
@@ -180,7 +179,6 @@ def rows_of(points: Float64, answers: Answers) -> str:
     """CSV lines with a cell for each of `TITLES`, empty where unknown."""
     length, a = f"%.{_DECIMALS}f", answers
     bound = None if a.bound is None else np.floor(a.bound * 10**_DECIMALS) / 10**_DECIMALS  # in print a bound still
-    splat = None if a.splat is None else np.where(a.splat < 0, "", a.splat.astype(str))
     columns: list[tuple[str, NDArray[np.generic] | None]] = [
         *(("%.9g", points[:, axis]) for axis in range(3)),
         ("%d", a.in_box),
@@ -189,7 +187,7 @@ def rows_of(points: Float64, answers: Answers) -> str:
         (length, bound),
         ("%.6g", a.probability),
         ("%s", None if a.label is None else _LABELS[a.label]),
-        ("%s", splat),
+        ("%s", None if a.splat is None else np.where(a.splat < 0, "", a.splat.astype(str))),
         ("%s", None if a.observed is None else _STATES[a.observed]),
         *((length, None if a.surface is None else a.surface[:, axis]) for axis in range(3)),
         (length, a.rest),
@@ -405,8 +403,7 @@ class _Figures:
             place = f"outside the box ({lower}) to ({upper}) m of the {asked.kind.partition(' ')[0]}"
             what = "have no distance; bake a larger --box" if asked.is_grid else "were never seen; ask inside it"
             notes.append(f"{num['outside']} of {num['points']} points lie {place} and {what}")
-        blank = num["points"] - num["answered"] - (num["outside"] if asked.is_grid else 0)
-        if blank:
+        if blank := num["points"] - num["answered"] - (num["outside"] if asked.is_grid else 0):
             notes.append(f"{blank} points lie next to unseen cells, baked as nan, and have no distance")
         if self._knows_seen and num["never_seen"]:
             notes.append(

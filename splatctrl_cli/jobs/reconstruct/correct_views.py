@@ -130,8 +130,9 @@ def _told(bends: FoundBends, scale: float, apart: float, after: float, console: 
         )
     if not rows and (bends.gains or bends.unlike):
         console.log("depth: stays as recorded: no bend that one half of the views tells holds for the other")
-    largest = max((row["largest"] for row in rows.values()), default=0.0)
-    return {"depth_bend": largest} | ({"depth_bends": rows} if rows else {})
+    return {"depth_bend": max((row["largest"] for row in rows.values()), default=0.0)} | (
+        {"depth_bends": rows} if rows else {}
+    )
 
 
 def _gains(frames: list[RgbdFrame], scale: float, console: Progress) -> Float64:

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import NEWS_LEAST, SAME_MOMENT_NS
+from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
@@ -33,7 +32,7 @@ class KeptMaps:
         period_ns = round(scene.snapshot_period * 1e9)
         if not taken or period_ns == 0:
             return True
-        first, last = taken[0].stamp_ns - SAME_MOMENT_NS, taken[-1].stamp_ns
+        first, last = taken[0].stamp_ns - fixed.SAME_MOMENT_NS, taken[-1].stamp_ns
         return (stamp_ns - first) // period_ns > (last - first) // period_ns
 
     def shows_news(self, fitter: SceneFitter) -> bool:
@@ -51,7 +50,7 @@ class KeptMaps:
             field = None if before is None else SphereField(Spheres.of(before.centers, before.radii))
             self._last = path, field, read_states(states)
         now = _spheres(fitter.splats(), fitter.unrepresented)
-        return now is not None and _num_new(now, *self._last[1:]) >= NEWS_LEAST
+        return now is not None and _num_new(now, *self._last[1:]) >= fixed.NEWS_LEAST
 
 
 def _num_new(spheres: SplatSet, field: SphereField | None, grid: OccupancyGrid) -> int:
@@ -63,8 +62,7 @@ def _num_new(spheres: SplatSet, field: SphereField | None, grid: OccupancyGrid) 
     is_free[is_inside] = grid.log_odds[tuple(cells[is_inside].T)] < 0.0
     if field is None:
         return int(is_free.sum())
-    distance = field.query(centers[is_free])[0]
-    return int(np.count_nonzero(distance + spheres.radii[is_free] > 0.5 * grid.voxel))
+    return int(np.count_nonzero(field.query(centers[is_free])[0] + spheres.radii[is_free] > 0.5 * grid.voxel))
 
 
 def _spheres(splats: SplatSet, balls: Balls | None) -> SplatSet | None:

@@ -24,7 +24,7 @@ from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, RobotOptions, other_frame, urdf_of, with_self_model
 from splatctrl_cli.jobs.running.device import FitDevice
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
+from splatctrl_cli.jobs.running.resume import check_resumption, checkpoint_to_go_on_from, identity, told_how_to_go_on
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
@@ -59,7 +59,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
     robot = _robot(request, progress)
     declared = declarations_of(request.declare, robot)
     stopwatch, checkpoint_file = Stopwatch(), partial_path(request.out) / CHECKPOINT
-    goes_on = _goes_on(request, checkpoint_file, progress)
+    goes_on = check_resumption(checkpoint_file, "run", progress, resume=request.resume)
     with (
         closing(device),
         told_how_to_go_on(checkpoint_file),
@@ -116,9 +116,12 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
             seed=request.seed,
             verdict=verdict.as_dict(),
         )
-    removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
     return ReconstructResult(
-        out=request.out, metrics=made.metrics, verdict=verdict, removed=removed, seconds=stopwatch.seconds
+        out=request.out,
+        metrics=made.metrics,
+        verdict=verdict,
+        removed={name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed},
+        seconds=stopwatch.seconds,
     )
 
 
@@ -161,15 +164,6 @@ def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations
     if robot is None:
         raise UsageError(f"--declare {path}: needs the robot", remedy="give --urdf as well")
     return read_declarations(path, robot.frame_names)
-
-
-def _goes_on(request: ReconstructRequest, checkpoint_file: Path, progress: Progress) -> bool:
-    partial = partial_path(request.out)
-    if request.resume and not checkpoint_file.is_file():
-        progress.log(f"{partial}: has no checkpoint to continue from; starts at the beginning")
-    elif checkpoint_file.is_file() and not request.resume:
-        progress.log(f"warning: {partial}: an interrupted run is replaced; --resume would have continued it")
-    return request.resume and checkpoint_file.is_file()
 
 
 def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None:

@@ -11,8 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from splatctrl_cli.calibration.displacement import placed
-from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import MOST_GROWTH
+from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.ply import read_points
 from splatctrl_cli.formats.scene.scene_folder import FORMAT
@@ -101,8 +100,9 @@ class Reconstruction:
         self.declared = declared or Declarations()
         self._first_state_ns: int | None = None  # declared times are relative to it
         self.cameras = training_cameras(self.source)
-        comments = {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}
-        self.writer = SceneWriter(folder, comments, checkpoint)
+        self.writer = SceneWriter(
+            folder, {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}, checkpoint
+        )
         self._kept = KeptMaps(self.writer, self.config)
         self._fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
@@ -229,7 +229,7 @@ class Reconstruction:
         least = SceneConfig().max_splats
         if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
             return False
-        budget = min(1000 * math.ceil((1.25 * (least + row.unmet + row.evicted)) / 1000), MOST_GROWTH * least)
+        budget = min(1000 * math.ceil((1.25 * (least + row.unmet + row.evicted)) / 1000), fixed.MOST_GROWTH * least)
         self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
         console.log(f"the first frames show more than {least} splats can stand for: takes {budget}")
         return True
@@ -361,9 +361,14 @@ class Reconstruction:
     def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)
         human, seed, threads = self.config.human, self.request.seed, self.request.threads
-        has_shell = self.robot is not None and scene.shell > 0
         return SceneFitter(
-            scene, self.config.occupancy, workspace, human=human, seed=seed, threads=threads, has_shell=has_shell
+            scene,
+            self.config.occupancy,
+            workspace,
+            human=human,
+            seed=seed,
+            threads=threads,
+            has_shell=self.robot is not None and scene.shell > 0,
         )
 
     def _workspace(self, first: TimeStep) -> Box:

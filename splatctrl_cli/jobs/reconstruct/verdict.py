@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatctrl_cli.calibration.displacement import is_corrected, is_displaced
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import MISPLACED
+from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, verdict_of
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.time_steps import AuditRow
@@ -51,11 +50,10 @@ class Reconstructed:
 def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
     """Judge a reconstruction by every criterion and each ``--require``."""
     metrics, counts = made.metrics, counts_of(made)
-    reasons = [reason for criterion in (_map, _blind, _calibration, _inside) for reason in criterion(made)]
     return verdict_of(
         "reconstruct",
         [
-            *reasons,
+            *(reason for criterion in (_map, _blind, _calibration, _inside) for reason in criterion(made)),
             *_notes(metrics, made.loss),
             *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
         ],
@@ -80,15 +78,20 @@ def counts_of(made: Reconstructed) -> dict[str, int]:
 
 
 def _notes(metrics: Mapping[str, Any], loss: LossReport) -> Iterator[Reason]:
-    held = metrics.get("poses", {}).get("held", [])
-    if held:
+    if held := metrics.get("poses", {}).get("held", []):
         shown = ", ".join(held[:3]) + (f" and {len(held) - 3} more" if len(held) > 3 else "")
-        yield noted("poses", f"not put right, too far off or seen by no other view: {shown}")
+        yield note(criterion="poses", sentence=f"not put right, too far off or seen by no other view: {shown}")
     for camera, bend in metrics.get("depth_bends", {}).items():
-        yield noted("depth", f"{camera}: freed of a bend of at most {100 * bend['largest']:.1f} % of the depth")
+        yield note(
+            criterion="depth",
+            sentence=f"{camera}: freed of a bend of at most {100 * bend['largest']:.1f} % of the depth",
+        )
     if loss.invalid_depth:
-        yield noted("input", f"{loss.invalid_depth} pixels of depth NaN, infinite, negative or 65535: taken as none")
-    yield from (noted("input", text) for text in loss.notes)
+        yield note(
+            criterion="input",
+            sentence=f"{loss.invalid_depth} pixels of depth NaN, infinite, negative or 65535: taken as none",
+        )
+    yield from (note(criterion="input", sentence=text) for text in loss.notes)
 
 
 def _map(made: Reconstructed) -> Iterator[Reason]:
@@ -120,7 +123,9 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
 def _blind(made: Reconstructed) -> Iterator[Reason]:
     """Cameras with stale depth, or with no depth for longer than evidence lasts."""
     for camera, num in made.metrics["repeated_frames"].items():
-        yield noted("depth", f"camera {camera}: {num} frames repeat the depth of the one before: left out")
+        yield note(
+            criterion="depth", sentence=f"camera {camera}: {num} frames repeat the depth of the one before: left out"
+        )
     without = made.metrics["frames_without_depth"]
     if made.is_seeded or not without:
         return
@@ -141,7 +146,7 @@ def _blind(made: Reconstructed) -> Iterator[Reason]:
         )
     if not long:
         frames = "1 frame has" if without == 1 else f"{without} frames have"
-        yield noted("depth", f"{frames} none, which seeds nothing")
+        yield note(criterion="depth", sentence=f"{frames} none, which seeds nothing")
 
 
 def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
@@ -165,7 +170,7 @@ def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
         criterion="calibration",
         sentence=sentence,
         value=row["distance_mm"],
-        threshold=1e3 * MISPLACED,
+        threshold=1e3 * fixed.MISPLACED,
         unit="mm",
         who=camera,
         remedy="find the cameras' poses ('splatctrl calibrate'), and give --calibration",
@@ -174,9 +179,8 @@ def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
 
 
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
-    for camera, row in made.metrics["displaced_cameras"].items():
-        if is_displaced(row):
-            yield displaced_camera(camera, row)
+    cameras = made.metrics["displaced_cameras"]
+    yield from (displaced_camera(camera, row) for camera, row in cameras.items() if is_displaced(row))
     told = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
     if not told:
         return

@@ -6,8 +6,7 @@ from itertools import combinations
 from pathlib import Path
 
 from splatctrl_cli.checks.check_views import are_far, check_views, rescaled
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.jobs.check import refuse_errors
@@ -51,7 +50,7 @@ class RecordingRequest:
 def open_to_train(
     recording: RecordingRequest,
     *,
-    max_pose_jump: float = POSE_JUMP,
+    max_pose_jump: float = fixed.POSE_JUMP,
     needs_depth: bool = True,
     allowed: Collection[str] = (),
 ) -> RecordSource:
@@ -74,7 +73,7 @@ def open_to_train(
     source = open_source(recording.path, recording.options, needs_depth=needs_depth)
     check_pose_jumps(source, max_pose_jump)
     if needs_depth:
-        jumps = () if max_pose_jump == POSE_JUMP else ("pose-jump",)
+        jumps = () if max_pose_jump == fixed.POSE_JUMP else ("pose-jump",)
         later = "agreement"  # `CameraAgreement` checks it, with the map's poses
         refuse_errors(recording.path, recording.options, (*allowed, *jumps, later))
     return source
@@ -187,11 +186,13 @@ class CameraAgreement:
             console.log(f"warning: {line}; {CAUSES}: correct poses or depth, or expect surfaces twice")
 
     def _check_scale(self, step: TimeStep, console: Progress) -> None:
-        cameras = sorted({frame.camera for frame in step.frames})
         if self._guess:
             console.log(f"warning: {self._name}: {self._guess}; the map is in metres")
-        is_sure = not self._guess and not are_far(step.frames)
-        findings = check_views(step.frames, dict.fromkeys(cameras), is_sure=is_sure)[0]
+        findings = check_views(
+            step.frames,
+            dict.fromkeys(sorted({frame.camera for frame in step.frames})),
+            is_sure=not self._guess and not are_far(step.frames),
+        )[0]
         for finding in [finding for finding in findings if finding.code == "views-scale"]:
             if not self._is_allowed:
                 raise InputError(

@@ -4,25 +4,14 @@ Camera names are alike on every rig and prove nothing.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import (
-    CLOCK_MIXED,
-    RECORDINGS_APART_NS,
-    SAME_CLEARANCE,
-    SAME_LENS_PIXELS,
-    SAME_LINK,
-    SAME_LINK_AREA,
-    SAME_MOTION_STATES,
-    SAME_PICTURE_LEVELS,
-    SAME_POSE_DEGREES,
-    SAME_POSE_METRES,
-)
+from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
+from splatctrl_cli.evaluate.verdict import Reason, lacking
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder
 from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.recording.log.state_columns import StateColumns
@@ -90,18 +79,17 @@ def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
     if then[4:].tolist() != now[4:].tolist():
         return [f"{camera}: images of {now[4]:g}x{now[5]:g}, not {then[4]:g}x{then[5]:g}"]
     gap = float(np.abs(then[:4] - now[:4]).max())
-    if gap > SAME_LENS_PIXELS:
+    if gap > fixed.SAME_LENS_PIXELS:
         lines.append(f"{camera}: intrinsics differ by {gap:.1f} px")
-    apart = (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9
-    if apart:
+    if apart := (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9:
         side = "after" if apart > 0 else "before"
         lines.append(f"{camera}: its nearest frame is {abs(apart):.3g} s {side} the one that trained")
     then_pose = np.array(first["T_world_camera"], np.float64).reshape(4, 4)
     metres, degrees = compare_poses(then_pose, frame.T_world_camera)
-    if metres > SAME_POSE_METRES or degrees > SAME_POSE_DEGREES:
+    if metres > fixed.SAME_POSE_METRES or degrees > fixed.SAME_POSE_DEGREES:
         lines.append(f"{camera}: the pose differs by {1e3 * metres:.0f} mm and {degrees:.1f} degrees")
     levels = float(np.abs(np.array(first["tiles"]) - np.array(_tiles(frame.color))).max())
-    if levels > SAME_PICTURE_LEVELS:
+    if levels > fixed.SAME_PICTURE_LEVELS:
         lines.append(f"{camera}: the picture differs by up to {levels:.0f} of 255 levels")
     return lines
 
@@ -123,40 +111,31 @@ def _tiles(color: UInt8) -> list[float]:
 S = TypeVar("S", SceneConfig, OccupancyConfig)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mismatch:
-    """A mismatch as a sentence, and its remedy."""
-
-    sentence: str
-    remedy: str
-
-
 def scene_mismatches(
     scene: SceneFolder, source: RecordSource, states: StateColumns, model: RobotModel
-) -> Iterator[Mismatch]:
+) -> Iterator[Reason]:
     """Mismatches of a reconstruction with a log and robot: provenance, times, and its own parts."""
     if not scene.has_digests:
-        yield Mismatch(
+        yield lacking(
             sentence=f"{scene.path} is of an earlier version: nothing tells whether its files are as written",
             remedy="reconstruct again",
         )
     yield from made_from_mismatches(scene.path, scene.made_from, source, model)
     if scene.has_clock and not scene.snapshots:
-        yield Mismatch(
+        yield lacking(
             sentence=f"{scene.path} has no snapshot: the map of its end would judge the log from its beginning",
             remedy="reconstruct again",
         )
     if scene.has_clock and len(states):
         stamps = [*(snapshot.stamp_ns for snapshot in scene.snapshots), scene.stamp_ns]
-        found = times_apart(states.stamp_ns, (min(stamps), max(stamps)))
-        if found is not None:
+        if (found := times_apart(states.stamp_ns, (min(stamps), max(stamps)))) is not None:
             yield found
     yield from _map_mismatches(scene)
 
 
 def made_from_mismatches(
     path: Path, made_from: Mapping[str, Any], source: RecordSource, model: RobotModel
-) -> Iterator[Mismatch]:
+) -> Iterator[Reason]:
     """Mismatches of a scene or field, by its `SceneFolder.made_from`, with a log and robot.
 
     Compares digests of files and calibration, training cameras' first frames, and the segmented robot's joints and
@@ -169,24 +148,24 @@ def made_from_mismatches(
         with_made, with_given = (
             f"with {', '.join(names.values())}" if names else "without one" for names in (made, given)
         )
-        yield Mismatch(
+        yield lacking(
             sentence=f"calibration: {path} was made {with_made}, this log is read {with_given}",
             remedy="give the --calibration that it was made with, or reconstruct",
         )
     elif not other and recorded and source.cameras:
         other = differences(recorded, source.records())
     if other:
-        yield Mismatch(
+        yield lacking(
             sentence=f"{path} was made from another recording: {'; '.join(other[:3])}", remedy="reconstruct this log"
         )
     if made_from.get("depth_bend"):
-        yield Mismatch(
+        yield lacking(
             sentence=f"{path} rests on depth corrected by up to {100 * made_from['depth_bend']:.1f} %, which no"
             " sensor measured",
             remedy="reconstruct with --urdf or without --refine-poses: depth stays as recorded",
         )
     if robot := _robot_difference(made_from, model):
-        yield Mismatch(
+        yield lacking(
             sentence=f"{path} was told apart from another robot, {robot}",
             remedy="reconstruct with this --urdf, or give the one that it was made with",
         )
@@ -218,28 +197,28 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
         if link not in ours:
             return f"with link {link}, which this one lacks: nothing else stands for it"
         off = np.abs(np.subtract(corners, ours[link][:-1])).max()
-        if off > SAME_LINK:
+        if off > fixed.SAME_LINK:
             return f"whose link {link} reaches {1e3 * off:.1f} mm farther, or less far"
-        if abs(area / ours[link][-1] - 1) > SAME_LINK_AREA:
+        if abs(area / ours[link][-1] - 1) > fixed.SAME_LINK_AREA:
             return f"whose link {link} has a surface of {area:.4f} m^2, not {ours[link][-1]:.4f}"
     return ""
 
 
-def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
+def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Reason | None:
     """Mismatch of stamps (T,) [ns] and a scene's span; None if they (nearly) overlap."""
     first, last = int(states_ns[0]), int(states_ns[-1])
     apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
-    if apart_ns <= RECORDINGS_APART_NS:
+    if apart_ns <= fixed.RECORDINGS_APART_NS:
         return None
     ours, theirs = (f"from {start * 1e-9:.2f} to {end * 1e-9:.2f} s" for start, end in ((first, last), scene_ns))
-    return Mismatch(
+    return lacking(
         sentence=f"joint states {ours} and a scene {theirs} are "
-        + ("on clocks that do not overlap" if (apart_ns > CLOCK_MIXED * 1e9) else "of different times"),
+        + ("on clocks that do not overlap" if (apart_ns > fixed.CLOCK_MIXED * 1e9) else "of different times"),
         remedy="record both by one clock, or reconstruct this log",
     )
 
 
-def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
+def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
     """Splats unlike their occupancy grid: rescaled, moved, or removed."""
     known = scene.known() if scene.has_digests else None
     if known is None:
@@ -249,7 +228,7 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
         scene.splats(), known, _used(SceneConfig, used.get("scene")), _used(OccupancyConfig, used.get("occupancy"))
     )
     if not found.holds and found.num_voxels:
-        yield Mismatch(
+        yield lacking(
             sentence=f"{scene.path}: splats and occupancy disagree: {100 * found.on_surface:.0f} % of the splats "
             f"lie on occupied voxels, {100 * found.represented:.0f} % of {found.num_voxels} occupied "
             "voxels are represented",
@@ -263,12 +242,12 @@ def _used(section: type[S], values: object) -> S:
     return section(**{name: value for name, value in given.items() if name in known})
 
 
-def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mismatch | None:
+def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Reason | None:
     """Mismatch of a truth file and logged states, by the truth's clearance."""
     stamps = states.stamp_ns
     shared = np.intersect1d(truth.stamps, stamps)
     if not len(shared):
-        return Mismatch(
+        return lacking(
             sentence=f"{truth.path} is of another recording: none of its {len(truth.stamps)} stamps is in the log",
             remedy="give the truth.json that simulate wrote beside the log",
         )
@@ -278,14 +257,14 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mis
     own = own.moved_by(truth.joint_names)
     moving = np.flatnonzero(own.moving_spheres)
     worst = 0.0
-    for stamp in shared[:: max(len(shared) // SAME_MOTION_STATES, 1)]:
+    for stamp in shared[:: max(len(shared) // fixed.SAME_MOTION_STATES, 1)]:
         q = states.position[int(np.searchsorted(stamps, stamp))]
         gap = truth.distance(own.sphere_centers(q)[moving], int(stamp)) - own.sphere_set.radii[moving]
         recorded = truth.clearance[int(np.searchsorted(truth.stamps, stamp))]
         worst = max(worst, abs(float(gap.min()) - float(recorded)))
-    if worst <= SAME_CLEARANCE:
+    if worst <= fixed.SAME_CLEARANCE:
         return None
-    return Mismatch(
+    return lacking(
         sentence=f"{truth.path} is of another recording: the logged motion has clearances up to {1e3 * worst:.0f} mm "
         "off those that it recorded",
         remedy="give the truth.json that simulate wrote beside the log",

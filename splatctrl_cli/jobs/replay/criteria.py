@@ -250,8 +250,7 @@ def clocks(judged: Judged) -> Iterator[Reason]:
     if clock is None or clock.offset_s is None or clock.uncertainty_s is None:
         return
     offset, uncertainty = float(clock.offset_s), float(clock.uncertainty_s)
-    apart = abs(offset) - uncertainty
-    if apart <= CLOCKS_APART:
+    if abs(offset) - uncertainty <= CLOCKS_APART:
         yield held(f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
         return
     yield lacking(
@@ -311,8 +310,7 @@ def scene_hits(judged: Judged) -> Iterator[Reason]:
     trace = judged.replay.closed_loop
     if trace is None:
         return
-    hits = judged.metrics["num_scene_hits"] or 0
-    if hits:
+    if hits := judged.metrics["num_scene_hits"] or 0:
         change = next(change for change in trace.scene_changes if change.is_hit)
         yield failed(
             sentence=f"obstacles appeared inside the arm {int(hits)} times, first",

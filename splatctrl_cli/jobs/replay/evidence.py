@@ -134,8 +134,12 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
         raise InputError(f"{request.log}: --evidence: expected cameras, got joint states alone")
     if not source.has_clock:
         raise InputError(f"{request.log}: --evidence: expected frames with times, got views without")
-    cameras = source.cameras if every is None else tuple(training_cameras(source))
-    evidence = Evidence(source=source, cameras=cameras, name=name, every=every)
+    evidence = Evidence(
+        source=source,
+        cameras=source.cameras if every is None else tuple(training_cameras(source)),
+        name=name,
+        every=every,
+    )
     if not any(step.has_depth for step in evidence.frame_sets()):
         raise InputError(
             f"{request.log}: --evidence: {name} has no pixel with depth", remedy="name a camera with depth"
@@ -311,18 +315,19 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
     truth = Rows(clearances)
     events = _true_events(inputs, replay, np.asarray(truth), Rows(nearest_spheres))
     merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
-    found = replace(replay, true_clearance=truth, events=merged)
-    return found, TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
+    return replace(replay, true_clearance=truth, events=merged), TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
 
 
 def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
     """Compare the audit with the truth near seen surfaces, after the last frame."""
     truth = np.asarray(replay.true_clearance)
-    agreement = {
-        name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)
-        for name, of in replay.audit.clearance.items()
-    }
-    return replace(replay, agreement=agreement)
+    return replace(
+        replay,
+        agreement={
+            name: clearance_agreement(np.asarray(of), truth, surfaces.seen, replay.median_radius)
+            for name, of in replay.audit.clearance.items()
+        },
+    )
 
 
 def _unexpected(
@@ -342,7 +347,6 @@ def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spher
     model, truth, audit = inputs.model, inputs.truth, replay.audit
     assert truth is not None
     names = sphere_names(model.sphere_set)
-    nearest = np.asarray(spheres[: len(clearance)], np.int64)
     fold = EventFold()
 
     def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
@@ -353,5 +357,9 @@ def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spher
         x, y, z = (float(v) for v in surface[0])
         return Obstacle(distance=float(distance[0]), position=(x, y, z), name=least.name)
 
-    fold.add(audit.stamp_ns, clearance_signals("true", clearance, nearest, replay.margin, names), near)
+    fold.add(
+        audit.stamp_ns,
+        clearance_signals("true", clearance, np.asarray(spheres[: len(clearance)], np.int64), replay.margin, names),
+        near,
+    )
     return fold.events()

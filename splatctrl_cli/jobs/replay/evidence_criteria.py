@@ -210,12 +210,11 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
     if share <= allowed:
         yield held(f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.num_states)
         return
-    first = int(np.argmax(judged.replay.audit.figures["unknown_share"] > allowed))
     yield lacking(
         sentence=f"{100 * share:.1f} % of the sphere centres lie in unseen space, allowed {100 * allowed:g} %, first",
         value=share,
         threshold=allowed,
-        time_s=seconds_at(judged, first),
+        time_s=seconds_at(judged, int(np.argmax(judged.replay.audit.figures["unknown_share"] > allowed))),
         remedy="add a camera, or give a larger --max-unknown",
         count=judged.num_states,
     )
@@ -273,8 +272,7 @@ def belonging(judged: Judged) -> Iterator[Reason]:
     """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links; files as
     written; splats that agree with their occupancy grid.
     """
-    for mismatch in judged.inputs.mismatches:
-        yield lacking(sentence=mismatch.sentence, remedy=mismatch.remedy)
+    yield from judged.inputs.mismatches
 
 
 def displaced(judged: Judged) -> tuple[str, float] | None:
@@ -302,9 +300,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
             remedy="find the cameras' poses ('splatctrl calibrate'), and give --calibration to reconstruct",
             count=int(figures["displaced_cameras"][camera[0]]["num_pixels"]),
         )
-    for name, row in (figures.get("displaced_cameras") or {}).items():
-        if is_corrected(row):
-            yield displaced_camera(name, row)
+    cameras = figures.get("displaced_cameras") or {}
+    yield from (displaced_camera(name, row) for name, row in cameras.items() if is_corrected(row))
     residual, by_link = figures.get("self_mask_residual_mm"), figures.get("self_mask")
     if residual is None or not isinstance(by_link, dict):
         return

@@ -253,7 +253,7 @@ ROWS = ("scene", "self", "limit")  # kinds of rows that shape a command
 
 def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
     """Write the pictures the mode has; seconds (T,) since the first state."""
-    curves: dict[str, FloatRows] = {name: of.rows for name, of in replay.audit.clearance.items()}
+    curves: dict[str, FloatRows] = {**replay.audit.clearance}
     if replay.true_clearance is not None:
         curves["truth"] = replay.true_clearance
     happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in SHOWN)
@@ -276,14 +276,13 @@ def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
             None if replay.open_loop is None else replay.open_loop.figures.rows("logged"),
         )
     if replay.open_loop is not None:
-        shaped = [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS]
         open_loop_picture(
             folder / "open_loop.png",
             seconds,
             replay.open_loop.figures.rows("difference"),
             replay.model.joint_names,
             replay.open_loop.figures.rows("barrier"),
-            shaped,
+            [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS],
         )
     if replay.divergence is not None and np.isfinite(replay.divergence["joints"]).any():
         of = [replay.divergence[name] for name in ("joints", "position", "rotation")]
@@ -307,7 +306,7 @@ def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterabl
     None where no camera has one. Frames after the last moment are not read.
     """
     audit = replay.audit
-    least = audit.clearance["exact"].distance
+    least = np.asarray(audit.clearance["exact"])
     if replay.true_clearance is not None:
         least = np.fmin(least, np.asarray(replay.true_clearance))
     states = worst_moments(audit.stamp_ns, least, num)
@@ -319,16 +318,15 @@ def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterabl
 def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | None]) -> list[str]:
     """Write worst_1.png and so on; return notes on missing pictures."""
     seen = [sight for sight in sights if sight is not None]
-    for number, sight in enumerate(seen, start=1):
-        first, *rest = sight.moment.caption
+    for number, (moment, frame) in enumerate(seen, start=1):
+        first, *rest = moment.caption
         whose = "driven arm; the image shows the logged one" if replay.mode == "closed-loop" else "logged posture"
         caption = (
             f"worst {number}   {first}",
             *rest,
-            f"{sight.frame.camera}, taken {sight.age_s:.2f} s before; spheres of the {whose}",
+            f"{frame.camera}, taken {(moment.stamp_ns - frame.stamp_ns) * 1e-9:.2f} s before; spheres of the {whose}",
         )
-        explained = replace(sight, moment=replace(sight.moment, caption=caption))
-        draw_sight(folder / f"worst_{number}.png", explained)
+        draw_sight(folder / f"worst_{number}.png", replace(moment, caption=caption), frame)
     if len(seen) < len(sights):
         return [f"worst frames: no camera image at or before {len(sights) - len(seen)} of {len(sights)} moments"]
     return []
@@ -336,10 +334,10 @@ def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | Non
 
 def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:
     audit, model = replay.audit, replay.model
-    stamp, worst = int(audit.stamp_ns[state]), int(audit.clearance["exact"].sphere[state])
+    stamp, worst = int(audit.stamp_ns[state]), int(audit.figures["sphere exact"][state])
     centers = model.sphere_centers(np.asarray(audit.position[state]))
     (obstacle,) = inputs.scene.at(stamp).obstacles(np.ascontiguousarray(centers[[worst]]))
-    figures = [f"{NAMES.get(name, name)} {100 * of.distance[state]:.2f} cm" for name, of in audit.clearance.items()]
+    figures = [f"{NAMES.get(name, name)} {100 * float(of[state]):.2f} cm" for name, of in audit.clearance.items()]
     if replay.true_clearance is not None:
         figures.append(f"truth {100 * float(replay.true_clearance[state]):.2f} cm")
     step = replay.steps[state] if replay.steps else None

@@ -47,8 +47,7 @@ POSE_COLUMNS = tuple(POSE.split(","))
 def check_goal(request: ReplayRequest) -> None:
     """Raise UsageError for an option the mode does not use."""
     asked, driven = ("open-loop", "closed-loop"), ("closed-loop",)
-    modes: dict[str, tuple[str, ...]] = {"re_anchor": driven}
-    modes |= dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)
+    modes = {"re_anchor": driven, **dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)}
     for option, wanted in modes.items():
         given = getattr(request, option)
         if given is not None and given is not False and request.mode not in wanted:
@@ -92,8 +91,7 @@ def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint,
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {error}", remedy="give --waypoints a .toml or .csv file") from None
-    read = _csv_rows(path, text, model.joint_names) if path.suffix == ".csv" else _toml_rows(path, text)
-    rows = list(read)
+    rows = list(_csv_rows(path, text, model.joint_names) if path.suffix == ".csv" else _toml_rows(path, text))
     if not rows:
         raise InputError(f"{path}: expected at least one waypoint, got none")
     waypoints = []

@@ -115,8 +115,7 @@ class Hindsight:
             return
         last_ns, last = self._stamps[-1], self._postures[-1]
         for stamp_ns in self._later(last_ns):
-            known = self._scene.seen_at(stamp_ns)
-            if known is not None:
+            if (known := self._scene.seen_at(stamp_ns)) is not None:
                 self.looked(stamp_ns, self._near.look(stamp_ns, last, known).age)
             if not self._stamps:
                 return

@@ -97,8 +97,9 @@ def measured_robot(
     except InputError as error:
         model, surfaces = model.with_coverage(None, str(error)), None
     else:
-        report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=COVERED_COARSE)
-        model = model.with_coverage(report)
+        model = model.with_coverage(
+            coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=COVERED_COARSE)
+        )
         surfaces = SelfSurfaces(model, solids, disabled, recorded)
     if config.coverage == "margin":
         _check_bounded(model)
@@ -133,8 +134,7 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
 def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[str] = ()) -> dict[str, str]:
     """Sentences on what the robot's spheres cover, by subject. by_surface: of `ReplayTrace`."""
     words = {"coverage": coverage_words(robot.model, config)}
-    kept = [pair for pair in robot.kept if pair.margin is not None]
-    if kept:
+    if kept := [pair for pair in robot.kept if pair.margin is not None]:
         words["self_margins"] = _self_margin_words(robot, kept, config)
     if by_surface:
         links = ", ".join(dict.fromkeys(name.partition("[")[0] for name in by_surface))
@@ -193,8 +193,7 @@ def _check_bounded(model: RobotModel) -> None:
         raise InputError(
             f"{wanted}: {model.coverage_unknown}", remedy="or set control.coverage = report, which needs no meshes"
         )
-    bare = bare_moving_links(model)
-    if bare:
+    if bare := bare_moving_links(model):
         raise InputError(
             f"{wanted}: expected spheres on every link that moves, got none on {', '.join(bare)}",
             remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",

@@ -11,8 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import NEXT_SCENE_NS
+from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_at
 from splatctrl_cli.control.barriers import SceneStep, guarded
 from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
@@ -102,9 +101,9 @@ class KnownScene:
     def next_ns(self, stamp_ns: int) -> int | None:
         """Stamp [ns] from which the next scene is known; None if none follows within NEXT_SCENE_NS."""
         later = self._index_at(stamp_ns) + 1
-        self.advance(stamp_ns + NEXT_SCENE_NS)
+        self.advance(stamp_ns + fixed.NEXT_SCENE_NS)
         known_ns = [stamp + self.latency_ns for stamp in self.stamps_ns[later : later + 1]]
-        return next((known for known in known_ns if known <= stamp_ns + NEXT_SCENE_NS), None)
+        return next((known for known in known_ns if known <= stamp_ns + fixed.NEXT_SCENE_NS), None)
 
     def _index_at(self, stamp_ns: int) -> int:
         self.advance(stamp_ns)
@@ -194,9 +193,10 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
         known = None if index < 0 else voxels(index)
         return None if known is None else seen_of(known)
 
-    always = stamps if has_times else [-(2**63)]
     return KnownScene(
-        at=fields_at(always, latency_ns, key_of if has_times else lambda _: None, fields),
+        at=fields_at(
+            stamps if has_times else [-(2**63)], latency_ns, key_of if has_times else lambda _: None, fields
+        ),
         observed=known_space(scene.occupancy()),
         first_ns=stamps[0] + latency_ns if has_times else None,
         cameras=tuple(scene.cameras),
@@ -268,8 +268,9 @@ def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction 
     centers, radii = obstacles.splats.centers[is_splat], obstacles.splats.radii[is_splat]
     if not len(radii):
         return lambda points: np.full(len(points), np.inf)
-    field = SphereField(Spheres.of(centers, radii), threads=threads)
-    return BallDistance(of_points=_distance(field), centers=centers, radii=radii)
+    return BallDistance(
+        of_points=_distance(SphereField(Spheres.of(centers, radii), threads=threads)), centers=centers, radii=radii
+    )
 
 
 def _nearest_spheres(obstacles: ObstacleSpheres, index: Index, points: Float64) -> tuple[Obstacle, ...]:
@@ -329,8 +330,7 @@ def certified_distance(fields: KnownFields) -> DistanceFunction:
 
     Kernel fields prove nothing from samples: their slope has no useful bound.
     """
-    certified = fields.distances.get("certified")
-    if certified is not None:
+    if (certified := fields.distances.get("certified")) is not None:
         return certified
     exact = fields.distances["exact"]
     return lambda points: exact(points) - ROUNDING

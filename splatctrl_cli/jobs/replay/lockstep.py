@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.calibration.displacement import displaced_cameras
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
@@ -49,7 +48,7 @@ def check_lockstep(request: ReplayRequest) -> None:
     """Raise UsageError for options without effect."""
     if request.latency and request.field is not None:
         raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
-    if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != POSE_JUMP):
+    if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != fixed.POSE_JUMP):
         raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
     if not request.lockstep and request.device.startswith(CUDA):
         raise UsageError(f"--device {request.device}: expected --lockstep: only a fit is worth a card", remedy=TO_CPU)
@@ -101,21 +100,20 @@ def from_log(
     source = _training_source(request, model, source)
     check_pose_jumps(source, request.max_pose_jump)
     allowed = ("agreement", *(("views-agreement", "views-scale", "alignment") if request.allow_disagreement else ()))
-    jumps = () if request.max_pose_jump == POSE_JUMP else ("pose-jump",)
+    jumps = () if request.max_pose_jump == fixed.POSE_JUMP else ("pose-jump",)
     refuse_errors(request.log, request.options, (*allowed, *jumps))
     place = folder / FOLDER
     place.mkdir()
-    asked = ReconstructRequest(
-        source=source,
-        out=place,
-        config=config,
-        seed=request.seed,
-        threads=request.threads,
-        allow_disagreement=request.allow_disagreement,
-    )
     seen = arm_seen(model, source, console)
     fitted = Reconstruction(
-        asked,
+        ReconstructRequest(
+            source=source,
+            out=place,
+            config=config,
+            seed=request.seed,
+            threads=request.threads,
+            allow_disagreement=request.allow_disagreement,
+        ),
         model,
         place,
         identity={"command": "replay --lockstep"},
@@ -124,15 +122,14 @@ def from_log(
         device=FitDevice(request.device),
         cameras_off={} if seen is None else displaced_cameras(*seen),
     )
-    lockstep = Lockstep(
+    return Lockstep(
         fitted,
         config,
         _latency_ns(request),
         console,
         ends_with_log=request.mode != "closed-loop",
         held_out_every=every_of(request.evidence),
-    )
-    return lockstep.scene()
+    ).scene()
 
 
 class Lockstep:

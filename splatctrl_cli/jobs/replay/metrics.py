@@ -6,8 +6,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import MOTION_WINDOW
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.events import first_intervention
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
@@ -35,8 +34,6 @@ from splatctrl_cli.evaluate.metrics import (
     Shown,
     counted,
     folded,
-    largest_of,
-    least_of,
 )
 from splatctrl_cli.jobs.replay.goal import TWIST_FIGURES
 from splatctrl_cli.jobs.replay.inputs import LOG_FIGURES, LoggedStates
@@ -55,10 +52,7 @@ def num_states(replay: Replay) -> int:
 
 def is_blank(replay: Replay) -> Bool:
     """(T,) True where a field has no distance."""
-    blank = np.zeros(len(replay.audit.stamp_ns), dtype=np.bool_)
-    for of in replay.audit.clearance.values():
-        blank |= np.isnan(of.distance)
-    return blank
+    return np.asarray(np.any([np.isnan(np.asarray(of)) for of in replay.audit.clearance.values()], axis=0))
 
 
 def _single(
@@ -72,7 +66,9 @@ def _single(
 
 def _clearance(field: str) -> Metric[Replay]:
     name = "min_clearance" if field == "exact" else f"min_clearance_{field}"
-    return folded(name, LEAST, AUDIT(f"distance {field}"), scale=GAP, shown=least_of(f"clearance_{field}"))
+    return folded(
+        name, LEAST, AUDIT(f"distance {field}"), scale=GAP, shown=Shown(column=f"clearance_{field}", pick="least")
+    )
 
 
 def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
@@ -82,7 +78,9 @@ def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], 
 
 def _num_sudden(replay: Replay) -> int:
     since = replay.audit.stamp_ns - replay.audit.stamp_ns[0]
-    return int(np.sum(since >= 2 * MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
+    return (
+        int(np.sum(since >= 2 * fixed.MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
+    )
 
 
 def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
@@ -104,7 +102,7 @@ SLACK = Scale(unit="m/s", better=Better.HIGHER, absolute=1e-3, relative=0.02)  #
 AT_GOAL = Scale(unit="m", better=Better.LOWER, absolute=ControlConfig().goal_position)  # within it, it is reached
 TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_rotation)
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
-NEAREST = least_of("clearance_exact")
+NEAREST = Shown(column="clearance_exact", pick="least")
 AUDIT = partial(_of, "audit.figures")
 OF_AUDIT: Declared = (
     _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
@@ -128,7 +126,7 @@ OF_STATES: Declared = (
         LEAST,
         lambda r: np.asarray(() if r.true_clearance is None else r.true_clearance),
         scale=GAP,
-        shown=least_of("clearance_true"),
+        shown=Shown(column="clearance_true", pick="least"),
     ),
     counted(
         "num_below_margin", AUDIT("distance exact"), lambda replay, values: values < replay.margin, shown=NEAREST
@@ -140,7 +138,7 @@ OF_STATES: Declared = (
         AUDIT("self_clearance"),
         lambda replay: int(np.isfinite(replay.audit.figures["self_clearance"]).sum()),
         scale=GAP,
-        shown=least_of("self_clearance"),
+        shown=Shown(column="self_clearance", pick="least"),
     ),
     folded(
         "min_limit_margin",
@@ -148,7 +146,7 @@ OF_STATES: Declared = (
         AUDIT("limit_margin"),
         num_states,
         scale=LIMIT,
-        shown=least_of("limit_margin"),
+        shown=Shown(column="limit_margin", pick="least"),
     ),
     folded("max_velocity_share", LARGEST, _of("strain", "velocity"), _intervals, scale=BAD_SHARE),
     folded("max_acceleration_share", LARGEST, _of("strain", "acceleration"), _num_sudden, scale=BAD_SHARE),
@@ -174,7 +172,7 @@ OF_STATES: Declared = (
         MEAN,
         AUDIT("unknown_share"),
         scale=BAD_SHARE,
-        shown=largest_of("unknown_share"),
+        shown=Shown(column="unknown_share", pick="largest"),
     ),
     counted("num_without_distance", lambda r: is_blank(r).astype(np.float64), lambda _, values: values > 0),
     _single(
@@ -188,7 +186,7 @@ OF_STATES: Declared = (
         LARGEST,
         lambda replay: np.asarray(replay.map_age_s),
         scale=AGE,
-        shown=largest_of("map_age_s"),
+        shown=Shown(column="map_age_s", pick="largest"),
     ),
     _map_error("map_error_bound", "bound", ERROR),
     _map_error("map_error_blocks", "num_stretches", DESCRIBES),
@@ -196,30 +194,46 @@ OF_STATES: Declared = (
 )
 
 
-LARGEST_DIFFERENCE, LEAST_SLACK = largest_of("velocity_difference"), least_of("barrier_margin_logged")
+LARGEST_DIFFERENCE, LEAST_SLACK = (
+    Shown(column="velocity_difference", pick="largest"),
+    Shown(column="barrier_margin_logged", pick="least"),
+)
 STEPS, ASKED = partial(_of, "kept_steps.figures"), partial(_of, "open_loop.figures")
 
 
 def _rung(rung: Rung) -> Metric[Replay]:
     name, shown = "num_" + rung.value.replace("-", "_"), Shown(column="rung", pick=rung.value)
-    scale = Scale(better=Better.HIGHER, relative=0.05) if rung is Rung.SOLVED else FAULTS
-    return counted(name, STEPS("rung"), lambda _, values: values == RUNGS.index(rung), scale=scale, shown=shown)
+    return counted(
+        name,
+        STEPS("rung"),
+        lambda _, values: values == RUNGS.index(rung),
+        scale=Scale(better=Better.HIGHER, relative=0.05) if rung is Rung.SOLVED else FAULTS,
+        shown=shown,
+    )
 
 
 OF_STEPS: Declared = (
     folded("intervention_share", MEAN, STEPS("shaped")),
     *(folded(f"intervention_share_{kind}", MEAN, STEPS(f"shaped {kind}")) for kind in RowKind),
     _single("first_intervention_s", lambda r: getattr(first_intervention(r.events), "start_s", None), scale=TIME),
-    folded("min_barrier_clearance", LOWEST, STEPS("clearance"), scale=GAP, shown=least_of("barrier_clearance")),
+    folded(
+        "min_barrier_clearance",
+        LOWEST,
+        STEPS("clearance"),
+        scale=GAP,
+        shown=Shown(column="barrier_clearance", pick="least"),
+    ),
     *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
     folded("num_refused", TOTAL, STEPS("refused"), scale=FAULTS),
-    counted("num_scaled_back", STEPS("scale"), lambda _, values: values < 1, shown=least_of("scale")),
+    counted(
+        "num_scaled_back", STEPS("scale"), lambda _, values: values < 1, shown=Shown(column="scale", pick="least")
+    ),
     folded(
         "max_residual",
         LARGEST,
         STEPS("residual"),
         scale=Scale(better=Better.LOWER, absolute=1e-6),
-        shown=largest_of("residual"),
+        shown=Shown(column="residual", pick="largest"),
     ),
 )
 OF_OPEN_LOOP: Declared = (
@@ -229,7 +243,11 @@ OF_OPEN_LOOP: Declared = (
     folded("min_barrier_margin_logged", LOWEST, ASKED("barrier"), scale=SLACK, shown=LEAST_SLACK),
     counted("num_barrier_broken_logged", ASKED("barrier"), lambda _, values: values < 0, shown=LEAST_SLACK),
     folded(
-        "min_velocity_margin_logged", LOWEST, ASKED("limit"), scale=SLACK, shown=least_of("velocity_margin_logged")
+        "min_velocity_margin_logged",
+        LOWEST,
+        ASKED("limit"),
+        scale=SLACK,
+        shown=Shown(column="velocity_margin_logged", pick="least"),
     ),
 )
 
@@ -256,7 +274,7 @@ OF_CLOSED_LOOP: Declared = (
             column,
             num_states,
             scale=Scale(unit=unit),
-            shown=largest_of(f"divergence_{name}"),
+            shown=Shown(column=f"divergence_{name}", pick="largest"),
         )
         for prefix, fold in (("max", LARGEST), ("end", LAST))
         for name, unit, column in (
@@ -282,16 +300,12 @@ def _declared(mode: str, of_fields: Sequence[str]) -> Declared:
     return (*OF_AUDIT, *map(_clearance, of_fields), *OF_STATES, *OF_MODE[mode])
 
 
-def _declared_of(replay: Replay) -> Declared:
-    return _declared(replay.mode, tuple(replay.audit.clearance))
-
-
 def metric_scales(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
     """Comparison scales of `metrics_of` and of the log's own figures, by name."""
-    scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)} | LOG_FIGURES
-    scales |= TWIST_FIGURES if has_twists else {}
+    of_states = {metric.name: metric.scale for metric in _declared(mode, of_fields)}
+    scales = of_states | LOG_FIGURES | (TWIST_FIGURES if has_twists else {})
     if has_truth:
         scales |= {f"truth_{figure}_{name}": scale for name in of_fields for figure, scale in AGREEMENT.items()}
         scales["truth_tolerance"] = LENGTH
@@ -305,7 +319,9 @@ def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Shown]:
 
 def metrics_of(replay: Replay) -> Metrics:
     """Every printed, written and gated figure by name; None without a value."""
-    metrics: Metrics = {metric.name: metric.value(replay) for metric in _declared_of(replay)}
+    metrics: Metrics = {
+        metric.name: metric.value(replay) for metric in _declared(replay.mode, tuple(replay.audit.clearance))
+    }
     metrics |= replay.twist_figures
     for name, agreement in replay.agreement.items():
         metrics |= {f"truth_{figure}_{name}": agreement[figure] for figure in agreement if figure != "tolerance"}
@@ -316,7 +332,7 @@ def metrics_of(replay: Replay) -> Metrics:
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
     """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
     found = dict.fromkeys(metrics, num_states(replay))
-    found |= {metric.name: metric.count(replay) for metric in _declared_of(replay)}
+    found |= {metric.name: metric.count(replay) for metric in _declared(replay.mode, tuple(replay.audit.clearance))}
     for field, agreement in replay.agreement.items():
         compared = int(agreement["num_compared"] or 0)
         found |= {f"truth_{name}_{field}": compared for name in AGREEMENT if name != "num_compared"}
@@ -328,7 +344,9 @@ def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> f
 
     None for metrics that are not of single states.
     """
-    running = next((of.running for of in _declared_of(replay) if of.name == metric), None)
+    running = next(
+        (of.running for of in _declared(replay.mode, tuple(replay.audit.clearance)) if of.name == metric), None
+    )
     start, values = (np.nan, ()) if running is None else running(replay)
     if running is None or not holds(start):
         return None

@@ -68,12 +68,13 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
             asked.add(trace)
             record.explain(part, trace.steps)
     audit = record.audit
-    figures = twist_figures(model, config.control, frame, twists, audit.stamp_ns, audit.position, asked.steps)
     return replace(
         _logged(request, inputs, config, record, first),
         open_loop=asked,
         kept_steps=asked.kept,
-        twist_figures=figures,
+        twist_figures=twist_figures(
+            model, config.control, frame, twists, audit.stamp_ns, audit.position, asked.steps
+        ),
         outside=commander if isinstance(commander, OutsideController) else None,
     )
 
@@ -92,8 +93,13 @@ def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -
 def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
     motion = inputs.motion()
-    twists = twist_track(request, model, inputs.states.stamp_ns, console)
-    task = _task(request, inputs, motion, twists, config.control.limit_tolerance)
+    task = _task(
+        request,
+        inputs,
+        motion,
+        twist_track(request, model, inputs.states.stamp_ns, console),
+        config.control.limit_tolerance,
+    )
     start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
     limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
@@ -115,9 +121,8 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
     apart = Figures()
     for first, last in record.blocks(trace.stamp_ns):
         stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])
-        steps = trace.steps[first:last]
         straight = np.zeros_like(positions)  # the driven arm moves straight from state to state
-        record.explain(record.measured(stamps, positions, straight), steps)
+        record.explain(record.measured(stamps, positions, straight), trace.steps[first:last])
         joints, position, rotation = divergence(model, task.frame, stamps, positions, motion)
         apart.append(joints=joints, position=position, rotation=rotation)
     return replace(
@@ -155,8 +160,14 @@ def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[
 def _logged(request: ReplayRequest, inputs: ReplayInputs, config: Config, record: ReplayRecord, first: int) -> Replay:
     states, model = inputs.states, inputs.model
     last = inputs.scene.at(int(states.stamp_ns[-1]))
-    statics = static_violations(model, last.barrier, states.position[-1], scene_margin(model, config.control))
-    return _replay(request, inputs, config, record, statics, radius_of=-1)
+    return _replay(
+        request,
+        inputs,
+        config,
+        record,
+        static_violations(model, last.barrier, states.position[-1], scene_margin(model, config.control)),
+        radius_of=-1,
+    )
 
 
 def _replay(
@@ -189,7 +200,7 @@ def _replay(
         unwatched=tuple(record.hindsight.found),
         overtaken=tuple(record.newer_depth.found),
         strain=record.strain,
-        statics=record.statics,
+        statics=record.fixed_parts.found,
         closest=record.closest,
         events=record.events.events(),
     )
@@ -234,8 +245,7 @@ def _task(
     stamps, positions = motion.stamp_ns, motion.position
     start = _first_judged(request, inputs)
     frame = request.frame or inputs.model.frame_names[-1]
-    end = positions[-1] if twists is None else positions[start]
-    *via, goal = goal_waypoints(request, inputs.model, frame, end)
+    *via, goal = goal_waypoints(request, inputs.model, frame, positions[-1] if twists is None else positions[start])
     for waypoint in (*via, goal):
         if waypoint.posture is not None:
             check_within_limits(inputs.model, waypoint.posture, tolerance, what="goal")

@@ -43,7 +43,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
     clearance = judged.replay.audit.clearance
     if "certified" not in clearance:
         return
-    least, exact = (lowest(clearance[name].distance) for name in ("certified", "exact"))
+    least, exact = (lowest(np.asarray(clearance[name])) for name in ("certified", "exact"))
     if least is None or exact is None or not least < judged.threshold <= exact:
         yield from _by_source(judged, "certified")
         return
@@ -74,8 +74,7 @@ def true_clearance(judged: Judged) -> Iterator[Reason]:
 
 def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     replay = judged.replay
-    values = replay.true_clearance if source == "true" else replay.audit.clearance[source].distance
-    least = lowest(np.asarray(values))
+    least = lowest(np.asarray(replay.true_clearance if source == "true" else replay.audit.clearance[source]))
     if least is None:
         return
     if least >= judged.threshold:
@@ -84,10 +83,11 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     events = events_of(replay, EventKind.IN_COLLISION if least < 0 else EventKind.BELOW_MARGIN, source)
     worst = min(events, key=lambda event: event.worst)
     states = sum(event.num_states for event in events)
+    apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
     yield _at_worst(
         worst,
         failed(
-            sentence=f"{worst.worst_name} {_apart(least)}, margin {mm(replay.margin)}, {states} states in "
+            sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}, {states} states in "
             f"{counted(len(events), 'interval')}, worst",
             value=least,
             threshold=replay.margin,
@@ -98,13 +98,9 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     )
 
 
-def _apart(least: float) -> str:
-    return f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
-
-
 def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
     replay = judged.replay
-    least = lowest(replay.audit.clearance["exact"].distance)
+    least = lowest(np.asarray(replay.audit.clearance["exact"]))
     assert least is not None
     if least >= judged.threshold:
         yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
@@ -145,8 +141,11 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     if least is None or not np.isfinite(least):
         return
     if not events:
-        apart = held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
-        yield _beside_fixture(judged) or _brought_together(judged) or apart
+        yield (
+            _beside_fixture(judged)
+            or _brought_together(judged)
+            or held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
+        )
         return
     worst = min(events, key=lambda event: event.worst)
     yield _at_worst(
@@ -296,8 +295,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             remedy="give a URDF with collision geometry (--packages finds its meshes)",
         )
         return
-    bare = bare_moving_links(judged.replay.model)
-    if bare:
+    if bare := bare_moving_links(judged.replay.model):
         yield lacking(
             sentence=f"no sphere on {', '.join(bare)}: their clearance is unknown",
             who=bare[0],
@@ -347,7 +345,7 @@ def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
     The last two are None if unknown. If the spheres break the margin, they are None and the first is NaN.
     """
     clearance = judged.replay.audit.clearance
-    spheres = lowest(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
+    spheres = lowest(np.asarray(clearance["certified" if "certified" in clearance else "exact"]))  # as `surface` is
     if spheres is None or spheres < judged.threshold:
         return np.nan, None, None
     return spheres, lowest(judged.replay.between["surface"]), lowest(judged.replay.between["lower"])

@@ -6,13 +6,13 @@ from pathlib import Path
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
+from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, check_gate_names
 from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.jobs.reconstruct.reconstruct import declarations_of
-from splatctrl_cli.jobs.recordings.provenance import Mismatch, made_from_mismatches, scene_mismatches, truth_mismatch
+from splatctrl_cli.jobs.recordings.provenance import made_from_mismatches, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.replay.criteria import Judged
 from splatctrl_cli.jobs.replay.evidence import (
     Evidence,
@@ -92,13 +92,13 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
                 found = replace(found, map_error=map_error(evidence, inputs, found.audit, config.verdict))
         metrics = metrics_of(found) | logged.metrics()
         with stopwatch.stage("verdict"):
-            judged = Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
-            verdict = replay_verdict(judged)
+            verdict = replay_verdict(
+                Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
+            )
         with stopwatch.stage("worst_frames"):
             unseen = draw_worst_frames(folder, found, sights)
         write_json(folder / "states.json", logged.as_dict())
-        by_surface = () if found.closed_loop is None else found.closed_loop.by_surface
-        of_robot = words_of(robot, config.control, by_surface)
+        of_robot = words_of(robot, config.control, () if found.closed_loop is None else found.closed_loop.by_surface)
         write_replay(
             folder, found, metrics, verdict, of_robot, config=config, inputs=inputs.digests, stopwatch=stopwatch
         )
@@ -157,8 +157,7 @@ def _read(
     if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
         raise InputError(other.sentence, remedy=other.remedy)
     declared = declarations_of(request.declare, model)
-    meant = (*declared.expected_contact, *grasp_contacts(model, logged.states))
-    declared = replace(declared, expected_contact=meant)
+    declared = replace(declared, expected_contact=(*declared.expected_contact, *grasp_contacts(model, logged.states)))
     evidence = open_evidence(request, model)
     source = logged.source
     reads_all = request.lockstep and request.evidence not in source.cameras  # none of them is evidence
@@ -169,14 +168,13 @@ def _read(
     scene = opened_scene(request, model, declared, folder, progress, source, observe)
     given = (request.urdf, request.spheres, request.self_model, request.srdf, request.truth, request.declare)
     files = [path for path in given if path not in (None, NO_SELF_MODEL)]
-    digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
     inputs = ReplayInputs(
         source=source,
         states=logged.states,
         model=model,
         scene=scene,
         truth=truth,
-        digests=digests,
+        digests={**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}},
         mismatches=_mismatches(request, scene, logged, model),
         declared=declared,
         surfaces=robot.surfaces,
@@ -187,7 +185,7 @@ def _read(
 
 def _mismatches(
     request: ReplayRequest, known: KnownScene, logged: LoggedStates, model: RobotModel
-) -> tuple[Mismatch, ...]:
+) -> tuple[Reason, ...]:
     if request.field is not None:
         return tuple(made_from_mismatches(request.field, known.figures(), logged.source, model))
     if request.scene is None:

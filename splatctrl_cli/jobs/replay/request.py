@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from dataclasses import field as made_by
 from pathlib import Path
 
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.events import Event
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
@@ -14,8 +13,8 @@ from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.conformal import ConformalBound
+from splatctrl_cli.evaluate.verdict import Reason
 from splatctrl_cli.jobs.reconstruct.verdict import LONGEST_BLIND
-from splatctrl_cli.jobs.recordings.provenance import Mismatch
 from splatctrl_cli.jobs.replay.hindsight import LaterDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
@@ -54,7 +53,7 @@ class ReplayRequest(RobotOptions, RunOptions):
     lockstep: bool = False
     latency: float = 0.0
     allow_disagreement: bool = False
-    max_pose_jump: float = POSE_JUMP
+    max_pose_jump: float = fixed.POSE_JUMP
     self_model: Path | None = None
     srdf: Path | None = None
     mode: str = "audit"
@@ -98,7 +97,7 @@ class ReplayInputs:
     scene: KnownScene
     truth: Truth | None
     digests: dict[str, str]
-    mismatches: tuple[Mismatch, ...] = ()
+    mismatches: tuple[Reason, ...] = ()
     declared: Declarations = made_by(default_factory=Declarations)
     surfaces: SelfSurfaces | None = None
     kept: tuple[KeptMargin, ...] = ()

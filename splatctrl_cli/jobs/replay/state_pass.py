@@ -6,8 +6,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
+from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import (
     AuditTrace,
@@ -93,7 +92,7 @@ class ReplayRecord:
         self._robot = self._model = model
         self._scene, self._max_map_age = scene, max_map_age
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
-        self._fixed = FixedParts(model, 2.0 * (self._margin - SLIGHTLY_UNDER))
+        self.fixed_parts = FixedParts(model, 2.0 * (self._margin - fixed.SLIGHTLY_UNDER))
         self._spheres = sphere_names(model.sphere_set)
         self._number = {name: number for number, name in enumerate(self._spheres)}
         self._surfaces, self._kept = surfaces, kept
@@ -110,7 +109,7 @@ class ReplayRecord:
         self.near, self._near = Figures(), NearSpace(model, config.control.margin, max_map_age)
         self._posture_before: Float64 | None = None  # at the end of the last block
         self.hindsight = Hindsight(scene, self._near, config.control.margin, self._clearance_in)
-        self.newer_depth = NewerDepth(scene, config.control.margin - SLIGHTLY_UNDER, self._clearance_in)
+        self.newer_depth = NewerDepth(scene, config.control.margin - fixed.SLIGHTLY_UNDER, self._clearance_in)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
         self._seen_before: Seen | None = None  # at the last check of the fixed spheres
@@ -147,13 +146,14 @@ class ReplayRecord:
 
     def explain(self, part: AuditTrace, steps: Sequence[ControlStep | None] = ()) -> None:
         """Find the events of the block measured last, with the controller's `steps` there."""
-        signals = audit_signals(part, self._margin, self._spheres, self._model.joint_names, self._pairs)
-        signals += limit_signals(self._strain, self._model.joint_names)
-        signals += interval_signals(self._lower, self._unbounded, self._margin - SLIGHTLY_UNDER)
         age_s = np.array([self._scene.age_s(stamp) for stamp in part.stamp_ns.tolist()])
-        signals.append(stale_signal(age_s, self._max_map_age))
-        if steps:
-            signals += step_signals(steps)
+        signals = [
+            *audit_signals(part, self._margin, self._spheres, self._model.joint_names, self._pairs),
+            *limit_signals(self._strain, self._model.joint_names),
+            *interval_signals(self._lower, self._unbounded, self._margin - fixed.SLIGHTLY_UNDER),
+            stale_signal(age_s, self._max_map_age),
+            *(step_signals(steps) if steps else ()),
+        ]
 
         def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
             if name not in self._number or kind is EventKind.WITHOUT_DISTANCE:
@@ -227,18 +227,22 @@ class ReplayRecord:
             stamps, positions = np.concatenate([[stamp], stamps]), np.concatenate([q[None], positions])
             velocities = np.concatenate([velocity[None], velocities])
             at_states = np.concatenate([earlier, at_states])
-        between = between_states(
-            self._model,
-            self._reach,
+        self._keep_bounds(
+            between_states(
+                self._model,
+                self._reach,
+                stamps,
+                positions,
+                velocities,
+                at_states,
+                known[name],
+                margin=self._margin - fixed.SLIGHTLY_UNDER,
+                longest=self._longest,
+            ),
             stamps,
-            positions,
-            velocities,
             at_states,
-            known[name],
-            margin=self._margin - SLIGHTLY_UNDER,
-            longest=self._longest,
+            is_first=self._before is None,
         )
-        self._keep_bounds(between, stamps, at_states, is_first=self._before is None)
         self._before = int(stamps[-1]), positions[-1], velocities[-1]
 
     def _keep_bounds(self, between: Between, stamps: Stamps, at_states: Float64, *, is_first: bool) -> None:
@@ -258,11 +262,7 @@ class ReplayRecord:
             return
         self._last_scene, before, self._seen_before = known, self._seen_before, self._scene.seen_at(stamp)
         was_seen = None if before is None else lambda places: before.look(places)[0] >= 0
-        self._fixed.look(known.distances["exact"], part.position[0], was_seen)
-
-    @property
-    def statics(self) -> dict[str, tuple[float, float]]:
-        return self._fixed.found
+        self.fixed_parts.look(known.distances["exact"], part.position[0], was_seen)
 
     def _look_around(self, part: AuditTrace) -> None:
         num = len(part.stamp_ns)
@@ -271,8 +271,7 @@ class ReplayRecord:
             self.hindsight.add(part.stamp_ns, part.position)
         for at, is_timed in self._near.due(part.stamp_ns, self._model.sphere_centers_batch(part.position)).items():
             stamp = int(part.stamp_ns[at])
-            known = self._scene.seen_at(stamp)
-            if known is not None:
+            if (known := self._scene.seen_at(stamp)) is not None:
                 exact = self._scene.at(stamp).distances["exact"]
                 before, q = part.position[at - 1] if at else self._posture_before, part.position[at]
                 way = self._near.on_the_way(before, q) if before is not None and self._is_continuous else ()
@@ -290,7 +289,7 @@ class ReplayRecord:
     def _tell_represented(self, part: AuditTrace) -> None:
         exact = part.clearance["exact"].distance
         alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
-        low = np.flatnonzero(exact < self._margin - SLIGHTLY_UNDER)
+        low = np.flatnonzero(exact < self._margin - fixed.SLIGHTLY_UNDER)
         if splats_alone is not None and len(low):
             alone[low] = moving_clearance(self._model, part.position[low], splats_alone)[0].distance
         self.between.append(represented=alone)

@@ -4,6 +4,7 @@ import pickle
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar, overload
 
 import numpy as np
@@ -14,7 +15,7 @@ from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import ControlStep, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.files.spilled_rows import IN_MEMORY, RowFile, Rows, scratch_folder
-from splatctrl_cli.records import Float64, Index, Stamps
+from splatctrl_cli.records import Float64, Stamps
 
 BLOCK = 1024  # states that are replayed at once
 RUNGS = tuple(Rung)
@@ -26,11 +27,11 @@ AUDITED = ("position", "limit_margin", "limit_joint", "self_clearance", "self_pa
 T = TypeVar("T")
 
 
+@dataclass(eq=False)
 class StampColumn:
     """Stamps [ns] in memory, eight bytes each."""
 
-    def __init__(self) -> None:
-        self._parts: list[Stamps] = []
+    _parts: list[Stamps] = field(default_factory=list)
 
     def append(self, stamp_ns: Stamps) -> None:
         self._parts.append(stamp_ns)
@@ -89,11 +90,11 @@ class StoredObjects(Sequence[T], Generic[T]):
         return self._read[1]
 
 
+@dataclass(eq=False)
 class Figures:
     """Named columns of a number or row per state; NaN without a value."""
 
-    def __init__(self) -> None:
-        self._files: dict[str, RowFile] = {}
+    _files: dict[str, RowFile] = field(default_factory=dict)
 
     def append(self, **columns: Float64) -> None:
         for name, values in columns.items():
@@ -108,30 +109,8 @@ class Figures:
         return Rows(self._files[name])
 
 
-class StoredClearance:
-    """A `Clearance` whose columns are read on each access."""
-
-    def __init__(self, figures: Figures, name: str) -> None:
-        self._figures, self._name = figures, name
-
-    @property
-    def distance(self) -> Float64:
-        """(T,) [m]."""
-        return self._figures[f"distance {self._name}"]
-
-    @property
-    def rows(self) -> Rows:
-        """Lazily read distance (T,) [m]."""
-        return self._figures.rows(f"distance {self._name}")
-
-    @property
-    def sphere(self) -> Index:
-        """(T,)."""
-        return self._figures[f"sphere {self._name}"].astype(np.int64)
-
-
 class StoredAudit:
-    """An `AuditTrace` in files; clearances are read on each access, positions by row."""
+    """An `AuditTrace` in files; its clearances are distances alone, their spheres are in `figures`."""
 
     def __init__(self) -> None:
         self._stamps, self.figures = StampColumn(), Figures()
@@ -141,8 +120,9 @@ class StoredAudit:
         self._names = tuple(part.clearance)
         self._stamps.append(part.stamp_ns)
         for name, clearance in part.clearance.items():
-            columns = {f"distance {name}": clearance.distance, f"sphere {name}": clearance.sphere.astype(np.float64)}
-            self.figures.append(**columns)
+            self.figures.append(
+                **{f"distance {name}": clearance.distance, f"sphere {name}": clearance.sphere.astype(np.float64)}
+            )
         self.figures.append(**{name: np.asarray(getattr(part, name), np.float64) for name in AUDITED})
 
     @property
@@ -156,8 +136,9 @@ class StoredAudit:
         return self.figures.rows("position")
 
     @property
-    def clearance(self) -> Mapping[str, StoredClearance]:
-        return {name: StoredClearance(self.figures, name) for name in self._names}
+    def clearance(self) -> Mapping[str, Rows]:
+        """Distances (T,) [m] by field."""
+        return {name: self.figures.rows(f"distance {name}") for name in self._names}
 
     def block(self, first: int, last: int) -> AuditTrace:
         def part(name: str) -> Float64:
@@ -178,15 +159,15 @@ class StoredAudit:
         )
 
 
+@dataclass(eq=False)
 class StoredSteps:
     """Steps of a controller, None where it had none, with `STEP_FIGURES` (T,) over all.
 
     Also the velocity (T, J) [rad/s], NaN without a step.
     """
 
-    def __init__(self) -> None:
-        self.stored: StoredObjects[ControlStep | None] = StoredObjects()
-        self.figures = Figures()
+    stored: StoredObjects[ControlStep | None] = field(default_factory=StoredObjects)
+    figures: Figures = field(default_factory=Figures)
 
     def extend(self, steps: Sequence[ControlStep | None], num_joints: int) -> None:
         blank = np.full(num_joints, np.nan)
@@ -255,11 +236,7 @@ class StoredOpenLoop:
     def __init__(self) -> None:
         self.kept, self.figures = StoredSteps(), Figures()
         self.margins: StoredObjects[VelocityMargin | None] = StoredObjects()
-
-    @property
-    def steps(self) -> Sequence[ControlStep | None]:
-        """None where the controller did not run."""
-        return self.kept.stored
+        self.steps: Sequence[ControlStep | None] = self.kept.stored  # None where the controller did not run
 
     def add(self, part: OpenLoopTrace) -> None:
         self.kept.extend(part.steps, part.logged.shape[1])

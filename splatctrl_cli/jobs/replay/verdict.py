@@ -74,8 +74,7 @@ def _how(judged: Judged) -> str:
 def _notes(judged: Judged) -> Iterator[str]:
     found = judged.replay.map_error
     yield "map error not measured" if found is None or found.bound is None else bound_words(found.bound)
-    close = [name for name, (first, _) in judged.replay.statics.items() if first < judged.threshold]
-    if close:
+    if close := [name for name, (first, _) in judged.replay.statics.items() if first < judged.threshold]:
         yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
@@ -88,8 +87,7 @@ def _notes(judged: Judged) -> Iterator[str]:
         yield "age of the evidence about the arm not judged"
     yield from _declared_notes(judged)
     yield from waivers(judged.request)
-    inside = judged.inputs.scene.figures().get("inside_robot_points")
-    if inside:
+    if inside := judged.inputs.scene.figures().get("inside_robot_points"):
         yield f"{inside} measured points lie inside the robot: contact, a carried object, or calibration"
     if judged.request.re_anchor is not None:
         yield "the arm is reset to the log's configuration on the way: motion between states is not judged"

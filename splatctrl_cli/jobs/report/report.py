@@ -132,15 +132,13 @@ class _Job:
         values = [metrics.get(name) for name in ("min_clearance", "min_clearance_true")]
         return min((float(value) for value in values if isinstance(value, int | float)), default=math.inf)
 
-    @property
-    def order(self) -> tuple[bool, bool, bool, float]:
-        ran = self.ran
-        return (ran.state == DONE, not self.is_changed, ran.outcome in ("passed", ""), self.least)
-
 
 def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
     changes, changed = changes_since(request.against, request.path, has_links=True)
-    jobs = sorted((_job(batch, ran, ran.node in changed) for ran in batch.runs), key=lambda job: job.order)
+    jobs = sorted(
+        (_job(batch, ran, ran.node in changed) for ran in batch.runs),
+        key=lambda job: (job.ran.state == DONE, not job.is_changed, job.ran.outcome in ("passed", ""), job.least),
+    )
     replayed = {job.ran.recording for job in jobs if job.ran.command == REPLAY}
     told = [job for job in jobs if _is_told(job, is_seen=request.all_scenes and job.ran.recording not in replayed)]
     wanted = [job for job in told if job.run is not None and job.run.command in WITH_SPACE]
@@ -232,11 +230,14 @@ def _section(
     most, width = (3, 800) if has_space else (1, 640)  # number, and width [px]
     section = section_of(run, anchor=ran.node, title=ran.node, most_pictures=most, width=width)
     if ran.state != DONE:
-        lines = [f"expected: {ran.expect}", *([ran.cause] if ran.cause else []), *section.lines]
-        section = replace(section, state=ran.state, lines=lines, details=[*section.details, _log(batch, ran)])
+        section = replace(
+            section,
+            state=ran.state,
+            lines=[f"expected: {ran.expect}", *([ran.cause] if ran.cause else []), *section.lines],
+            details=[*section.details, _log(batch, ran)],
+        )
     if not has_space:
-        hint = "not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else ""
-        return replace(section, no_space=hint)
+        return replace(section, no_space="not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else "")
     return _in_space(section, run, (batch.path, *request.roots), scenes, f"scene-{len(scenes)}")
 
 
@@ -263,15 +264,21 @@ def _cell(ran: Run | None, linked: set[str]) -> Cell:
 
 
 def _list(title: str, jobs: Sequence[_Job], linked: set[str]) -> Table:
-    rows = []
-    for job in jobs:
-        ran = job.ran
-        name = Cell(text=ran.node, link=ran.node if ran.node in linked else "")
-        least = None if job.least == math.inf else round(1e3 * job.least, 1)
-        words = ran.sentence or ran.cause
-        cost = (ran.seconds or None, ran.peak_mb or None)
-        cells = (name, f"{ran.label or ran.state}{ran.damage}", ran.expect, least, words, *cost)
-        rows.append((cells, ran.state))
+    rows = [
+        (
+            (
+                Cell(text=job.ran.node, link=job.ran.node if job.ran.node in linked else ""),
+                f"{job.ran.label or job.ran.state}{job.ran.damage}",
+                job.ran.expect,
+                None if job.least == math.inf else round(1e3 * job.least, 1),
+                job.ran.sentence or job.ran.cause,
+                job.ran.seconds or None,
+                job.ran.peak_mb or None,
+            ),
+            job.ran.state,
+        )
+        for job in jobs
+    ]
     return Table(title=title, header=("job", "verdict", "expected", "least mm", "sentence", "s", "MB"), rows=rows)
 
 
@@ -296,8 +303,14 @@ def view(request: ViewRequest) -> ViewResult:
     """Write a 3-D page. Raises InputError if there is nothing to show."""
     space = space_of(request.path, request.roots)
     name = request.path.absolute().name
-    section = RunSection(anchor="scene", title="", state="", sentence="", space="scene")
-    page = Page(title=name, state="", sentence="", runs=[section], scenes={"scene": packed(space)}, opens=True)
+    page = Page(
+        title=name,
+        state="",
+        sentence="",
+        runs=[RunSection(anchor="scene", title="", state="", sentence="", space="scene")],
+        scenes={"scene": packed(space)},
+        opens=True,
+    )
     file = _write(request, page)
     return ViewResult(
         file=file,

@@ -77,8 +77,7 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
 def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:
     """Spans [s] of events by kind and measure: faults, then what shaped a command."""
     found: dict[str, list[tuple[float, float]]] = {}
-    events = (run.json_of("events.json") or {}).get("events", [])
-    shown = [event for event in events if event["source"] in SHOWN]
+    shown = [event for event in (run.json_of("events.json") or {}).get("events", []) if event["source"] in SHOWN]
     for event in sorted(shown, key=lambda event: event["kind"] in INTERVENTIONS):
         name = f"{event['kind']}{SHOWN[event['source']]}"
         found.setdefault(name, []).append((float(event["start_s"]), float(event["end_s"])))
@@ -101,8 +100,12 @@ def _settings(run: RunFolder) -> Table:
         for key, value in values.items()
         if value != default[section].get(key)
     ]
-    text = f"splatctrl {shlex.join(run.arguments)}" + ("" if rows else "\nevery setting as by default")
-    return Table(title="Settings", header=("setting", "value", "default"), rows=rows, text=text)
+    return Table(
+        title="Settings",
+        header=("setting", "value", "default"),
+        rows=rows,
+        text=f"splatctrl {shlex.join(run.arguments)}" + ("" if rows else "\nevery setting as by default"),
+    )
 
 
 def _provenance(run: RunFolder) -> Table:
@@ -115,8 +118,9 @@ def _provenance(run: RunFolder) -> Table:
         **{f"seconds: {name}": value for name, value in dict(run.run.get("seconds", {})).items()},
         **{f"sha256 of {name}": value for name, value in dict(run.run.get("inputs", {})).items()},
     }
-    rows = [(item, "") for item in about.items()]
-    return Table(title="Versions and provenance", header=("what", "value"), rows=rows)
+    return Table(
+        title="Versions and provenance", header=("what", "value"), rows=[(item, "") for item in about.items()]
+    )
 
 
 HEADER = ("job", "what", "before", "now", "", "allowed", "unit", "where")
@@ -167,8 +171,14 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
         for one in found.verdicts
     ]
     unlike = [(("", name, *values, "not alike", "", "", ""), "") for name, values in found.differences.items()]
-    text = ". ".join([found.verdict.sentence, *map(str, found.verdict.said)])
-    tables = [Table(title="What changed", header=HEADER, rows=[*first, *rows(worse), *unlike], text=text)]
+    tables = [
+        Table(
+            title="What changed",
+            header=HEADER,
+            rows=[*first, *rows(worse), *unlike],
+            text=". ".join([found.verdict.sentence, *map(str, found.verdict.said)]),
+        )
+    ]
     if better:
         tables.append(
             Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)

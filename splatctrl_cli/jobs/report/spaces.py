@@ -69,8 +69,12 @@ def space_of_grid(path: Path) -> Space:
     if "sdf" not in grid.channels:
         raise InputError(f"{path}: expected the channel sdf, got {', '.join(grid.channels)}")
     step = -(-max(grid.channels["sdf"].shape) // 80)  # cells along a side at most
-    channels = {"sdf": np.ascontiguousarray(grid.channels["sdf"][::step, ::step, ::step])}
-    thinned = DistanceGrid(origin=grid.origin, voxel=step * grid.voxel, channels=channels, header=grid.header)
+    thinned = DistanceGrid(
+        origin=grid.origin,
+        voxel=step * grid.voxel,
+        channels={"sdf": np.ascontiguousarray(grid.channels["sdf"][::step, ::step, ::step])},
+        header=grid.header,
+    )
     try:
         found = iso_surface(thinned)
         surface = Surface(vertices=found.vertices.astype(np.float32), faces=found.faces.astype(np.uint32))
@@ -105,8 +109,9 @@ def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> Ro
     locks = tuple((name, float(value)) for name, _, value in (word.partition("=") for word in run.options("--lock")))
     packages = tuple(place for word in run.options("--packages") if (place := run.place_of(word, roots)))
     pose = None if base is None else tuple(float(part) for part in base.split(","))
-    digests = tuple(sha256(path) for path in found.values())
-    robot = _robot(found["urdf"], found.get("spheres"), pose, locks, packages, digests)
+    robot = _robot(
+        found["urdf"], found.get("spheres"), pose, locks, packages, tuple(sha256(path) for path in found.values())
+    )
     return robot.moved_by(tuple(states.joints))
 
 
@@ -141,8 +146,7 @@ def _file(run: RunFolder, given: str, roots: tuple[Path, ...]) -> Path:
 
 
 def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding: Deciding | None) -> Space:
-    grid = run.option("--field")
-    if grid is not None:
+    if (grid := run.option("--field")) is not None:
         place = _file(run, grid, roots)
         return space_of_grid(place / "field.npz" if place.is_dir() else place)
     scene = scene_of(run, roots)
@@ -209,14 +213,13 @@ def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
     end = run.option("--frame") or robot.frame_names[-1]
     postures = [position_of(states, robot, state) for state in which]
     least = np.fmin.reduce(list(states.clearance.values())) if states.clearance else np.full(count, np.nan)
-    about = run.json_of("summary.json") or {}
     return Motion(
         seconds=states.seconds[which],
         bodies=bodies,
         poses=np.array([[robot.frame_pose(q, link) for link in bodies] for q in postures]),
         path=np.array([robot.frame_pose(q, end)[:3, 3] for q in postures]),
         clearance=least[which],
-        margin=float(about.get("about", {}).get("margin", 0.0)),
+        margin=float((run.json_of("summary.json") or {}).get("about", {}).get("margin", 0.0)),
     )
 
 

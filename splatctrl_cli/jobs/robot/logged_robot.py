@@ -38,10 +38,13 @@ class RobotOptions:
 
     def posed(self, urdf: UrdfFile, otherwise: SphereSet | None = None) -> RobotModel:
         """Robot of a URDF, with the spheres `otherwise` if none are given. Raises InputError."""
-        T_world_base = None if self.base is None else transform_from(self.base[:3], self.base[3:])
         spheres = otherwise if self.spheres is None else self.spheres
         return RobotModel.from_urdf(
-            urdf, spheres, T_world_base=T_world_base, locked=self.locked, packages=self.packages
+            urdf,
+            spheres,
+            T_world_base=None if self.base is None else transform_from(self.base[:3], self.base[3:]),
+            locked=self.locked,
+            packages=self.packages,
         )
 
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import DEFAULT_SPHERES
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
 from splatctrl_cli.evaluate.verdict import (
@@ -15,7 +14,7 @@ from splatctrl_cli.evaluate.verdict import (
     Verdict,
     check_gate_names,
     gate_reasons,
-    noted,
+    note,
     parse_gate,
     verdict_of,
 )
@@ -25,7 +24,7 @@ from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.report.pictures import robot_picture
-from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage, coverage_of_solids
+from splatctrl_cli.robot.coverage import CoverageReport, coverage_of_solids
 from splatctrl_cli.robot.link_meshes import Solid, mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import SelfCollisionPairs, read_srdf, self_collision_pairs
@@ -72,7 +71,7 @@ class RobotRequest(RobotOptions):
     picture: Path | None = None
     require: tuple[str, ...] = ()
     out: Path = Path("spheres.yaml")
-    fit: FitOptions = field(default_factory=lambda: FitOptions(max_spheres=DEFAULT_SPHERES))
+    fit: FitOptions = field(default_factory=lambda: FitOptions(max_spheres=fixed.DEFAULT_SPHERES))
     force: bool = False
     srdf: Path | None = None
     postures: int = 2000
@@ -92,7 +91,22 @@ class CoverageResult:
     links_left_out: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        links = [_plain_link(link) for link in self.report.links]
+        links = [
+            {
+                "link": link.link,
+                "num_spheres": link.num_spheres,
+                "area": link.area,
+                "uncovered_share": link.uncovered_share,
+                "uncovered_bounds": [bound / link.area for bound in link.uncovered_bounds],
+                "deficit": None if link.deficit is None else max(0.0, link.deficit.proven),
+                "deficit_found": None if link.deficit is None else max(0.0, link.deficit.found),
+                "place": None if link.deficit is None else link.deficit.place.tolist(),
+                "protrusion": link.protrusion,
+                "worst_sphere": link.worst_sphere,
+                "is_closed": link.is_closed,
+            }
+            for link in self.report.links
+        ]
         return {"metrics": {name: of(self.report) for name, of in METRICS.items()}, "links": links}
 
 
@@ -172,8 +186,11 @@ def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageRes
     if request.picture is not None:
         _draw(request.picture, urdf, solids, spheres)
     allowed = max(DEFAULT_MARGIN, request.fit.max_deficit)
-    verdict = _verdict(report, urdf, solids, "robot spheres", request.require, allowed)
-    return CoverageResult(report=report, verdict=verdict, spheres=request.out)
+    return CoverageResult(
+        report=report,
+        verdict=_verdict(report, urdf, solids, "robot spheres", request.require, allowed),
+        spheres=request.out,
+    )
 
 
 def check_robot(request: RobotRequest) -> CoverageResult:
@@ -200,19 +217,26 @@ def robot_pairs(request: RobotRequest) -> PairsResult:
     """Find links that may collide, and why others may not."""
     model = RobotModel.from_urdf(request.urdf, request.spheres, locked=request.locked)
     disabled, foreign = ((), ()) if request.srdf is None else read_srdf(request.srdf, model.urdf)
-    found = self_collision_pairs(
-        model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
+    return PairsResult(
+        found=self_collision_pairs(
+            model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
+        ),
+        num_foreign=len(foreign),
+        doubts=tuple(model.doubts),
     )
-    return PairsResult(found=found, num_foreign=len(foreign), doubts=tuple(model.doubts))
 
 
 def describe_robot(request: RobotRequest) -> RobotResult:
     """Describe joints, links, shapes and spheres, by default the URDF's own spheres."""
     urdf = read_urdf(request.urdf)
     locked = urdf.with_followers(request.locked)
-    spheres = own_spheres(urdf) if request.spheres is None else request.spheres
-    model = RobotModel.from_urdf(request.urdf, spheres, locked=locked)
-    return RobotResult(model=model, locked=locked, lost_meshes=_lost_meshes(urdf, request.packages))
+    return RobotResult(
+        model=RobotModel.from_urdf(
+            request.urdf, own_spheres(urdf) if request.spheres is None else request.spheres, locked=locked
+        ),
+        locked=locked,
+        lost_meshes=_lost_meshes(urdf, request.packages),
+    )
 
 
 def coverage_summary(report: CoverageReport) -> str:
@@ -266,13 +290,15 @@ def _verdict(
             f" {1e3 * allowed:g} mm",
             remedy="fit a set with 'splatctrl robot spheres', or give --require 'max_deficit<=...' [m]",
         )
-    ignored = dict.fromkeys(part.surface.note for parts in solids.values() for part in parts if part.surface.note)
-    gates = gate_reasons(require, {name: of(report) for name, of in METRICS.items()}, counts)
     return verdict_of(
         command,
-        [covered, *([noted("coverage", bare)] if bare else []), *gates],
+        [
+            covered,
+            *([note(criterion="coverage", sentence=bare)] if bare else []),
+            *gate_reasons(require, {name: of(report) for name, of in METRICS.items()}, counts),
+        ],
         scope=f"{report.num_spheres} spheres on {num} links",
-        notes=ignored,
+        notes=dict.fromkeys(part.surface.note for parts in solids.values() for part in parts if part.surface.note),
         counts=counts,
     )
 
@@ -310,20 +336,3 @@ def _draw(path: Path, urdf: UrdfFile, solids: Mapping[str, tuple[Solid, ...]], s
         transform_points(poses[link], part.surface.corners) for link, parts in solids.items() for part in parts
     ]
     robot_picture(path, triangles, model.sphere_centers(model.middle), model.sphere_set.radii)
-
-
-def _plain_link(link: LinkCoverage) -> dict[str, Any]:
-    deficit = link.deficit
-    return {
-        "link": link.link,
-        "num_spheres": link.num_spheres,
-        "area": link.area,
-        "uncovered_share": link.uncovered_share,
-        "uncovered_bounds": [bound / link.area for bound in link.uncovered_bounds],
-        "deficit": None if deficit is None else max(0.0, deficit.proven),
-        "deficit_found": None if deficit is None else max(0.0, deficit.found),
-        "place": None if deficit is None else deficit.place.tolist(),
-        "protrusion": link.protrusion,
-        "worst_sphere": link.worst_sphere,
-        "is_closed": link.is_closed,
-    }

@@ -68,8 +68,9 @@ def demanded(name: str, source: str = FIT) -> Device | None:
     try:
         return opened(name, source)
     except DeviceError as error:
-        remedy = f"{error.remedy}, or {TO_CPU}" if error.remedy else TO_CPU
-        raise UsageError(f"--device {name}: {error}", remedy=remedy) from error
+        raise UsageError(
+            f"--device {name}: {error}", remedy=f"{error.remedy}, or {TO_CPU}" if error.remedy else TO_CPU
+        ) from error
 
 
 def automatic(
@@ -95,10 +96,9 @@ def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
 
     Raises UsageError if unusable.
     """
-    device = demanded(name, FIELD)
-    if device is None:
-        device = automatic(progress, source=FIELD) if is_enough else Device()
-    return device
+    if (device := demanded(name, FIELD)) is not None:
+        return device
+    return automatic(progress, source=FIELD) if is_enough else Device()
 
 
 class FitDevice:

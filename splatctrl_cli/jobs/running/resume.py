@@ -12,6 +12,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, read_checkpoint
+from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.kernels import arithmetic
 
 DECIDING_OPTIONS: Mapping[str, object] = {  # defaults that decide a scene's bytes, besides its configuration
@@ -70,6 +71,19 @@ def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[No
         ) from None
 
 
+def check_resumption(checkpoint: Path, what: str, progress: Progress, *, resume: bool) -> bool:
+    """True if --resume finds a checkpoint; log one that is missing or replaced.
+
+    what: "run" or "bake".
+    """
+    partial, is_there = checkpoint.parent.parent, checkpoint.is_file()
+    if resume and not is_there:
+        progress.log(f"{partial}: has no checkpoint to continue from; starts at the beginning")
+    elif is_there and not resume:
+        progress.log(f"warning: {partial}: an interrupted {what} is replaced; --resume would have continued it")
+    return resume and is_there
+
+
 def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint:
     """Read a partial folder's checkpoint. Raises UsageError naming differences."""
     checkpoint = read_checkpoint(folder)
@@ -80,8 +94,7 @@ def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint
 def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise UsageError naming deciding values that differ from the interrupted run."""
     before, after = dict(_flat(run)), dict(_flat(now))
-    differing = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    if differing:
+    if differing := [name for name in {**before, **after} if before.get(name) != after.get(name)]:
         said = ", ".join(f"{n} was {_shown(before.get(n))}, is {_shown(after.get(n))}" for n in differing[:3])
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise UsageError(

@@ -149,8 +149,7 @@ def cameras_to_score(
             remedy="give the views that reconstruct left out as --holdout or --protocol, or --allow-training",
         )
     cameras = tuple(dict.fromkeys(wanted))
-    unknown = [name for name in cameras if name not in recorded]
-    if unknown:
+    if unknown := [name for name in cameras if name not in recorded]:
         raise InputError(f"{reference.where}: no camera {unknown[0]!r}", remedy=f"use one of: {', '.join(recorded)}")
     trained = [name for name in cameras if name in training]
     if trained and not allow_training:

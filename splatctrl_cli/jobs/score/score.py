@@ -1,6 +1,5 @@
 """A score of scenes against held-out views of one or several scans."""
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from splatctrl_cli.evaluate.score_report import (
 )
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
 from splatctrl_cli.field.unknown import field_splats, obstacle_spheres
-from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run, write_table
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, run_value
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
@@ -140,21 +139,31 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
             surface = cloud_figures(cloud, scene, scorer.training, request.threads)
     protocol = _protocol(scorer)
     definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
-    metrics = total_score(scorer.views) | surface
-    metrics |= {"free_mass": _free_mass(request.scene, scene), "num_skipped": len(scorer.skipped)}
-    metrics["num_warnings"] = len(scorer.doubts) + len(same["differences"])
+    metrics = (
+        total_score(scorer.views)
+        | surface
+        | {
+            "free_mass": _free_mass(request.scene, scene),
+            "num_skipped": len(scorer.skipped),
+            "num_warnings": len(scorer.doubts) + len(same["differences"]),
+        }
+    )
     report = _report(request, scorer, same, protocol | {"definitions": definitions}, as_json(metrics))
     result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
     if folder:
-        _write_table(folder / "views.csv", report["views"])
+        write_table(folder / "views.csv", list(report["views"][0]), report["views"])
         with stopwatch.stage("pictures"):
             for (_, best), (_, worst) in scorer.extremes.values() if request.images != "none" else ():
                 comparison = [best] if worst.title == best.title else [best, worst]
                 comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
-        config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
         made = request.scene if request.scene.is_file() else request.scene / "splats.ply"
-        inputs = {**digests, f"scene/{made.name}": sha256(made)}
-        _write_result(folder, result, config=config, inputs=inputs, stopwatch=stopwatch)
+        _write_result(
+            folder,
+            result,
+            config={"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol},
+            inputs={**digests, f"scene/{made.name}": sha256(made)},
+            stopwatch=stopwatch,
+        )
     return result
 
 
@@ -188,7 +197,6 @@ def _protocol(scorer: Scorer) -> dict[str, Any]:
     """Facts a figure must be published with to be comparable."""
     reference = scorer.reference
     named, split = reference.protocol, reference.split
-    sizes = sorted({view.size for view in scorer.views})
     return {
         "name": "none" if named is None else named.name,
         "source": "none" if named is None else named.source,
@@ -198,7 +206,7 @@ def _protocol(scorer: Scorer) -> dict[str, Any]:
         "left_out_views": None if split is None else list(split.left_out),
         "split": "by camera" if split is None else split.words(),
         "mask_rule": reference.mask_rule,
-        "resolution": [f"{width}x{height}" for width, height in sizes],
+        "resolution": [f"{width}x{height}" for width, height in sorted({view.size for view in scorer.views})],
         "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
         "published_scans": None if named is None or not named.scans else list(named.scans),
         "background": [round(value, 4) for value in scorer.scene.background],
@@ -210,8 +218,8 @@ def _free_mass(path: Path, scene: SceneFolder) -> float:
     """Free mass of the scene, NaN without an occupancy grid."""
     if not (path / "occupancy.npz").is_file():
         return nan
-    keys = ("config", "occupancy", "free_below")
-    free_below = run_value(scene.run, keys, float, where=str(path / "run.json"))
+    where = str(path / "run.json")
+    free_below = run_value(scene.run, ("config", "occupancy", "free_below"), float, where=where)
     spheres = obstacle_spheres(scene.splats(), scene.unrepresented_at(None), frozenset(Label))
     return free_mass(spheres.splats, scene.occupancy(), free_below)
 
@@ -219,20 +227,14 @@ def _free_mass(path: Path, scene: SceneFolder) -> float:
 def _concluded(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
     if request.baseline is not None:
         report["metrics"] |= changes(report, request.baseline)
-    verdict = score_verdict(report, request.require, is_damaged=is_damaged)
-    return ScoreResult(report=report, verdict=verdict, out=request.out)
+    return ScoreResult(
+        report=report, verdict=score_verdict(report, request.require, is_damaged=is_damaged), out=request.out
+    )
 
 
 def _view_drawer(folder: Path) -> Callable[[ComparisonRow], None]:
     folder.mkdir(parents=True, exist_ok=True)
     return lambda row: view_picture(folder / f"{row.title}.png", row)
-
-
-def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        table = csv.DictWriter(stream, fieldnames=list(rows[0]), lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
 
 
 def _write_result(
@@ -264,8 +266,7 @@ def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
     if not found or recording.scan is None:
         return found
     wanted = [name.strip() for name in recording.scan.split(",") if name.strip()]
-    unknown = [name for name in wanted if name not in found]
-    if unknown:
+    if unknown := [name for name in wanted if name not in found]:
         raise InputError(f"{folder}: no scene {unknown[0]!r}", remedy=f"scenes: {', '.join(found)}")
     return {name: found[name] for name in wanted}
 
@@ -276,17 +277,19 @@ def _score_scans(
     results: dict[str, ScoreResult] = {}
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
-        recording = of_scan(request.recording, scan)
         # gates and baseline apply to the means alone
-        alone = replace(request, scene=scene, recording=recording, require=(), baseline=None)
+        alone = replace(request, scene=scene, recording=of_scan(request.recording, scan), require=(), baseline=None)
         results[scan] = _score_scene(alone, folder and folder / scan, progress)
-    report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
-    report |= report_of_scans({scan: result.report for scan, result in results.items()})
+    report = {
+        "scenes": str(request.scene),
+        "reference": str(request.recording.path),
+        **report_of_scans({scan: result.report for scan, result in results.items()}),
+    }
     result = _concluded(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
     if folder is not None:
         names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
-        rows = [{"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items()]
-        _write_table(folder / "scans.csv", rows)
+        rows = ({"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items())
+        write_table(folder / "scans.csv", ["scan", *names], rows)
         _write_result(folder, result, config={"scans": report["scans"]})
     return result
 

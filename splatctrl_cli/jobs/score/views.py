@@ -132,8 +132,10 @@ class Scorer:
         if self.draw is not None:
             self.draw(row)
         best, worst = self.extremes.get(frame.camera, ((rank, row), (rank, row)))
-        ends = max(best, (rank, row), key=itemgetter(0)), min(worst, (rank, row), key=itemgetter(0))
-        self.extremes[frame.camera] = ends
+        self.extremes[frame.camera] = (
+            max(best, (rank, row), key=itemgetter(0)),
+            min(worst, (rank, row), key=itemgetter(0)),
+        )
 
     def _compared(
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
@@ -163,9 +165,9 @@ class Scorer:
 
 
 def _figures(score: ViewScore) -> str:
-    parts = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} seen"]
-    parts += [f"{score.masked.psnr:.1f} masked"] if score.masked is not None else []
-    return "dB: " + ", ".join([*parts, f"{score.all.psnr:.1f} all"])
+    seen = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} seen"]
+    masked = [] if score.masked is None else [f"{score.masked.psnr:.1f} masked"]
+    return "dB: " + ", ".join([*seen, *masked, f"{score.all.psnr:.1f} all"])
 
 
 def rendered_with_shell(

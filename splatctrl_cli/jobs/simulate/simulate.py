@@ -100,7 +100,19 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
         write_json(folder / "truth.json", truth_document(truth))
         if request.dtu:
             with stopwatch.stage("dtu"):
-                _write_scan(folder)
+                scan = [
+                    DtuView(
+                        name=frame.camera,
+                        color=frame.color,
+                        depth=frame.depth,
+                        intrinsics=frame.intrinsics,
+                        T_world_camera=frame.T_world_camera,
+                        mask=object_mask(frame),
+                    )
+                    for frame in turntable_views()
+                ]
+                write_dtu(folder / "dtu", "scan1", scan)
+                write_idr(folder / "idr", "scan1", scan)
         write_run(
             folder,
             command="simulate",
@@ -164,22 +176,6 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
     return Recording(options, robot, scene, request.unmodelled)
 
 
-def _write_scan(folder: Path) -> None:
-    scan = [
-        DtuView(
-            name=frame.camera,
-            color=frame.color,
-            depth=frame.depth,
-            intrinsics=frame.intrinsics,
-            T_world_camera=frame.T_world_camera,
-            mask=object_mask(frame),
-        )
-        for frame in turntable_views()
-    ]
-    write_dtu(folder / "dtu", "scan1", scan)
-    write_idr(folder / "idr", "scan1", scan)
-
-
 def _sizes(folder: Path) -> dict[str, int]:
     sizes = {}
     for path in sorted(folder.iterdir()):
@@ -211,8 +207,9 @@ def copied_arm(
         spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
     moved = [joint.name for joint in original.joints if joint.kind != "fixed" and joint.name not in original.grippers]
     model = RobotModel.from_urdf(copy, spheres).moved_by(moved)
-    report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=fixed.COVERED_COARSE)
-    model = model.with_coverage(report)
+    model = model.with_coverage(
+        coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=fixed.COVERED_COARSE)
+    )
     return model, SelfSurfaces(model, solids)
 
 
@@ -241,8 +238,7 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
         raise InputError(f"{model.urdf.path}: expected a way between the waypoints, got none", remedy=REMEDY)
     for choice in reversed(before):
         chosen.insert(0, int(choice[chosen[0]]))
-    waypoints = np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)])
-    return Motion(times=times, waypoints=waypoints)
+    return Motion(times=times, waypoints=np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)]))
 
 
 def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
@@ -331,9 +327,8 @@ def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) 
     is_late = slowed.times[-1] > leg.times[-1]
     if is_late and any(primitive.track is not None for primitive in scene.primitives):
         return np.inf
-    solids: Sequence[Primitive] = scene.primitives
-    if is_late:
-        solids = [replace(primitive, from_ns=ALWAYS[0], to_ns=ALWAYS[1]) for primitive in solids]
+    always = [replace(primitive, from_ns=ALWAYS[0], to_ns=ALWAYS[1]) for primitive in scene.primitives]
+    solids: Sequence[Primitive] = always if is_late else scene.primitives
     seconds = np.linspace(leg.times[0], leg.times[-1], fixed.SIMULATED_SAMPLES)
     positions = np.array([leg.at(second)[0] for second in seconds])
     centers = model.sphere_centers_batch(positions)

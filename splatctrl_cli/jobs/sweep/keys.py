@@ -104,11 +104,11 @@ class Chain:
     def _job(self, stage: Stage, values: Mapping[str, float]) -> Job:
         chosen: dict[str, list[Any]] = {}
         for name, key in self.keys.items():
-            options = options_for(key, is_lockstep="lockstep" in self.stages[-1].options)
-            option = options.get(stage.command)
+            option = options_for(key, is_lockstep="lockstep" in self.stages[-1].options).get(stage.command)
             if option is not None:
-                value = int(values[name]) if key.is_whole else values[name]
-                chosen[option] = [self._given(stage, option, values, value)]
+                chosen[option] = [
+                    self._given(stage, option, values, int(values[name]) if key.is_whole else values[name])
+                ]
         return Job(name=stage.command, command=stage.command, options=stage.options, matrix=chosen)
 
     def _given(self, stage: Stage, option: str, values: Mapping[str, float], value: float) -> Any:
@@ -202,8 +202,10 @@ def _check_inputs(run: RunFolder, places: Sequence[Path]) -> None:
             continue
         files = [file for place in places for file in _named(place, name.removeprefix(CALIBRATION)) if file.is_file()]
         if not any(sha256(file) == digest for file in files):
-            what = f"{files[0]}: has changed since {run.path} was made" if files else f"{run.path}: {name} has moved"
-            raise InputError(what, remedy="put it back as it was, or make the run again and sweep that")
+            raise InputError(
+                f"{files[0]}: has changed since {run.path} was made" if files else f"{run.path}: {name} has moved",
+                remedy="put it back as it was, or make the run again and sweep that",
+            )
 
 
 def _named(place: Path, name: str) -> Iterator[Path]:

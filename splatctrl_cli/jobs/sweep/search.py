@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from scipy.special import ndtri
@@ -83,16 +84,23 @@ def _num_changes(ordered: Mapping[float, str]) -> int:
     return sum(a != b for a, b in itertools.pairwise(is_first))
 
 
-@dataclass(frozen=True, kw_only=True)
-class LeastChange:
-    """Points before and after a flip along one direction, in range shares.
+P = TypeVar("P")
 
-    length: of `first`.
+
+@dataclass(frozen=True, kw_only=True)
+class LeastChange(Generic[P]):
+    """Points before and after a flip along one direction.
+
+    length: root of summed squares of the range shares of `first`.
     """
 
-    last: tuple[float, ...]
-    first: tuple[float, ...]
     length: float
+    last: P
+    first: P
+
+
+Shares = tuple[float, ...]
+"""A point, as a share of each range."""
 
 
 def find_least(
@@ -100,7 +108,7 @@ def find_least(
     alone: Sequence[float | None],
     *,
     tolerance: float,
-) -> LeastChange | None:
+) -> LeastChange[Shares] | None:
     """Find the shortest joint change that flips the outcome of (0, ..., 0), or None.
 
     Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
@@ -109,14 +117,14 @@ def find_least(
     """
     num = len(alone)
     start = judge([(0.0,) * num])[0]
-    best: LeastChange | None = None
-    axes = [(share, k) for k, share in enumerate(alone) if share is not None]
-    if axes:
+    best: LeastChange[Shares] | None = None
+    if axes := [(share, k) for k, share in enumerate(alone) if share is not None]:
         share, k = min(axes)
-        first = tuple(share if each == k else 0.0 for each in range(num))
-        best = LeastChange(last=(0.0,) * num, first=first, length=share)
+        best = LeastChange(
+            last=(0.0,) * num, first=tuple(share if each == k else 0.0 for each in range(num)), length=share
+        )
 
-    def improved(way: np.ndarray, best: LeastChange | None) -> LeastChange | None:
+    def improved(way: np.ndarray, best: LeastChange[Shares] | None) -> LeastChange[Shares] | None:
         length = min(1.0 / way.max(), np.inf if best is None else best.length - tolerance)
         if length <= 0 or judge([_point(way, length)])[0] == start:
             return best
@@ -144,5 +152,5 @@ def _directions(num: int) -> Iterator[np.ndarray]:
         yield way / np.linalg.norm(way)
 
 
-def _point(way: np.ndarray, length: float) -> tuple[float, ...]:
+def _point(way: np.ndarray, length: float) -> Shares:
     return tuple(float(f"{value:.6g}") for value in np.minimum(way * length, 1.0))

@@ -18,7 +18,7 @@ from splatctrl_cli.jobs.batch.suite import Recording, Suite
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, open_run
 from splatctrl_cli.jobs.sweep.keys import Chain, Key, chain_of, key_of
-from splatctrl_cli.jobs.sweep.search import Flip, find_flip, find_least
+from splatctrl_cli.jobs.sweep.search import Flip, LeastChange, find_flip, find_least
 
 FORMAT, VERSION = "splatctrl-sweep", 1
 TOLERANCE = 1 / 64  # of a range
@@ -86,22 +86,13 @@ class KeyFlip:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LeastFlip:
-    """Least joint change found; length: root of summed squares of range shares."""
-
-    length: float
-    last: Tried
-    first: Tried
-
-
-@dataclass(frozen=True, kw_only=True)
 class SweepResult:
     """Content of ``sweep.json``; before: the run's own verdict."""
 
     out: Path
     before: Mapping[str, Any]
     flips: Sequence[KeyFlip]
-    least: LeastFlip | None = None
+    least: LeastChange[Tried] | None = None
     num_runs: int = 0
     num_new: int = 0
 
@@ -229,8 +220,7 @@ class Runs:
         made = {values: self.nodes_at(point) for values, point in new.items()}
         nodes: dict[str, Node] = {}
         for node in (node for each in made.values() for node in each):
-            other = nodes.setdefault(node.name, self.nodes.get(node.name, node))
-            if other.words != node.words:
+            if nodes.setdefault(node.name, self.nodes.get(node.name, node)).words != node.words:
                 raise UsageError(f"two runs are called {node.name}", remedy="vary fewer keys at once")
         assert self.scheduler is not None
         found = self.scheduler.run(list(nodes.values())) if nodes else {}
@@ -249,8 +239,13 @@ class Runs:
         if outcome != Outcome.NOT_EVALUABLE and (last.state in (ERROR, SKIPPED) or not last.outcome):
             wrong = next(run for run in runs if run.state in (ERROR, SKIPPED) or run is last)
             if not wrong.cause and wrong.exit_code in BY_ITS_VALUES:
-                said = f"{wrong.job}: {wrong.sentence}"
-                return Tried(values=dict(values), outcome=REFUSED, label=REFUSED, sentence=said, folder="")
+                return Tried(
+                    values=dict(values),
+                    outcome=REFUSED,
+                    label=REFUSED,
+                    sentence=f"{wrong.job}: {wrong.sentence}",
+                    folder="",
+                )
             raise InputError(
                 f"{_told(values)}: {wrong.job} came to no verdict: {wrong.cause or wrong.sentence}",
                 remedy=f"see {self.out / wrong.log}",
@@ -275,12 +270,11 @@ def _found(
         raise InputError(f"{_told(starts)}: is refused: {start.sentence}", remedy="begin at a value that is not")
     _check_settings(run, open_run(runs.out / start.folder), runs.chain)
     flips = [_alone(name, starts, b, runs, request.tolerance) for name, (_, b) in ranges.items()]
-    least = _together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None
     return SweepResult(
         out=request.out,
         before=run.verdict,
         flips=flips,
-        least=least,
+        least=_together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None,
         num_runs=len(runs.nodes),
         num_new=sum(each.started >= began for each in runs.scheduler.runs.values()) if runs.scheduler else 0,
     )
@@ -337,7 +331,7 @@ def _alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, toler
 
 def _together(
     flips: Sequence[KeyFlip], ranges: Mapping[str, tuple[float, float]], runs: Runs, tolerance: float
-) -> LeastFlip | None:
+) -> LeastChange[Tried] | None:
     def values_at(shares: Sequence[float]) -> dict[str, float]:
         values = {n: a + (b - a) * s for (n, (a, b)), s in zip(ranges.items(), shares, strict=True)}
         return {n: float(round(v)) if runs.chain.keys[n].is_whole else float(f"{v:.6g}") for n, v in values.items()}
@@ -354,7 +348,7 @@ def _together(
     if found is None:
         return None
     last, first = runs.at([values_at(found.last), values_at(found.first)])
-    return LeastFlip(length=float(f"{found.length:.6g}"), last=last, first=first)
+    return LeastChange(length=float(f"{found.length:.6g}"), last=last, first=first)
 
 
 def _write(out: Path, asked: Mapping[str, Any], result: SweepResult | None) -> None:

@@ -3,12 +3,11 @@
 A journal of written frames lets a killed run continue.
 """
 
-import csv
 import hashlib
 import json
 import shutil
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from numpy.lib import format as npy
 
 from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import InputError, UsageError, WriteError
-from splatctrl_cli.files.output import sha256, write_json
+from splatctrl_cli.files.output import sha256, write_json, write_table
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.capture.capture import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
 from splatctrl_cli.recording.log.messages import metres
@@ -212,10 +211,10 @@ def _write_index(
         (folder / ROBOT).write_text(robot, encoding="utf-8", newline="")
         names.append(ROBOT)
     columns = (*COLUMNS, *(name for name in MASKS if any(name in entry.row for entry in journal.entries())))
-    _write_table(folder / "frames.csv", columns, (entry.row for entry in journal.entries()))
+    write_table(folder / "frames.csv", columns, (entry.row for entry in journal.entries()))
     if any(entry.provenance for entry in journal.entries()):
         names.append(PROVENANCE)
-        _write_table(folder / PROVENANCE, PROVENANCE_COLUMNS, (entry.provenance for entry in journal.entries()))
+        write_table(folder / PROVENANCE, PROVENANCE_COLUMNS, (entry.provenance for entry in journal.entries()))
     if topics is not None and topics.topics:
         shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
         header = header | {"joint_topics": write_topics(folder, topics, names.append)}
@@ -239,13 +238,6 @@ def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None
             images = (each for entry in journal.entries() for each in entry.sums)
             its = [(others[place], place)] if place in others else (i for i in images if i[1].startswith(place))
             stream.writelines(f"{digest}  {name}\n" for digest, name in its)
-
-
-def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:

@@ -125,7 +125,7 @@ def bodied(deficit: tuple[float, float], surface: float) -> Any:
     )
     between = {"surface": np.full(NUM, surface), "lower": np.full(NUM - 1, surface)}
     run = judged(model=model, margin=0.02, between=between)
-    run.replay.audit.clearance = {"exact": SimpleNamespace(distance=np.full(NUM, 0.03))}
+    run.replay.audit.clearance = {"exact": np.full(NUM, 0.03)}
     run.threshold = 0.019
     return run
 
@@ -158,9 +158,7 @@ def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:
     there, blank = np.full(NUM, 0.2), np.full(NUM, 0.2)
     blank[3] = np.nan
     for fields in ((there, blank), (blank, there)):
-        run.replay.audit.clearance = {
-            name: SimpleNamespace(distance=of) for name, of in zip("ab", fields, strict=True)
-        }
+        run.replay.audit.clearance = dict(zip("ab", fields, strict=True))
         (reason,) = evidence.judged_time(run)
         assert (reason.outcome, reason.time_s) == (Outcome.NOT_EVALUABLE, pytest.approx(0.3))
 
