@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections.abc import Iterator
+from functools import cache
 
 from tests.conftest import ROOT
 
@@ -14,14 +14,17 @@ NAMES = re.compile(r"`[^`]*`|\b\w+:")  # of code, and of what a docstring explai
 LONGEST = 60  # words of a first paragraph
 
 
-def docstrings() -> Iterator[tuple[str, str]]:
+@cache
+def docstrings() -> list[tuple[str, str]]:
     """Place and text of every docstring of the package."""
+    found = []
     for path in sorted((ROOT / "splatctrl_cli").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
                 text = ast.get_docstring(node)
                 if text:
-                    yield f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}", text
+                    found.append((f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}", text))
+    return found
 
 
 def test_a_docstring_begins_with_a_word_that_carries_it() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from benchmarks.calibration import SetUp, write_log
 from splatctrl_cli.calibration.board import Board, matrix_of
@@ -37,6 +38,14 @@ def views_of(sample_data: Path) -> list[RgbdFrame]:
     """Of a still scene, at their true poses."""
     source = open_to_train(RecordingRequest(path=sample_data / "dtu", is_dtu=True))
     return [record for record in source.records() if isinstance(record, RgbdFrame)]
+
+
+def shrink_refinement(patch: pytest.MonkeyPatch) -> None:
+    """Set smaller images, fewer points and a wider lattice than a calibration has, for speed."""
+    for name, value in {
+        "BEND_GRID": (9, 12), "REFINE_NEIGHBOURS": 4, "REFINE_POINTS": 3000, "REFINE_ROWS": 104
+    }.items():  # fmt: skip
+        patch.setattr(fixed, name, value)
 
 
 def disturbed(views: Sequence[RgbdFrame], millimetres: float, degrees: float) -> list[RgbdFrame]:

@@ -23,7 +23,7 @@ from splatctrl_cli.calibration.pose_refinement import (
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float64, RgbdFrame
-from tests.calibration.scan import a_bend, bent, disturbed, views_of
+from tests.calibration.scan import a_bend, bent, disturbed, shrink_refinement, views_of
 from tests.reference.depth_bend import unbent_depth
 
 
@@ -48,11 +48,7 @@ def noisy(views: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Smaller images, fewer points and a wider lattice than a calibration has, for speed."""
-    for name, value in {
-        "BEND_GRID": (9, 12), "REFINE_NEIGHBOURS": 4, "REFINE_POINTS": 3000, "REFINE_ROWS": 104
-    }.items():  # fmt: skip
-        monkeypatch.setattr(fixed, name, value)
+    shrink_refinement(monkeypatch)
 
 
 def told(views: Sequence[RgbdFrame]) -> FoundBends:

@@ -1,17 +1,29 @@
-"""What replays share."""
+"""What commands and replays share."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from splatctrl_cli.checks import limits
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.jobs.replay import files, inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import Desk, FakeSource, logged
 from tests.recording.log.make_log import messages_of, write_raw
+
+
+@pytest.fixture(scope="package", autouse=True)
+def few_points() -> Iterator[None]:
+    """Compare fewer points between views than usual, which takes a fifth of a small fit."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(limits, "VIEWS_PAIRS", 10)
+        patch.setattr(limits, "VIEWS_POINTS", 400)
+        patch.setattr(limits, "VIEWS_LANDED", 200)
+        yield
 
 
 @pytest.fixture(scope="session")

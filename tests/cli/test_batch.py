@@ -12,15 +12,13 @@ from junitparser import JUnitXml
 from splatctrl_cli.cli import batch
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.jobs.batch import run, task
-from tests.conftest import ROOT
 from tests.recording.log.make_log import LogRecipe, make_log
 
-LOG = ROOT / "sample_data/tabletop/log.mcap"
-SUITE = f"""
+SUITE = """
 name = "two logs"
 [[recordings]]
 name = "good"
-paths = ["{LOG}"]
+paths = ["good.mcap"]
 [[recordings]]
 paths = ["damaged.mcap"]
 [recordings.jobs.info]
@@ -41,12 +39,19 @@ def one_runner() -> Iterator[None]:
     task.stop_runners()
 
 
-def test_a_suite_runs_once_tells_what_was_not_expected_and_lists_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    suite, out = tmp_path / "nightly.toml", tmp_path / "nightly.out"
-    suite.write_text(SUITE)
+@pytest.fixture
+def suite(tmp_path: Path) -> Path:
+    """The file of the suite, with its two logs."""
+    make_log(tmp_path / "good.mcap", LogRecipe(num_frames=3))
     (tmp_path / "damaged.mcap").write_bytes(b"not a log")
+    (tmp_path / "nightly.toml").write_text(SUITE)
+    return tmp_path / "nightly.toml"
+
+
+def test_a_suite_runs_once_tells_what_was_not_expected_and_lists_it(
+    suite: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "nightly.out"
 
     def said(*words: str, code: int) -> tuple[str, str]:
         assert main(["batch", str(suite), *words]) == code
@@ -94,7 +99,7 @@ def test_a_suite_runs_once_tells_what_was_not_expected_and_lists_it(
     ],
 )
 def test_what_cannot_run_is_said_in_a_line(
-    tmp_path: Path,
+    suite: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     words: list[str],
@@ -102,19 +107,16 @@ def test_what_cannot_run_is_said_in_a_line(
     said: str,
 ) -> None:
     monkeypatch.setattr("splatctrl_cli.jobs.batch.batch.CONNECT_S", 0.5)
-    (tmp_path / "suite.toml").write_text(SUITE)
-    (tmp_path / "damaged.mcap").touch()
-    place = [] if words[0].endswith((".toml", ".")) else [str(tmp_path / "suite.toml")]
+    place = [] if words[0].endswith((".toml", ".")) else [str(suite)]
     assert main(["batch", *place, *words]) == code
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
 
 
-def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    suite, junit = tmp_path / "nightly.toml", tmp_path / "nightly.xml"
+def test_ci_is_told_a_suite_for_each_recording(suite: Path, tmp_path: Path) -> None:
+    junit = tmp_path / "nightly.xml"
     suite.write_text(SUITE + "[jobs.scene]\ncommand = 'reconstruct'\nurdf = 'missing.urdf'\n")
     (tmp_path / "missing.urdf").touch()
-    (tmp_path / "damaged.mcap").write_bytes(b"not a log")
     assert main(["batch", str(suite), "--junit", str(junit), "-q", "--workers", "1"]) == 1
     found = {each.name: {case.classname: case for case in each} for each in JUnitXml.fromfile(str(junit))}
     assert set(found) == {"good", "damaged"}
@@ -157,9 +159,10 @@ def test_a_log_that_was_cut_is_named_in_the_table_the_sentence_the_page_and_juni
     assert "passed, damaged" in page and "done, damaged" in page
 
 
-def test_what_a_page_reads_is_the_suite_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    suite, out = tmp_path / "nightly.toml", tmp_path / "nightly.out"
-    (tmp_path / "damaged.mcap").write_bytes(b"not a log")
+def test_what_a_page_reads_is_the_suite_as_it_is(
+    suite: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "nightly.out"
 
     def states(text: str, code: int) -> dict[str, str]:
         suite.write_text(text)
@@ -175,7 +178,7 @@ def test_what_a_page_reads_is_the_suite_as_it_is(tmp_path: Path, capsys: pytest.
     assert main(["batch", str(suite), "--failed", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["nodes"] == []
     jobs = SUITE[SUITE.index("[jobs.info]") :]
-    fewer = states(f'[[recordings]]\nname = "good"\npaths = ["{LOG}"]\n{jobs}', 0)
+    fewer = states(f'[[recordings]]\nname = "good"\npaths = ["good.mcap"]\n{jobs}', 0)
     assert fewer == {"good/info": "done", "good/ingest": "done"}, "what is no longer in the suite is not told"
 
 

@@ -27,8 +27,7 @@ from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
-from tests.calibration.scan import a_bend, bent, disturbed, gains_of, robot_in, views_of
-from tests.cli.conftest import short_sample
+from tests.calibration.scan import a_bend, bent, disturbed, gains_of, robot_in, shrink_refinement, views_of
 from tests.jobs.replay.test_criteria import judged
 from tests.jobs.score.wall import FakeSource
 
@@ -85,6 +84,7 @@ def test_a_view_held_out_is_scored_where_it_was_recorded_and_where_it_belongs(
 def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
     seven: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    shrink_refinement(monkeypatch)
     off = held_out(bent(seven, a_bend(0.05)))
     result = reconstruct(request(off, tmp_path / "scene"))
     bend = result.metrics["depth_bends"]["camera"]
@@ -102,8 +102,9 @@ def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
 
 
 def test_where_a_robot_is_judged_depth_stays_as_it_was_recorded(
-    seven: list[RgbdFrame], tmp_path: Path, plain_arm: Path
+    seven: list[RgbdFrame], tmp_path: Path, plain_arm: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    shrink_refinement(monkeypatch)
     asked = request(bent(seven, a_bend(0.05)), tmp_path / "scene")
     result = reconstruct(replace(asked, **robot_in(plain_arm)))
     assert result.metrics["pose_residual"] > 0
@@ -160,8 +161,6 @@ def test_what_nothing_tells_is_refused(views: list[RgbdFrame], tmp_path: Path) -
     with pytest.raises(InputError, match="depth"):
         reconstruct(request(bare, tmp_path / "scene"))
 
-
-__all__ = ["short_sample"]
 
 SETTINGS = ("scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3")
 FAST = ["--threads", "1", "-q", *(word for setting in SETTINGS for word in ("--set", setting))]

@@ -30,8 +30,8 @@ HELD = (10**9, 2 * 10**9)  # [ns]
 
 
 @pytest.fixture
-def request_(sample_data: Path, tmp_path: Path) -> ReconstructRequest:
-    tabletop = sample_data / "tabletop"
+def request_(short_sample: Path, tmp_path: Path) -> ReconstructRequest:
+    tabletop = short_sample / "tabletop"
     source = open_source(tabletop / "log.mcap", SourceOptions())
     spheres = tabletop / "robot_spheres.yaml"
     return ReconstructRequest(source=source, out=tmp_path / "scene", urdf=tabletop / "robot.urdf", spheres=spheres)
@@ -53,8 +53,8 @@ def holding(robot: RobotModel) -> SelfModel:
     return replace(found, links=tuple(robot.urdf.links), digest=surface_digest(robot.surface))
 
 
-def replayed(request: ReconstructRequest, sample_data: Path, **more: object) -> RobotModel:
-    log = sample_data / "tabletop" / "log.mcap"
+def replayed(request: ReconstructRequest, sample: Path, **more: object) -> RobotModel:
+    log = sample / "tabletop" / "log.mcap"
     asked = ReplayRequest(log=log, out=request.out / "audit", urdf=request.urdf, spheres=request.spheres)
     return open_log(replace(asked, **more))[0]  # type: ignore[arg-type]
 
@@ -65,23 +65,23 @@ def of_primitives(plain_arm: Path) -> dict[str, Path]:
 
 
 def test_what_the_recording_shows_is_kept_and_a_replay_of_the_scene_takes_it(
-    request_: ReconstructRequest, sample_data: Path, plain_arm: Path
+    request_: ReconstructRequest, short_sample: Path, plain_arm: Path
 ) -> None:
     robot, _ = learned(request_)
     assert robot.self_model is not None and (request_.out / SELF_MODEL).is_file()
-    assert replayed(request_, sample_data, scene=request_.out).self_model is not None
-    assert replayed(request_, sample_data, scene=request_.out, self_model=NO_SELF_MODEL).self_model is None
+    assert replayed(request_, short_sample, scene=request_.out).self_model is not None
+    assert replayed(request_, short_sample, scene=request_.out, self_model=NO_SELF_MODEL).self_model is None
     other = of_primitives(plain_arm)
-    assert replayed(request_, sample_data, scene=request_.out, **other).self_model is None
+    assert replayed(request_, short_sample, scene=request_.out, **other).self_model is None
     with pytest.raises(InputError, match="another robot"):
-        replayed(request_, sample_data, self_model=request_.out / SELF_MODEL, **other)
+        replayed(request_, short_sample, self_model=request_.out / SELF_MODEL, **other)
 
 
 def test_in_lockstep_nothing_is_learned_ahead(
-    request_: ReconstructRequest, sample_data: Path, monkeypatch: pytest.MonkeyPatch
+    request_: ReconstructRequest, short_sample: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reconstruct, "learn_from", None)
-    assert replayed(request_, sample_data, lockstep=True).self_model is None
+    assert replayed(request_, short_sample, lockstep=True).self_model is None
 
 
 def test_a_run_that_goes_on_takes_the_file_that_is_there(
