@@ -74,22 +74,22 @@ def test_an_output_of_other_words_is_not_taken_for_this_ones(tmp_path: Path) -> 
     assert not (tmp_path / "a/first").exists()
 
 
-@pytest.mark.parametrize(
-    ("expect", "words", "state"),
-    [
-        ("contact", ("verdict", "failed", "contact", "exit", "1"), DONE),
-        ("failed", ("verdict", "failed", "contact", "exit", "1"), DONE),
-        ("exit 4", ("exit", "4"), DONE),
-        ("passed", (), DONE),
-        ("passed", ("exit", "3"), DONE),
-        ("passed", ("verdict", "not evaluable", "not evaluable", "exit", "5"), FAILED),
-        ("contact", ("verdict", "passed", "safe"), FAILED),
-        ("exit 4", (), FAILED),
-    ],
-)
-def test_an_expected_outcome_is_the_good_one(tmp_path: Path, expect: str, words: tuple[str, ...], state: str) -> None:
-    runs = batch_of(tmp_path, [node(tmp_path, "a/job", *words, expect=expect)])
-    assert states(runs) == {"a/job": state}
+EXPECTED = [
+    ("contact", ("verdict", "failed", "contact", "exit", "1"), DONE),
+    ("failed", ("verdict", "failed", "contact", "exit", "1"), DONE),
+    ("exit 4", ("exit", "4"), DONE),
+    ("passed", (), DONE),
+    ("passed", ("exit", "3"), DONE),
+    ("passed", ("verdict", "not evaluable", "not evaluable", "exit", "5"), FAILED),
+    ("contact", ("verdict", "passed", "safe"), FAILED),
+    ("exit 4", (), FAILED),
+]
+
+
+def test_an_expected_outcome_is_the_good_one(tmp_path: Path) -> None:
+    nodes = [node(tmp_path, f"r{k}/job", *words, expect=expect) for k, (expect, words, _) in enumerate(EXPECTED)]
+    found = states(batch_of(tmp_path, nodes, workers=1))
+    assert found == {f"r{k}/job": state for k, (_, _, state) in enumerate(EXPECTED)}
 
 
 def test_an_expected_error_stands_too(tmp_path: Path) -> None:

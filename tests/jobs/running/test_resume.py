@@ -33,7 +33,7 @@ FAST = [
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "small"
-    size = ["--duration", "1.2", "--width", "128", "--height", "96", "-q"]
+    size = ["--duration", "1.2", "--width", "96", "--height", "72", "-q"]
     assert main(["simulate", "-o", str(folder), *size]) == 0
     return folder
 
@@ -156,7 +156,7 @@ def test_a_killed_process_goes_on_to_the_same_bytes_with_another_number_of_threa
 ) -> None:
     given = command(recording, "log", tmp_path / "scene")
     audit = str(tmp_path / "scene.partial" / "audit.jsonl")
-    for threads, num_rows, number in (("1", 2, signal.SIGKILL), ("4", 4, signal.SIGTERM), ("2", 5, signal.SIGINT)):
+    for threads, num_rows, number in (("1", 2, signal.SIGKILL), ("4", 4, signal.SIGINT)):
         words = [sys.executable, "-c", KILLED, audit, str(num_rows), str(int(number)), *given]
         done = subprocess.run(
             [*words, "--resume", "--threads", threads], capture_output=True, text=True, check=False, timeout=120
@@ -219,9 +219,8 @@ def test_a_run_goes_on_only_as_what_it_was(
         given[given.index("--urdf") + 1] = str(other)
         changed = []
     elif changed == ["LOG"]:
-        assert (
-            main(["simulate", "-o", str(tmp_path / "b"), "--duration", "1", "--width", "64", "--height", "48"]) == 0
-        )
+        few = ["--duration", "0.6", "--width", "64", "--height", "48"]
+        assert main(["simulate", "-o", str(tmp_path / "b"), *few]) == 0
         given[1], changed = str(tmp_path / "b" / "log.mcap"), []
         capsys.readouterr()
     assert main([*given, *changed, "--resume"]) == 2
@@ -254,7 +253,6 @@ def test_resume_without_anything_to_go_on_from_starts_at_the_beginning(
     [
         (["scene.snapshot_every=2"], [0, 2, 4]),
         (["scene.snapshot_period=0.5"], [0, 3, 5]),
-        (["scene.snapshot_period=100"], [0]),
         (["scene.snapshot_every=3", "scene.snapshot_period=0.3"], [0, 3, 5]),
     ],
 )
