@@ -6,7 +6,6 @@ Jobs and requests are in `splatctrl_cli.api`; these names may change with a mino
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
 from splatctrl_cli.config.fixed import START_ROOM
 from splatctrl_cli.config.ranges import checked_pose
-from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audit
 from splatctrl_cli.control.barriers import SceneStep, rate_of
 from splatctrl_cli.control.events import runs_of
@@ -99,6 +98,7 @@ from splatctrl_cli.records import (
 from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
+from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.fitter import SceneFitter
@@ -130,7 +130,6 @@ __all__ = [
     "START_NS",
     "START_ROOM",
     "SURFACE_SCANS",
-    "ArmModel",
     "AuditRow",
     "Baker",
     "Ball",

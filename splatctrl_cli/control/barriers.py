@@ -8,13 +8,14 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import BRAKING_SHARE, IMMOVABLE_ROW, SURFACE_STEP
-from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.limits import braking_speed
 from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import sphere_names
 
 MARGIN = "margin"
 
@@ -28,7 +29,7 @@ class SceneRows(BarrierTerm):
     kind = RowKind.SCENE
 
     def __init__(
-        self, model: ArmModel, config: ControlConfig, field: DistanceField, acceleration: Float64 | None
+        self, model: RobotModel, config: ControlConfig, field: DistanceField, acceleration: Float64 | None
     ) -> None:
         """acceleration (J,) [rad/s^2]: of braking; None: joints stop at once."""
         self._model, self._config, self._field, self._acceleration = model, config, field, acceleration
@@ -118,7 +119,7 @@ class SelfRows(BarrierTerm):
 
     kind = RowKind.SELF
 
-    def __init__(self, model: ArmModel, config: ControlConfig, acceleration: Float64 | None) -> None:
+    def __init__(self, model: RobotModel, config: ControlConfig, acceleration: Float64 | None) -> None:
         """acceleration as for `SceneRows`."""
         self._config, self._acceleration = config, acceleration
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
@@ -164,7 +165,7 @@ class SelfRows(BarrierTerm):
         return pair_gaps(centers, self._radii, self._pairs)[0]
 
 
-def scene_margin(model: ArmModel, config: ControlConfig) -> Float64:
+def scene_margin(model: RobotModel, config: ControlConfig) -> Float64:
     """Return spheres' scene margins (S,) [m]: epsilon, plus deficits if `config.coverage` is "margin".
 
     The surface is within that deficit of a sphere, so by the triangle inequality it keeps epsilon for any 1-Lipschitz
@@ -256,7 +257,7 @@ def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> floa
 
 
 def rate_of(
-    config: ControlConfig, model: ArmModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
+    config: ControlConfig, model: RobotModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
 ) -> float | Float64:
     """Return the configured dd/dt of the moving spheres at a posture (J,) and stamp."""
     step = None if scene_step_at is None or config.distance_rate == "none" else scene_step_at(stamp_ns)

@@ -8,9 +8,9 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import ENCODER, MOTION_WINDOW
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Float64, Index, Stamps
+from splatctrl_cli.robot.model import RobotModel
 
 Rows = tuple[Float64, Float64]
 FR3 = "fr3"
@@ -107,7 +107,7 @@ class JointLimits:
     by_position: VelocityLimits | None = None
 
     @classmethod
-    def of(cls, model: ArmModel, config: ControlConfig) -> "JointLimits":
+    def of(cls, model: RobotModel, config: ControlConfig) -> "JointLimits":
         """Return an arm's configured limits.
 
         Raises UsageError for a wrong number of accelerations, or for other joints than an FR3's with its limits.

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.line_process import Fault, LineProcess, Misbehaved, shown
 from splatctrl_cli.control.step import ControlStep, Moment, QpIkController, View
@@ -24,6 +23,7 @@ from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.control.user_controller import PROTOCOL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
 
 STEP_LIMIT = 10.0  # [s] for one answer, also on a busy machine
 PATIENCE = 3.0  # times that limit, after which waiting ends
@@ -116,7 +116,7 @@ class OutsideController(AbstractContextManager["OutsideController"]):
         self,
         name: str,
         command: Sequence[str],
-        model: ArmModel,
+        model: RobotModel,
         config: ControlConfig,
         *,
         frame: str,
@@ -185,7 +185,7 @@ def class_command(target: str) -> tuple[str, ...]:
     return sys.executable, "-P", "-c", SERVE, target
 
 
-def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) -> Document:
+def _start(model: RobotModel, config: ControlConfig, frame: str, home: Float64) -> Document:
     """First line; see `ControllerStart`."""
     acceleration = JointLimits.of(model, config).acceleration
     return {
@@ -202,7 +202,7 @@ def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) ->
     }
 
 
-def _question(model: ArmModel, frame: str, moment: Moment, view: View) -> Document:
+def _question(model: RobotModel, frame: str, moment: Moment, view: View) -> Document:
     """Line of a step; see `ControllerInput`."""
     guide = moment.guide
     return {

@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction
 from splatctrl_cli.control.barriers import SceneStepAt, rate_of, scene_margin
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
@@ -23,6 +22,7 @@ from splatctrl_cli.control.preconditions import (
 )
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController
 from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
+from splatctrl_cli.robot.model import RobotModel
 
 FieldAt = Callable[[int], DistanceField]
 
@@ -150,7 +150,7 @@ class InMemory:
 
 
 def closed_loop(
-    model: ArmModel,
+    model: RobotModel,
     config: ControlConfig,
     task: ReplayTask,
     field_at: FieldAt,
@@ -235,7 +235,7 @@ class _Course:
     """Goals by step: waypoints in order, or the logged motion."""
 
     def __init__(
-        self, model: ArmModel, config: ControlConfig, task: ReplayTask, plan_detour: PlanDetour | None
+        self, model: RobotModel, config: ControlConfig, task: ReplayTask, plan_detour: PlanDetour | None
     ) -> None:
         self._model, self._config, self._task, self._plan_detour = model, config, task, plan_detour
         self._waypoints = (*task.via, Waypoint(T_world_goal=task.T_world_goal, posture=None))
@@ -307,7 +307,7 @@ class _Course:
 
 
 def divergence(
-    model: ArmModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
+    model: RobotModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
 ) -> tuple[Float64, Float64, Float64]:
     """Return distances of T postures (T, J) from those logged at their stamps.
 
@@ -329,7 +329,7 @@ def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:
 
 
 def scene_change(
-    model: ArmModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField
+    model: RobotModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField
 ) -> SceneChange:
     """Return how a newer scene changes the clearance at q (J,)."""
     moving = np.asarray(model.moving_spheres)

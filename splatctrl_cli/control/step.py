@@ -9,7 +9,6 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MULTIPLIER, STEP_SCALES, WITHIN_SHARE
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
@@ -29,6 +28,7 @@ from splatctrl_cli.control.terms import (
     summed,
 )
 from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.robot.model import RobotModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ class QpIkController:
 
     def __init__(
         self,
-        model: ArmModel,
+        model: RobotModel,
         config: ControlConfig,
         field: DistanceField,
         *,

@@ -9,11 +9,12 @@ from typing import Protocol
 import numpy as np
 
 from splatctrl_cli.config.fixed import SHORTEST_EDGE, STILL_ROW
-from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.kernels.chain import EdgeRoom
 from splatctrl_cli.planner.solid_scene import Solids
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import sphere_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +43,7 @@ class Clearance:
     `lipschitz` scales its rows). compiled: kernel for edges among `Solids`, None without a chain.
     """
 
-    model: ArmModel
+    model: RobotModel
     scene: HasDistance
     taken: Float64
     moving: Integers
@@ -54,7 +55,7 @@ class Clearance:
     @classmethod
     def of(
         cls,
-        model: ArmModel,
+        model: RobotModel,
         scene: HasDistance,
         *,
         margin: float | Float64 = 0.0,

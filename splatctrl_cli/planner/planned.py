@@ -11,7 +11,6 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import Detour, PlanDetour, TimedPath, pose_error
 from splatctrl_cli.control.replay import ReplayTask
@@ -19,6 +18,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.planner.birrt import Plan, PlanOutcome, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, check_edges
 from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
 
 
 def resampled(waypoints: Float64, spacing: float) -> Float64:
@@ -31,7 +31,7 @@ def resampled(waypoints: Float64, spacing: float) -> Float64:
 
 
 def effector_rates(
-    model: ArmModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
+    model: RobotModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
     """Return edge shares per second (W - 1,) within a frame's speeds [m/s], [rad/s].
 
@@ -98,7 +98,7 @@ class PlannedPath:
 
 
 def planned_path(
-    model: ArmModel,
+    model: RobotModel,
     scene: HasDistance,
     task: ReplayTask,
     planner: PlannerConfig,
@@ -208,7 +208,7 @@ def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlCo
 
 
 def planned_detours(
-    model: ArmModel,
+    model: RobotModel,
     scene_at: Callable[[int], HasDistance],
     frame: str,
     planner: PlannerConfig,
@@ -227,7 +227,7 @@ def planned_detours(
 
 
 def goal_postures(
-    model: ArmModel, frame: str, T_world_goal: Float64, guesses: Float64, config: ControlConfig, *, at_most: int
+    model: RobotModel, frame: str, T_world_goal: Float64, guesses: Float64, config: ControlConfig, *, at_most: int
 ) -> Float64:
     """Return distinct postures (G, J) within limits that bring `frame` to a pose.
 
@@ -244,7 +244,7 @@ def goal_postures(
 
 
 def _solved(
-    model: ArmModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
+    model: RobotModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
 ) -> Float64 | None:
     """Levenberg's method with steps clipped at the limits; None without convergence."""
     scale = 1.0 / np.repeat([fixed.GOAL_SHARE * config.goal_position, fixed.GOAL_SHARE * config.goal_rotation], 3)

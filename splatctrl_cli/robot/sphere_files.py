@@ -263,3 +263,13 @@ def _sphere(where: str, sphere: Any) -> list[float]:
             f"{where}: expected {{center: [x, y, z], radius: r}}, got {sphere!r}", remedy="finite, in metres"
         )
     return row
+
+
+def sphere_names(spheres: SphereSet) -> tuple[str, ...]:
+    """Return each sphere's link and number on it: ``panda_hand[2]``."""
+    seen: dict[str, int] = {}
+    names = []
+    for link in spheres.links:
+        seen[link] = seen.get(link, -1) + 1
+        names.append(f"{link}[{seen[link]}]")
+    return tuple(names)

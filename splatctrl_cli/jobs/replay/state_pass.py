@@ -8,7 +8,6 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
-from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import (
     AuditTrace,
     Between,
@@ -41,6 +40,7 @@ from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
+from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.voxels import EvidenceClass
 
 KINDS = len(EvidenceClass)
