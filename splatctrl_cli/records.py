@@ -157,8 +157,7 @@ class LossReport:
     def plus(self, other: "LossReport", notes: list[str], sign: int = 1) -> "LossReport":
         """Return the sum of both counts (sign -1: the difference), with these notes."""
         names = [column.name for column in fields(self) if column.name != "notes"]
-        counts = {name: getattr(self, name) + sign * getattr(other, name) for name in names}
-        return LossReport(**counts, notes=notes)
+        return LossReport(**{name: getattr(self, name) + sign * getattr(other, name) for name in names}, notes=notes)
 
 
 class RecordSource(Protocol):

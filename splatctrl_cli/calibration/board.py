@@ -133,8 +133,7 @@ def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
         window = int(np.clip(edge / 4, 2, 10))
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
         start = np.ascontiguousarray(pixels.reshape(-1, 1, 2), np.float32)
-        refined = cv2.cornerSubPix(gray, start, (window, window), (-1, -1), stop)
-        return np.asarray(refined, np.float64).reshape(-1, 2)
+        return np.asarray(cv2.cornerSubPix(gray, start, (window, window), (-1, -1), stop), np.float64).reshape(-1, 2)
     return None
 
 
@@ -379,5 +378,4 @@ def middle_pose(poses: Sequence[Float64]) -> Float64:
     few = np.array(spread(poses, 100))
     moves = np.linalg.norm(few[:, None, :3, 3] - few[None, :, :3, 3], axis=2)
     cosines = (np.einsum("iab,jab->ij", few[:, :3, :3], few[:, :3, :3]) - 1) / 2
-    away = moves + 0.3 * np.arccos(np.clip(cosines, -1, 1))
-    return np.asarray(few[int(np.argmin(away.sum(axis=1)))])
+    return np.asarray(few[int(np.argmin((moves + 0.3 * np.arccos(np.clip(cosines, -1, 1))).sum(axis=1)))])

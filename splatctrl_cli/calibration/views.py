@@ -140,8 +140,7 @@ def overlap_rows(
     points (K, 3): of the other view, at T (4, 4); which (K,): those that land (`landed`).
     """
     there, normal = transform_points(T, points[which]), normals[which]
-    residual = np.einsum("ki,ki->k", there - surface[which], normal)
-    return residual, by_twists(points[which], there, normal, T)
+    return np.einsum("ki,ki->k", there - surface[which], normal), by_twists(points[which], there, normal, T)
 
 
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:

@@ -217,8 +217,7 @@ def _inverse(poses: Float64) -> Float64:
 
 def _spread(poses: Float64, logged: Float64) -> Spread:
     position = np.linalg.norm(poses[:, :3, 3] - logged[:, :3, 3], axis=1)
-    relative = np.swapaxes(poses[:, :3, :3], 1, 2) @ logged[:, :3, :3]
-    rotation = np.array([_angle(R) for R in relative])
+    rotation = np.array([_angle(R) for R in np.swapaxes(poses[:, :3, :3], 1, 2) @ logged[:, :3, :3]])
     return Spread(
         median_position=float(np.median(position)),
         max_position=float(position.max()),

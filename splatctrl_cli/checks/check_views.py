@@ -321,8 +321,7 @@ def _fitting(
     num_fit = num = 0
     for i, j in pairs:
         a, b = views[i], views[j]
-        scales = [scale if view.camera in cameras else 1.0 for view in (a, b)]
-        off, depth = _distances(a, b, *scales)
+        off, depth = _distances(a, b, *[scale if view.camera in cameras else 1.0 for view in (a, b)])
         num_fit += int((off < limits.VIEWS_FIT * share * depth).sum())
         num += len(off)
     return num_fit, num

@@ -106,8 +106,7 @@ def moving_clearance(
     distance, _ = part_clearances(model, positions, distance_to, centers)
     moving = np.flatnonzero(model.moving_spheres)
     nearest = np.argmin(distance, axis=1)
-    least = Clearance(distance=distance[np.arange(len(distance)), nearest], sphere=moving[nearest])
-    return least, distance
+    return Clearance(distance=distance[np.arange(len(distance)), nearest], sphere=moving[nearest]), distance
 
 
 def audit(
@@ -172,8 +171,7 @@ def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]
 def _self_clearance(model: RobotModel, centers: Float64) -> Clearance:
     pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
     if not len(pairs):
-        nothing = np.full(len(centers), -1, dtype=np.int64)
-        return Clearance(distance=np.full(len(centers), np.inf), sphere=nothing)
+        return Clearance(distance=np.full(len(centers), np.inf), sphere=np.full(len(centers), -1, dtype=np.int64))
     distance = np.array([pair_gaps(c, model.sphere_set.radii, pairs)[0] for c in centers])
     nearest = distance.argmin(axis=1)
     return Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=nearest)

@@ -57,8 +57,7 @@ class SceneRows(BarrierTerm):
             return distance
         postures = q[None] if G is None else q + SURFACE_STEP * np.eye(len(q) + 1, len(q), -1)
         links = set(self._links[chosen].tolist())
-        gaps = self._model.surface_gaps(postures, self._balls.centers, self._balls.radii, links)
-        for link, gap in gaps.items():
+        for link, gap in self._model.surface_gaps(postures, self._balls.centers, self._balls.radii, links).items():
             raised = gap[0] + self.margin - self._config.margin
             is_raised = chosen & (self._links == link) & (raised > distance)
             distance = np.where(is_raised, raised, distance)
@@ -201,8 +200,7 @@ def external_gradient(gradient: Float64, jacobians: Float64) -> Float64:
 
 def pair_gradient(direction: Float64, jacobians: Float64, pairs: Integers) -> Float64:
     """Return ``dd/dq`` (P, J) of sphere pairs; jacobians (S, 3, J)."""
-    relative = jacobians[pairs[:, 0]] - jacobians[pairs[:, 1]]
-    return np.asarray(np.matmul(direction[:, None, :], relative)[:, 0, :])
+    return np.asarray(np.matmul(direction[:, None, :], jacobians[pairs[:, 0]] - jacobians[pairs[:, 1]])[:, 0, :])
 
 
 def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, rate: float | Float64 = 0.0) -> Float64:

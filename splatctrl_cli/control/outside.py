@@ -59,8 +59,7 @@ class Program(LineProcess):
                 f"{name}: cannot be started: {reason}", remedy="check its path, and that it may be executed"
             ) from None
         try:
-            limit = max(START_LIMIT, step_limit)
-            version = _document(self.exchange(_line(start), limit)).get("protocol")
+            version = _document(self.exchange(_line(start), max(START_LIMIT, step_limit))).get("protocol")
             if version != PROTOCOL:
                 raise Misbehaved(Fault.OTHER_PROTOCOL, f"expected protocol {PROTOCOL}, got {shown(repr(version))}")
         except Misbehaved as error:

@@ -54,8 +54,7 @@ class Rows:
 
     @property
     def for_qp(self) -> tuple[Barrier, ...]:
-        ends = np.cumsum([len(barrier) for barrier in self.barriers])[:-1]
-        parts = np.split(self.in_qp, ends)
+        parts = np.split(self.in_qp, np.cumsum([len(barrier) for barrier in self.barriers])[:-1])
         rows = tuple(barrier.select(part) for barrier, part in zip(self.barriers, parts, strict=True))
         return rows if self.cuts is None else (*rows, self.cuts)
 

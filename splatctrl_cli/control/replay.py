@@ -342,5 +342,4 @@ def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
     num_back = round(config.stall_time / config.period)
     if len(positions) <= num_back:
         return False
-    moved = np.max(np.abs(positions[-1] - positions[-1 - num_back]))
-    return bool(moved < config.stall_speed * config.stall_time)
+    return bool(np.max(np.abs(positions[-1] - positions[-1 - num_back])) < config.stall_speed * config.stall_time)

@@ -289,8 +289,7 @@ class QpIkController:
         """True for spheres (M,) with relaxed rows whose links' surfaces are farther away."""
         distance, scene = rows.external.distance, self._builder.scene
         has_given_way = rows.spread(choice.slack)[: len(distance)] > self._config.slack_tolerance
-        raised = scene.by_surfaces(state.q, distance, has_given_way & ~state.by_surface)
-        return np.asarray(raised > distance)
+        return np.asarray(scene.by_surfaces(state.q, distance, has_given_way & ~state.by_surface) > distance)
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
         """True for rows (M,) whose `later` distance, a period on, breaks their promise.
@@ -317,8 +316,7 @@ class QpIkController:
             return 0.0
         for scale in STEP_SCALES:
             q = state.q + self._config.period * _blend(choice.velocity, rest, scale)
-            later = self._builder.distances(q, state.by_surface)
-            if not np.any(self._broken(choice, rows, later)):
+            if not np.any(self._broken(choice, rows, self._builder.distances(q, state.by_surface))):
                 return scale
         return 0.0
 

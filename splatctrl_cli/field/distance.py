@@ -42,8 +42,7 @@ class SphereField:
     def nearest(self, points: Float64) -> NDArray[np.int64]:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the distance."""
         local = self.spheres.relative(checked_points(points))
-        entry = native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]
-        return self.spheres.source[entry]
+        return self.spheres.source[native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]]
 
 
 class LogSumExpField(ABC):
@@ -320,5 +319,4 @@ def device_field(
     chosen = KERNEL_OF[config.distance]
     choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
     terms = {name: field.terms() for name, field in kernels.items()}
-    radii = spheres.offsets(spheres.radii)
-    return DeviceField(device, spheres.clusters, radii, terms, choice)
+    return DeviceField(device, spheres.clusters, spheres.offsets(spheres.radii), terms, choice)

@@ -89,8 +89,7 @@ def median_spacing(centers: Floats) -> float:
     if len(centers) < 2:
         return 0.0
     points = np.asarray(centers, dtype=np.float64)
-    distance = np.asarray(cKDTree(points).query(points, k=2)[0])
-    return float(np.median(distance[:, 1]))
+    return float(np.median(np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1]))
 
 
 def planar_zero_level(radius: float, length: float) -> float:

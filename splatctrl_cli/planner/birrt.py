@@ -257,8 +257,7 @@ def _over_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) 
 def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float64:
     places = np.sort(_places(path, random.random((num, 2))), axis=1)
     places = places[np.floor(places[:, 0]) < np.floor(places[:, 1])]
-    along = _lengths(path)
-    way = np.interp(places, np.arange(len(path)), along)
+    way = np.interp(places, np.arange(len(path)), _lengths(path))
     saved = way[:, 1] - way[:, 0] - np.linalg.norm(_points(path, places[:, 1]) - _points(path, places[:, 0]), axis=1)
     order = np.argsort(-saved, kind="stable")
     return np.asarray(places[order[saved[order] > SHORTCUT_WORTH]])

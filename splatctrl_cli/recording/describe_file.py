@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.formats.grid.grid_format import json_value
@@ -60,7 +60,7 @@ def _ply(path: Path, head: bytes) -> Summary:
 
 
 def _npz(path: Path, _head: bytes) -> Summary:
-    try:
+    with refuse_faults(f"{path}: not a readable .npz", *DAMAGE, OSError, remedy="the file is damaged"):
         with zipfile.ZipFile(path) as archive:
             arrays = {n: _npy_header(archive, n) for n in archive.namelist() if n.endswith(".npy")}
         if not arrays:
@@ -74,8 +74,6 @@ def _npz(path: Path, _head: bytes) -> Summary:
             name: json_value(str(array)) if array.dtype.kind in "US" else array.tolist()
             for name, array in read_arrays(path, short, most=1 << 24).items()
         }
-    except (*DAMAGE, OSError) as error:
-        raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
     rows = [
         [name.removesuffix(".npy"), "x".join(map(str, shape)) or "-", str(dtype)]
         for name, (shape, dtype) in arrays.items()
@@ -149,10 +147,8 @@ def _json(path: Path, _head: bytes) -> Summary:
 def _rows(path: Path, _head: bytes) -> Summary:
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     if path.suffix == ".jsonl":
-        try:
+        with refuse_faults(f"{path}: the first line is not JSON", ValueError, remedy="the file is damaged"):
             first = json.loads(lines[0])
-        except ValueError as error:
-            raise InputError(f"{path}: the first line is not JSON: {error}", remedy="the file is damaged") from None
         return Summary(path=str(path), kind="JSON lines", facts={"rows": len(lines), "keys": list(first)})
     return Summary(path=str(path), kind="CSV", facts={"rows": len(lines) - 1, "columns": lines[0].split(",")})
 

@@ -230,8 +230,7 @@ def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
     for part in [*parts, *([is_open] if is_open.any() else [])]:
         used, inverse = np.unique(mesh.faces[part], return_inverse=True)
         local = inverse.reshape(-1, 3).astype(np.int64)
-        is_closed = _is_closed(local)
-        pieces.append(replace(mesh, vertices=mesh.vertices[used], faces=local, is_closed=is_closed))
+        pieces.append(replace(mesh, vertices=mesh.vertices[used], faces=local, is_closed=_is_closed(local)))
     return pieces
 
 
@@ -248,8 +247,7 @@ def _hull(vertices: Float64) -> TriangleMesh | None:
     except QhullError:
         return None
     faces = hull.simplices.astype(np.int64)
-    normal = face_normals(vertices[faces])
-    is_inward = np.einsum("fa,fa->f", normal, hull.equations[:, :3]) < 0
+    is_inward = np.einsum("fa,fa->f", face_normals(vertices[faces]), hull.equations[:, :3]) < 0
     faces[is_inward] = faces[is_inward][:, ::-1]
     return TriangleMesh(vertices=vertices, faces=faces, is_closed=True)
 
@@ -257,8 +255,7 @@ def _hull(vertices: Float64) -> TriangleMesh | None:
 def _box(size: Float64) -> tuple[Float64, Index]:
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    faces = [face for a, b, c, d in quads for face in ([a, b, c], [a, c, d])]
-    return corners, np.array(faces, dtype=np.int64)
+    return corners, np.array([face for a, b, c, d in quads for face in ([a, b, c], [a, c, d])], dtype=np.int64)
 
 
 def _prism(radius: float, length: float) -> tuple[Float64, Index]:
@@ -284,8 +281,7 @@ def _prism(radius: float, length: float) -> tuple[Float64, Index]:
 def _unit_ball() -> tuple[Float64, Index, float]:
     """A polyhedron inside the unit sphere, and its largest distance from it."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
-    corners = axes[np.array(faces)]
+    corners = axes[np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])]
     for _ in range(SPHERE_ROUNDS):
         a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
         ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))

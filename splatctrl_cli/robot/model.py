@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Box, Float64, Floats, Index, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
@@ -106,10 +106,8 @@ class RobotModel:
         with their mimics. packages: folders for ``package://``, before those above the URDF. Raises InputError.
         """
         file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
-        try:
+        with refuse_faults(f"{file.path}: not a URDF that can be built", ValueError, RuntimeError):
             model = pinocchio.buildModelFromXML(file.text)
-        except (ValueError, RuntimeError) as error:
-            raise InputError(f"{file.path}: not a URDF that can be built: {error}") from None
         model = _without(model, file.with_followers(locked or {}), file.path)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
@@ -400,8 +398,7 @@ class RobotModel:
     def _moved(self) -> Bool:
         """Spheres on the base, or centred on their only axes, never move."""
         postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
-        gain = [np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures]
-        return np.asarray(np.max(gain, axis=0) > 1e-9)
+        return np.asarray(np.max([np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures], axis=0) > 1e-9)
 
     def _lever_arms(self) -> Float64:
         length = np.zeros(self.num_joints + 1)

@@ -73,8 +73,8 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
     names = {link: link for link in urdf.links}
     asked = spheres.links
     if are_links_renamed(spheres, urdf):
-        names = {_without_prefix(link): link for link in urdf.links}
-        asked = tuple(_without_prefix(link) for link in asked)
+        names = {link.partition("_")[2] or link: link for link in urdf.links}
+        asked = tuple(link.partition("_")[2] or link for link in asked)
     kept = [index for index, link in enumerate(asked) if link in names]
     if asked and not kept:
         raise InputError(
@@ -83,17 +83,12 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
     matched = SphereSet(
         links=tuple(names[asked[index]] for index in kept), centers=spheres.centers[kept], radii=spheres.radii[kept]
     )
-    left_out = {spheres.links[index] for index, link in enumerate(asked) if link not in names}
-    return matched, tuple(sorted(left_out))
+    return matched, tuple(sorted({spheres.links[index] for index, link in enumerate(asked) if link not in names}))
 
 
 def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:
     """True if the two have no link name in common."""
     return not set(spheres.links) & set(urdf.links)
-
-
-def _without_prefix(link: str) -> str:
-    return link.partition("_")[2] or link
 
 
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:

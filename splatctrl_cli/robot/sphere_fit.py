@@ -117,8 +117,7 @@ class _Link:
         self._seed = (options.seed, index)
         self._parts = parts
         self._distance = SolidDistance(parts)
-        surface = np.concatenate([part.surface.corners for part in parts])
-        area = float(areas(surface).sum())
+        area = float(areas(np.concatenate([part.surface.corners for part in parts])).sum())
         if not area > 0:
             raise InputError(f"link '{name}': expected a collision surface, got none of any area")
         longest = max(FIT_MIN_PATCH, 2 * float(np.sqrt(area / options.num_patches)))

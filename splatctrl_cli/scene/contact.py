@@ -94,5 +94,4 @@ def hidden_objects(
         return np.zeros(0, np.intp)
     slots = np.flatnonzero(buffer.is_alive & (buffer.labels != Label.ROBOT))
     slots = slots[robot.distance(buffer.centers[slots]) < ROBOT_REACH]
-    is_hidden = shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT
-    return np.asarray(slots[is_hidden], np.intp)
+    return np.asarray(slots[shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT], np.intp)

@@ -114,8 +114,7 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
 
 def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
     """Mask with contradicted depth marked."""
-    pixels = found.pixels(mask.kinds.shape)
-    return replace(mask, kinds=np.where(pixels, np.uint8(PixelKind.CONTRADICTED), mask.kinds))
+    return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
 
 def _side(frame: RgbdFrame) -> int:
@@ -125,8 +124,7 @@ def _side(frame: RgbdFrame) -> int:
 def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
     """Pixels (h, w, side^2) of an image's blocks, without incomplete ones at its ends."""
     h, w = (size // side for size in image.shape)
-    parts = image[: h * side, : w * side].reshape(h, side, w, side)
-    return parts.swapaxes(1, 2).reshape(h, w, side * side)
+    return image[: h * side, : w * side].reshape(h, side, w, side).swapaxes(1, 2).reshape(h, w, side * side)
 
 
 def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:

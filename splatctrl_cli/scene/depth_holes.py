@@ -42,12 +42,8 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     if not holes.any():
         return iter(())
     behind = _nearest_depth(frame.depth)
-    width = _voxel_width(frame, behind[holes], config)
+    width = config.voxel * frame.intrinsics.fx / float(np.median(behind[holes]))
     return _on_rays(frame, _wide(holes, NARROW_HOLE * width), behind, max(int(width), 1), config)
-
-
-def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:
-    return config.voxel * frame.intrinsics.fx / float(np.median(depths))
 
 
 def _wide(pixels: Bool, width: float) -> Bool:

@@ -195,8 +195,7 @@ class SceneFitter:
             progress(num_iterations * (block + 1) // REFINE_BLOCKS)
         removed = dict(self.refined.removed)
         masks = [object_mask(view.frame) for view in views]
-        filled = self.refined.filled + self._fill_gaps(views, masks, removed)
-        return self._audit(views, filled, removed, {})
+        return self._audit(views, self.refined.filled + self._fill_gaps(views, masks, removed), removed, {})
 
     def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
         rng = np.random.default_rng([self.seed, self.num_steps, 1 + block])
@@ -252,8 +251,7 @@ class SceneFitter:
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
         """Frame as the optimiser takes it; mask: of a robot in it."""
-        min_range = self.occupancy.config.min_range
-        mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
+        mappable = inside_workspace(frame, world_points(frame), self.workspace, self.occupancy.config.min_range)
         reach = NEAREST_REACH * (self.config.scale or 1.0)
         is_robot = None if mask is None else mask.kinds == PixelKind.ROBOT
         return make_view(frame, mappable, self.mounted.get(frame.camera), is_robot=is_robot, reach=reach)

@@ -42,8 +42,7 @@ def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Fil
     opacities = np.where(buffer.is_alive, buffer.opacities, 0.0).astype(np.float64)
     sources = clone_sources(opacities, num_clones, rng)
     count = 1 + np.bincount(sources, minlength=len(opacities))
-    shapes = clone_shape(opacities, buffer.radii.astype(np.float64), count)
-    return Filled(relocated=buffer.copy(sources, *shapes))
+    return Filled(relocated=buffer.copy(sources, *clone_shape(opacities, buffer.radii.astype(np.float64), count)))
 
 
 @dataclass(frozen=True, kw_only=True)

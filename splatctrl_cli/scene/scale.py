@@ -74,7 +74,7 @@ def depth_noise(images: Sequence[Float32]) -> float:
 def _linear_noise(images: Sequence[Float32], times: int) -> float:
     left: list[Float64] = []
     for depth in images:
-        side = times * _block_side(depth)
+        side = times * int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
         rows, columns = (size // side for size in depth.shape)
         blocks = depth[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
         pixels = blocks.reshape(-1, side * side)
@@ -85,11 +85,6 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
         left.append(np.sqrt(np.sum(residual**2, axis=1) / (side * side - 3)))
     found = np.concatenate(left) if left else np.zeros(0)
     return float(np.quantile(found, NOISE_QUANTILE)) if len(found) >= NOISE_FEWEST else 0.0
-
-
-def _block_side(depth: Float32) -> int:
-    """Side of a block [px]: 1 / `NOISE_BLOCKS` of the width, at least `NOISE_LEAST_SIDE`: neighbours share noise."""
-    return int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
 
 
 def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:

@@ -102,8 +102,7 @@ def slim(shape: Capsule | Block) -> tuple[Capsule | Block, ...]:
         x, y, z = (size - 2 * GAP for size in shape.size)
         return (Block(middle=shape.middle, size=(x, y, z)),)
     start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
-    length = float(np.linalg.norm(end - start))
-    if length < LONG:
+    if float(np.linalg.norm(end - start)) < LONG:
         return (Capsule(start=shape.start, end=shape.end, radius=shape.radius - GAP),)
     low, high = (start + share * (end - start) for share in (BULGE, 1 - BULGE))
     return (

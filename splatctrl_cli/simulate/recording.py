@@ -184,8 +184,7 @@ class Recording:
         """world -> camN_link -> camN_optical_frame, and world -> the arm's root link."""
         transforms: list[Transform] = [("world", self.robot.urdf.links[0], self.robot.T_world_base)]
         for camera in self.cameras:
-            T_world_link = camera.T_world_camera @ OPTICAL_FROM_LINK.T
-            transforms.append(("world", f"{camera.name}_link", T_world_link))
+            transforms.append(("world", f"{camera.name}_link", camera.T_world_camera @ OPTICAL_FROM_LINK.T))
             transforms.append((f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK))
         return transforms
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.records import DistanceGrid, Float64, Values
@@ -82,10 +82,8 @@ def header_text(grid: DistanceGrid) -> str:
 
 def parse_header(name: str, text: str) -> dict[str, object]:
     """Parse a header. Raises InputError naming `name` if invalid or of another version."""
-    try:
+    with refuse_faults(f"{name}: header: not JSON", json.JSONDecodeError, remedy="bake it again"):
         parsed = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{name}: header: not JSON: {error}", remedy="bake it again") from None
     if not isinstance(parsed, dict) or parsed.get("version") != VERSION:
         version = parsed.get("version") if isinstance(parsed, dict) else None
         raise InputError(

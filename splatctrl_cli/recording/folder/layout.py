@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.formats.image_file import decode_file, image_head
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
@@ -256,7 +256,5 @@ def read_pose(path: Path) -> Float64 | None:
 
 def read_json(path: Path) -> Any:
     """Read JSON. Raises InputError if unreadable."""
-    try:
+    with refuse_faults(f"{path}: not readable JSON", ValueError, OSError, remedy=_WHOLE):
         return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise InputError(f"{path}: not readable JSON: {error}", remedy=_WHOLE) from None

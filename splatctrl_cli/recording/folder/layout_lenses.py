@@ -61,8 +61,7 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
     root = _frames(folder)
     assert root is not None
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
-    trajectory = Trajectory(_poses(root / TRAJECTORY))
-    pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, trajectory.at, options)
+    pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, Trajectory(_poses(root / TRAJECTORY)).at, options)
     lenses: list[CameraTable] = []
     pincams = {
         stamp: path

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_DEPTH
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.spilled_rows import Table, blocks_of, ranges
 from splatctrl_cli.formats.arrays import npy_head, npy_of
 from splatctrl_cli.formats.image_file import JPEG, PNG
@@ -108,12 +108,12 @@ def read_topics(folder: Path, described: Mapping[str, Any], checked: Callable[[s
 
     Raises InputError if damaged.
     """
-    try:
+    with refuse_faults(
+        f"{folder / FOLDER}: cannot be read", KeyError, TypeError, ValueError, OSError, EOFError, remedy=AGAIN
+    ):
         topics = [_topic(entry, checked) for entry in described["topics"]]
         loss = LossReport(**described["loss"]["counts"])
         first_note, chosen = int(described["loss"]["first_note"]), described["chosen"]
-    except (KeyError, TypeError, ValueError, OSError, EOFError) as error:
-        raise InputError(f"{folder / FOLDER}: cannot be read: {error}", remedy=AGAIN) from None
     return JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=chosen)
 
 
@@ -214,10 +214,8 @@ class StoredFrame:
         )
 
     def _read(self, read: Callable[[], _Image]) -> _Image:
-        try:
+        with refuse_faults(self.origin, UndecodableMessageError, remedy="copy the recording again"):
             return read()
-        except UndecodableMessageError as error:
-            raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
 
 
 class FrameSource:
