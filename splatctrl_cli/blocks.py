@@ -65,7 +65,17 @@ from splatctrl_cli.kernels import raster as gaussian_kernels
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
 from splatctrl_cli.libraries import is_installed, mpl, of_extra
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, OnlyDistance, check_edges
+from splatctrl_cli.planner.configuration_clearance import (
+    Ball,
+    Clearance,
+    Cuboid,
+    HasDistance,
+    OnlyDistance,
+    Rod,
+    Solid,
+    Solids,
+    check_edges,
+)
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     START_BLOCKED,
@@ -75,7 +85,6 @@ from splatctrl_cli.planner.planned import (
     planned_path,
     resampled,
 )
-from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.recording.calibrated import Perturbation
 from splatctrl_cli.recording.folder.dtu import scan_folders
 from splatctrl_cli.recording.folder.idr import idr_scans

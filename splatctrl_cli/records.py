@@ -113,17 +113,7 @@ def spread(items: Sequence[Item], most: int) -> list[Item]:
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))]
 
 
-class Stamped(Protocol):
-    """An item with a time."""
-
-    @property
-    def stamp_ns(self) -> int: ...
-
-
-_Item = TypeVar("_Item", bound=Stamped)
-
-
-def by_stamp(*streams: Iterable[_Item]) -> Iterator[_Item]:
+def by_stamp(*streams: Iterable[Item]) -> Iterator[Item]:
     """Merge sorted streams by stamp; at equal stamps, earlier streams come first."""
     return heapq.merge(*streams, key=attrgetter("stamp_ns"))
 

@@ -109,8 +109,8 @@ class ImageWatch:
         self.scale = scale
         if factor != 1.0:
             self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
-            self.medians.change(lambda median: float(median * factor))
-            self.kept.change(lambda kept: replace(kept, pixels=_scaled(kept.pixels, factor)))
+            self.medians[:] = [float(median * factor) for median in self.medians]
+            self.kept[:] = [replace(kept, pixels=_scaled(kept.pixels, factor)) for kept in self.kept]
             self.thumbnails = [(stamp_ns, _scaled(image, factor)) for stamp_ns, image in self.thumbnails]
 
     @property
@@ -216,7 +216,7 @@ def depth_findings(images: ImageWatch) -> Iterator[Finding]:
         )
         if every:
             return
-    share = float(np.median(list(images.shares)))
+    share = float(np.median(images.shares))
     if share < limits.SOME_DEPTH:
         severity = warning if share < limits.LITTLE_DEPTH else note
         yield severity(

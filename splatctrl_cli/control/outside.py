@@ -18,7 +18,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.line_process import Fault, LineProcess, Misbehaved, shown
-from splatctrl_cli.control.step import ControlStep, Moment, QpIkController, View
+from splatctrl_cli.control.step import Commander, ControlStep, Moment, QpIkController, View
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.control.user_controller import PROTOCOL
 from splatctrl_cli.errors import InputError
@@ -105,7 +105,7 @@ class Program(LineProcess):
         return _document(answer)
 
 
-class OutsideController(AbstractContextManager["OutsideController"]):
+class OutsideController(Commander, AbstractContextManager["OutsideController"]):
     """The `Commander` of a user's controller, or of two copies that must agree to the bit.
 
     num_answers, seconds, slowest: count of answers, total and longest time [s].

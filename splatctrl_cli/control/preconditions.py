@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import MOUNTED_CHANGE, STATIC_CHANGE, STATIC_REACH
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, part_clearances
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
@@ -158,7 +157,7 @@ class FixedParts:
         if is_first:
             self.found = {name: (float(mine), float(mine)) for name, mine in zip(self._names, own, strict=True)}
         first = np.array([self.found[name][0] for name in self._names])
-        change = np.where(first < self._near, MOUNTED_CHANGE, STATIC_CHANGE)
+        change = np.where(first < self._near, fixed.MOUNTED_CHANGE, fixed.STATIC_CHANGE)
         came = own
         if isinstance(distance_to, BallDistance):
             if is_first:
@@ -175,7 +174,7 @@ class FixedParts:
         model, least = self._model, np.full(len(centers), np.inf)
         radii = model.sphere_set.radii[self._still]
         away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii
-        near = np.flatnonzero(away.min(axis=0) < STATIC_REACH)
+        near = np.flatnonzero(away.min(axis=0) < fixed.STATIC_REACH)
         places = np.asarray(balls.centers[near], np.float64)
         if was_seen is not None and len(near):
             is_new_place = ~was_seen(places)
@@ -186,7 +185,7 @@ class FixedParts:
         before, self._new = self._new, places[has_come]
         for number in np.flatnonzero(has_come):
             last = np.linalg.norm(before - places[number], axis=1).min(initial=np.inf)
-            has_come[number] = last <= MOUNTED_CHANGE
+            has_come[number] = last <= fixed.MOUNTED_CHANGE
         for k in np.unique(owner[has_come]).tolist():
             chosen = near[(owner == k) & has_come]
             link = model.sphere_set.links[self._still[k]]

@@ -130,7 +130,8 @@ class RowKind(StrEnum):
 class Barrier:
     """M barrier rows ``G v - s <= h``, with ``G = -dd/dq`` (M, J).
 
-    ``h = alpha (d - epsilon) + dd/dt`` (M,); distance d (M,) [m]; index (M,): place among names (spheres, or pairs).
+    ``h = alpha (d - epsilon) + dd/dt`` (M,), less where joints cannot stop at once (`barriers.distance_bound`);
+    distance d (M,) [m]; index (M,): place among names (spheres, or pairs).
     Slack costs ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
     """
 

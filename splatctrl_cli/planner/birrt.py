@@ -10,8 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.config.fixed import SHORTCUT_WORTH
+from splatctrl_cli.config import PlannerConfig, fixed
 from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
@@ -260,7 +259,7 @@ def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float6
     way = np.interp(places, np.arange(len(path)), _lengths(path))
     saved = way[:, 1] - way[:, 0] - np.linalg.norm(_points(path, places[:, 1]) - _points(path, places[:, 0]), axis=1)
     order = np.argsort(-saved, kind="stable")
-    return np.asarray(places[order[saved[order] > SHORTCUT_WORTH]])
+    return np.asarray(places[order[saved[order] > fixed.SHORTCUT_WORTH]])
 
 
 def _cut(path: Float64, cut: Float64) -> Float64:

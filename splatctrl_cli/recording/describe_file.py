@@ -95,10 +95,11 @@ def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
 
 
 def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:
-    try:
+    # ValueError: what defusedxml forbids, too
+    with refuse_faults(
+        f"{path}: not {what}", ValueError, EOFError, ParseError, yaml.YAMLError, remedy="the file is damaged"
+    ):
         return parse()
-    except (ValueError, EOFError, ParseError, yaml.YAMLError) as error:  # ValueError: what defusedxml forbids, too
-        raise InputError(f"{path}: not {what}: {error}", remedy="the file is damaged") from None
 
 
 def _npy(path: Path, _head: bytes) -> Summary:

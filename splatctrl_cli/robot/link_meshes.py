@@ -1,6 +1,6 @@
 """Collision geometry of a robot's links as closed triangle surfaces, and exact distance to them, in float64."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -218,7 +218,7 @@ def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
     ]
 
 
-def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
+def _taken_apart(mesh: TriangleMesh) -> Iterator[TriangleMesh]:
     size = len(mesh.vertices)
     ends = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
     _, label = connected_components(coo_matrix((np.ones(len(ends[0])), ends), shape=(size, size)), directed=False)
@@ -226,12 +226,10 @@ def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
     closed = [value for value in np.unique(of_face) if _is_closed(mesh.faces[of_face == value])]
     parts = [of_face == value for value in closed]
     is_open = ~np.isin(of_face, closed)
-    pieces = []
     for part in [*parts, *([is_open] if is_open.any() else [])]:
         used, inverse = np.unique(mesh.faces[part], return_inverse=True)
         local = inverse.reshape(-1, 3).astype(np.int64)
-        pieces.append(replace(mesh, vertices=mesh.vertices[used], faces=local, is_closed=_is_closed(local)))
-    return pieces
+        yield replace(mesh, vertices=mesh.vertices[used], faces=local, is_closed=_is_closed(local))
 
 
 def _is_closed(faces: Index) -> bool:

@@ -14,7 +14,8 @@ import numpy as np
 import yaml
 
 from splatctrl_cli.config.fixed import CARRIED_CELL
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.kernels.chain import PRISMATIC, Chain
 from splatctrl_cli.records import Box, Float64, SphereSet
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
@@ -191,12 +192,9 @@ def spheres_yaml(spheres: SphereSet, comments: Sequence[str] = ()) -> str:
 
 
 def _yaml(path: Path) -> Any:
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give a spheres YAML file") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid YAML: {error}", remedy="give a spheres YAML file or a URDF") from None
+    remedy = "give a spheres YAML file"
+    with refuse_faults(f"{path}: not valid YAML", yaml.YAMLError, UnicodeDecodeError, remedy=f"{remedy} or a URDF"):
+        return yaml.safe_load(read_text(path, remedy))
 
 
 def _section(tree: Any) -> dict[Any, Any]:
@@ -262,9 +260,4 @@ def _sphere(where: str, sphere: Any) -> list[float]:
 
 def sphere_names(spheres: SphereSet) -> tuple[str, ...]:
     """Return each sphere's link and number on it: ``panda_hand[2]``."""
-    seen: dict[str, int] = {}
-    names = []
-    for link in spheres.links:
-        seen[link] = seen.get(link, -1) + 1
-        names.append(f"{link}[{seen[link]}]")
-    return tuple(names)
+    return tuple(f"{link}[{spheres.links[:index].count(link)}]" for index, link in enumerate(spheres.links))

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64
 
 MOVABLE = ("revolute", "continuous", "prismatic")
@@ -219,18 +220,15 @@ def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give the robot's URDF file") from None
+        return read_text(path, "give the robot's URDF file")
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected a URDF, got bytes that are not text") from None
 
 
 def _parse(path: Path, text: str) -> tuple[str, Any]:
-    try:
+    # ValueError: what defusedxml forbids
+    with refuse_faults(f"{path}: expected a URDF, got broken XML", ElementTree.ParseError, ValueError):
         root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:  # ValueError: what defusedxml forbids
-        raise InputError(f"{path}: expected a URDF, got broken XML: {error}") from None
     if root.tag != "robot":
         raise InputError(f"{path}: expected a URDF with root <robot>, got <{root.tag}>")
     return text, root

@@ -21,9 +21,9 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
+from splatctrl_cli.scene.depth_holes import shadowed
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
-from splatctrl_cli.scene.stereo_shadow import shadowed
 
 T = TypeVar("T", bound=np.generic)
 BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours

@@ -7,18 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
-from splatctrl_cli.config.fixed import (
-    EVICT_EVERY,
-    MASK_SIGMAS,
-    NEAREST_REACH,
-    NOT_COVERED,
-    REFINE_BLOCKS,
-    ROBOT_REACH,
-    SEED_ASKED_VIEWS,
-    SEED_MUCH_MORE,
-    WELL_INSIDE,
-)
+from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel, fixed
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
@@ -26,7 +15,7 @@ from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFra
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
 from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
-from splatctrl_cli.scene.depth_holes import lost_edges, unanswered_points
+from splatctrl_cli.scene.depth_holes import explain_unseen, lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
@@ -64,7 +53,6 @@ from splatctrl_cli.scene.shell import Shell
 from splatctrl_cli.scene.steady_depth import steadied
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
-from splatctrl_cli.scene.unseen import explain_unseen
 from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 
 
@@ -190,9 +178,9 @@ class SceneFitter:
         `progress` gets the iterations done after each of ten blocks; a restored fitter continues with the next.
         """
         views = [self.view(view.frame) for view in (*self.window.newest, *self.window.keyframes)]
-        for block in range(self.refined.num_blocks, REFINE_BLOCKS):
+        for block in range(self.refined.num_blocks, fixed.REFINE_BLOCKS):
             self._refine_block(block, num_iterations, views)
-            progress(num_iterations * (block + 1) // REFINE_BLOCKS)
+            progress(num_iterations * (block + 1) // fixed.REFINE_BLOCKS)
         removed = dict(self.refined.removed)
         masks = [object_mask(view.frame) for view in views]
         return self._audit(views, self.refined.filled + self._fill_gaps(views, masks, removed), removed, {})
@@ -200,16 +188,18 @@ class SceneFitter:
     def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
         rng = np.random.default_rng([self.seed, self.num_steps, 1 + block])
         nowhere = np.zeros(self.config.max_splats, bool)
-        rate = self.config.final_rate ** (block / (REFINE_BLOCKS - 1))
-        count = num_iterations * (block + 1) // REFINE_BLOCKS - num_iterations * block // REFINE_BLOCKS
+        rate = self.config.final_rate ** (block / (fixed.REFINE_BLOCKS - 1))
+        count = num_iterations * (block + 1) // fixed.REFINE_BLOCKS - num_iterations * block // fixed.REFINE_BLOCKS
         settings = self.descent.settings(rate, rate * self.config.refine_geometry)
         self.descent.run(
-            self.window.schedule(count, rng), settings, self.config.refine_depth ** (block / (REFINE_BLOCKS - 1))
+            self.window.schedule(count, rng),
+            settings,
+            self.config.refine_depth ** (block / (fixed.REFINE_BLOCKS - 1)),
         )
         # Splats that a view sees through stay: removing them costs 0.6 dB if poses are off by millimetres.
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
-        if block < REFINE_BLOCKS - 2:
+        if block < fixed.REFINE_BLOCKS - 2:
             filled += self._seed(views, [object_mask(view.frame) for view in views])
             filled += self._use_idle(views, rng, removed)
         self.refined = Refined(
@@ -233,11 +223,13 @@ class SceneFitter:
             seen = [view.frame.depth[::8, ::8] for view in self.window.newest]
             depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0, np.float32)
             error = (
-                MASK_SIGMAS * self.occupancy.config.depth_error * float(np.median(depth)) ** 2 if len(depth) else 0.0
+                fixed.MASK_SIGMAS * self.occupancy.config.depth_error * float(np.median(depth)) ** 2
+                if len(depth)
+                else 0.0
             )
             found = unrepresented_voxels(self.occupancy, self.splats(), self.config, error)
             if self.posture is not None:
-                found = found.select(~self.posture.holds(found.centers, WELL_INSIDE))
+                found = found.select(~self.posture.holds(found.centers, fixed.WELL_INSIDE))
             self._unrepresented, self.bare = confirmed(found, self.bare), found
         return self._unrepresented
 
@@ -252,7 +244,7 @@ class SceneFitter:
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
         """Frame as the optimiser takes it; mask: of a robot in it."""
         mappable = inside_workspace(frame, world_points(frame), self.workspace, self.occupancy.config.min_range)
-        reach = NEAREST_REACH * (self.config.scale or 1.0)
+        reach = fixed.NEAREST_REACH * (self.config.scale or 1.0)
         is_robot = None if mask is None else mask.kinds == PixelKind.ROBOT
         return make_view(frame, mappable, self.mounted.get(frame.camera), is_robot=is_robot, reach=reach)
 
@@ -273,7 +265,7 @@ class SceneFitter:
         counted = [view.target.counted > 0 for view in views]
         if not any(view.mappable.any() for view in views):
             shown = [self.descent.rendering(view).opacity for view in views]
-            counted = [mask & (opacity < NOT_COVERED) for mask, opacity in zip(counted, shown, strict=True)]
+            counted = [mask & (opacity < fixed.NOT_COVERED) for mask, opacity in zip(counted, shown, strict=True)]
         return background_color([view.frame for view in views], counted)
 
     def _carry(self, robot: RobotPosture | None) -> None:
@@ -328,7 +320,7 @@ class SceneFitter:
         every = thinning(added)
 
         def offered(index: int) -> list[Candidates]:
-            view, others = views[index], spread(range(len(views)), SEED_ASKED_VIEWS)
+            view, others = views[index], spread(range(len(views)), fixed.SEED_ASKED_VIEWS)
             asked = [views[(index + k) % len(views)] for k in others]
             wanted = (thinned(added[index] & of_label(masks[index], label), every) for label in found)
             sources = (candidates(view.frame, pixels, self.num_threads) for pixels in wanted)
@@ -344,7 +336,7 @@ class SceneFitter:
         num_candidates = sum(len(source) for source in everything)
         if not num_candidates:
             return Filled()
-        if self.density is None or num_candidates > SEED_MUCH_MORE * self.density.num_candidates:
+        if self.density is None or num_candidates > fixed.SEED_MUCH_MORE * self.density.num_candidates:
             count = max(int(self.config.fill * self.config.max_splats), 1)
             self.density = density_for(everything, count, self.config, self.num_threads)
         reserve = int(self.config.gap_reserve * self.config.max_splats)
@@ -354,7 +346,7 @@ class SceneFitter:
                 continue
             live = self.buffer.centers[self._standing_for(label)]
             seeds = seeds_at(sources, live, self.density, self.config, self.num_threads)
-            if len(views) > SEED_ASKED_VIEWS:
+            if len(views) > fixed.SEED_ASKED_VIEWS:
                 seeds = seeds.select(self._is_grounded(seeds.centers, views, label))
             filled += self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve, label=label)
         return filled
@@ -385,7 +377,7 @@ class SceneFitter:
             )
             seeds = seeds.select(self._is_grounded(seeds.centers, views, label))
             num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
-            if label == Label.OBJECT and num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
+            if label == Label.OBJECT and num_missing > 0 and self.num_steps % fixed.EVICT_EVERY == 0:
                 shown, gap = self.descent.misfits(views)[1], self.config.max_gap
                 is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, gap)
                 self.buffer.kill(is_evicted)
@@ -427,7 +419,7 @@ class SceneFitter:
             return
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
-        slots = slots[robot.distance(self.buffer.centers[slots]) < ROBOT_REACH]
+        slots = slots[robot.distance(self.buffer.centers[slots]) < fixed.ROBOT_REACH]
         self.buffer.centers[slots] = on_surface(self.buffer.centers[slots], views, config.see_through)
         error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
         radii = kept_radii(

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import SEED_OVERSAMPLING
+from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thinned, thinning
@@ -91,7 +90,7 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
             for misfit, mask in zip(misfits, masks, strict=True)
         ]
     )
-    count = min(SEED_OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
+    count = min(fixed.SEED_OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
     if count == 0:
         return NO_SEEDS
     found = _pixels([misfit.frame for misfit in misfits], masks, drawn(weight, count, rng))

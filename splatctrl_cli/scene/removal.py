@@ -5,8 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import EVICT_ASKED, EVICT_NEARER, EVICT_NEAREST, NEAREST_REACH
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -14,7 +13,7 @@ from splatctrl_cli.scene.occupancy import OccupancyMap
 REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak", "evicted")
 
 
-def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
+def nearest_depth(frame: RgbdFrame, reach: float = fixed.NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
     """Least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
 
     `reach` is at the median depth. Robot pixels count only for themselves and neighbours: near the robot, what is
@@ -105,7 +104,7 @@ def room_for(
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
     others, may_go = live[stands], live[splats.labels == Label.OBJECT]
-    weakest = may_go[np.argsort(shown[may_go], kind="stable")][: EVICT_ASKED * num]
+    weakest = may_go[np.argsort(shown[may_go], kind="stable")][: fixed.EVICT_ASKED * num]
     order, voxels = np.searchsorted(others, weakest), occupancy.occupied_centers()
     chosen = others[redundant(order, num, splats.select(stands), voxels, tolerance, occupancy.num_threads)]
     is_evicted = np.zeros(len(shown), bool)
@@ -139,7 +138,7 @@ def redundant(
     of_splat = cKDTree(voxels).query_ball_point(splats.centers[order], reach, workers=num_threads)
     asked = np.unique(np.concatenate([np.asarray(found, np.intp) for found in of_splat]))
     count = np.zeros(len(voxels), np.int64)
-    ranks = np.arange(1, min(EVICT_NEAREST, len(splats)) + 1)
+    ranks = np.arange(1, min(fixed.EVICT_NEAREST, len(splats)) + 1)
     distance, nearest = cKDTree(splats.centers).query(voxels[asked], k=ranks, workers=num_threads)
     count[asked] = (distance - splats.radii[nearest] <= tolerance).sum(axis=1)
     chosen: list[np.intp] = []
@@ -161,7 +160,7 @@ def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> ND
     farthest = np.argsort(-to_splat, kind="stable")[:num_wanted]
     to_seed = np.sort(distance_to_box(seeds, path))[:num_wanted]
     pairs = min(len(farthest), len(to_seed))
-    is_worth_it = to_splat[farthest[:pairs]] >= to_seed[:pairs] + EVICT_NEARER
+    is_worth_it = to_splat[farthest[:pairs]] >= to_seed[:pairs] + fixed.EVICT_NEARER
     return farthest[:pairs][np.logical_and.accumulate(is_worth_it)]
 
 

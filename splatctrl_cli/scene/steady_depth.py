@@ -5,8 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import MASK_EDGE, STEADY_GAIN, STEADY_MOVED, STEADY_SIGMAS
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.records import Bool, RgbdFrame
 
 
@@ -29,10 +28,10 @@ def steadied(
         return frame, np.ones(frame.depth.shape, bool)
     offset = frame.depth - earlier.depth
     error = config.depth_error * frame.depth**2
-    is_same = is_object & (earlier.depth > 0) & (np.abs(offset) <= STEADY_SIGMAS * error)
-    side = 2 * round(frame.intrinsics.width / MASK_EDGE) + 1
+    is_same = is_object & (earlier.depth > 0) & (np.abs(offset) <= fixed.STEADY_SIGMAS * error)
+    side = 2 * round(frame.intrinsics.width / fixed.MASK_EDGE) + 1
     weight = is_same.astype(np.float32)
     total, num = (cv2.boxFilter(image, -1, (side, side), normalize=False) for image in (weight * offset, weight))
-    is_same &= np.abs(total) <= STEADY_MOVED * error * num
-    depth = np.where(is_same & was_object, earlier.depth + np.float32(STEADY_GAIN) * offset, frame.depth)
+    is_same &= np.abs(total) <= fixed.STEADY_MOVED * error * num
+    depth = np.where(is_same & was_object, earlier.depth + np.float32(fixed.STEADY_GAIN) * offset, frame.depth)
     return replace(frame, depth=depth), np.asarray(is_same)

@@ -10,8 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import BARE_GROUP, OCCUPIED_WITH_SPLATS, SPLATS_ON_SURFACE
+from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Bool, Box, Float32, Label, SplatSet
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -47,7 +46,7 @@ def confirmed(found: Balls, before: Balls | None) -> Balls:
     pairs = cKDTree(found.centers).query_pairs(1.01 * 3**0.5 * voxel, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(found), len(found)))
     group = connected_components(graph, directed=False)[1]
-    is_kept = np.bincount(group)[group] >= BARE_GROUP
+    is_kept = np.bincount(group)[group] >= fixed.BARE_GROUP
     if len(before):
         is_kept |= cKDTree(before.centers).query(found.centers)[0] < 0.5 * voxel
     return found.select(is_kept)
@@ -108,7 +107,7 @@ class GridAgreement:
     @property
     def holds(self) -> bool:
         """True if both shares are as large as a reconstruction leaves them; False with nothing to compare."""
-        return self.on_surface >= SPLATS_ON_SURFACE and self.represented >= OCCUPIED_WITH_SPLATS
+        return self.on_surface >= fixed.SPLATS_ON_SURFACE and self.represented >= fixed.OCCUPIED_WITH_SPLATS
 
 
 def agreement_with_grid(
