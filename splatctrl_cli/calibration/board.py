@@ -113,8 +113,9 @@ def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
         corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(gray)
         if ids is None or len(ids) < FEWEST_MARKERS:
             continue
-        size = (board.columns + 1, board.rows + 1)
-        drawn = cv2.aruco.CharucoBoard(size, board.square, 0.5 * board.square, dictionary)
+        drawn = cv2.aruco.CharucoBoard(
+            (board.columns + 1, board.rows + 1), board.square, 0.5 * board.square, dictionary
+        )
         numbers, places = np.ravel(np.asarray(drawn.getIds())), np.asarray(drawn.getObjPoints())
         middles = dict(zip(numbers.tolist(), places.mean(axis=1), strict=True))
         seen = [(middles[i], c.reshape(4, 2).mean(axis=0)) for i, c in zip(ids.ravel().tolist(), corners, strict=True)
@@ -139,8 +140,9 @@ def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
 
 def _sighting(board: Board, frame: RgbdFrame, pixels: Float64) -> Sighting | None:
     """The board's pose: a plane's corners allow two, and depth decides."""
-    matrix = matrix_of(frame.intrinsics)
-    _, turns, moves, errors = cv2.solvePnPGeneric(board.points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    _, turns, moves, errors = cv2.solvePnPGeneric(
+        board.points, pixels, matrix_of(frame.intrinsics), None, flags=cv2.SOLVEPNP_IPPE
+    )
     fits: list[tuple[float, Float64, float | None]] = []
     for turn, move, error in zip(turns, moves, np.ravel(errors), strict=True):
         T = pose_at(np.ravel(move), cv2.Rodrigues(turn)[0])

@@ -74,8 +74,15 @@ class ImageWatch:
         if self.kept.is_next():
             stride = stride_of(height)
             small = cv2.resize(color, (-(-width // stride), -(-height // stride)), interpolation=cv2.INTER_AREA)
-            kept = np.asarray(small, dtype=np.uint8)
-            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, pixels=kept))
+            self.kept.add(
+                Kept(
+                    stamp_ns=stamp_ns,
+                    stride=stride,
+                    width=width,
+                    height=height,
+                    pixels=np.asarray(small, dtype=np.uint8),
+                )
+            )
 
     def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
         """Take a depth image (H, W) [m], 0 = none."""

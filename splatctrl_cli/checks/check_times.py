@@ -163,8 +163,11 @@ def _overlap(a: Finding, b: Finding) -> bool:
 def _joined(group: list[Finding]) -> Finding:
     worst = max(group, key=lambda f: f.value or 0.0)
     names = [f.where for f in group]
-    where = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-    return replace(worst, where=where, what=f"{len(names)} pause together; of {worst.where}: {worst.what}")
+    return replace(
+        worst,
+        where=", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else ""),
+        what=f"{len(names)} pause together; of {worst.where}: {worst.what}",
+    )
 
 
 def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:

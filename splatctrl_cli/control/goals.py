@@ -90,8 +90,9 @@ class LoggedMotion:
 
 def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
     """Return a frame's pose (4, 4) and motion at a posture and velocity (J,)."""
-    twist = model.frame_jacobian(position, frame) @ velocity
-    return model.frame_pose(position, frame), Guide(twist=twist, posture=position, velocity=velocity)
+    return model.frame_pose(position, frame), Guide(
+        twist=model.frame_jacobian(position, frame) @ velocity, posture=position, velocity=velocity
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,5 +200,6 @@ class TwistTrack:
         self, model: RobotModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
     ) -> tuple[Float64, Guide]:
         """Return the frame's own pose (4, 4), moving with the twist, without a posture."""
-        twist = self.reference(model, config, q, stamp_ns)
-        return model.frame_pose(q, frame), Guide(twist=twist, posture=q, velocity=np.zeros(len(q)))
+        return model.frame_pose(q, frame), Guide(
+            twist=self.reference(model, config, q, stamp_ns), posture=q, velocity=np.zeros(len(q))
+        )

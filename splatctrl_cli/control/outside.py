@@ -186,14 +186,13 @@ def class_command(target: str) -> tuple[str, ...]:
 
 def _start(model: RobotModel, config: ControlConfig, frame: str, home: Float64) -> Document:
     """First line; see `ControllerStart`."""
-    acceleration = JointLimits.of(model, config).acceleration
     return {
         "protocol": PROTOCOL,
         "joints": list(model.joint_names),
         "lower": _list(model.lower),
         "upper": _list(model.upper),
         "velocity_limit": _list(model.velocity_limit),
-        "acceleration_limit": _list(acceleration),
+        "acceleration_limit": _list(JointLimits.of(model, config).acceleration),
         "frame": frame,
         "home": _list(home),
         "period": config.period,

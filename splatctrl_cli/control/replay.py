@@ -288,8 +288,9 @@ class _Course:
         waypoint = self._waypoints[self.num_reached]
         if waypoint.posture is None:
             return waypoint.T_world_goal, None
-        still = np.zeros(len(waypoint.posture))
-        return waypoint.T_world_goal, Guide(twist=np.zeros(6), posture=waypoint.posture, velocity=still)
+        return waypoint.T_world_goal, Guide(
+            twist=np.zeros(6), posture=waypoint.posture, velocity=np.zeros(len(waypoint.posture))
+        )
 
     def has_ended(self, stamp_ns: int, index: int, step: ControlStep) -> bool:
         """True at the last goal; an earlier one advances to the next. Twists have none."""

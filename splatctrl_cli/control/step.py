@@ -144,8 +144,9 @@ class QpIkController:
         self._model, self._config, self._frame = model, config, frame
         self._solver: QpSolver = SOLVERS[config.solver] if solver is None else solver
         self._limits = JointLimits.of(model, config)
-        further = [term for term in terms if isinstance(term, BarrierTerm)]
-        self._builder = RowBuilder(model, config, field, self._limits.acceleration, further)
+        self._builder = RowBuilder(
+            model, config, field, self._limits.acceleration, [term for term in terms if isinstance(term, BarrierTerm)]
+        )
         self._limit_names = tuple(f"{joint} {side}" for side in ("highest", "lowest") for joint in model.joint_names)
         self.row_names, self.row_kinds = self._builder.names, self._builder.kinds
         costs = [term for term in terms if not isinstance(term, BarrierTerm)]

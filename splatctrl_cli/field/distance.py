@@ -317,5 +317,10 @@ def device_field(
     """Put the exact distance and `kernels` on a device, for ``config.distance``."""
     chosen = KERNEL_OF[config.distance]
     choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
-    terms = {name: field.terms() for name, field in kernels.items()}
-    return DeviceField(device, spheres.clusters, spheres.offsets(spheres.radii), terms, choice)
+    return DeviceField(
+        device,
+        spheres.clusters,
+        spheres.offsets(spheres.radii),
+        {name: field.terms() for name, field in kernels.items()},
+        choice,
+    )

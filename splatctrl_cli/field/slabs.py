@@ -263,9 +263,11 @@ class UnknownSpace:
 
     def header(self) -> dict[str, object]:
         """Return its changes of a header."""
-        counts = {"never_seen": self.num_never_seen, "changed": self.num_changed}
-        bound = {"bound": BOUND} if self.policy == "obstacle" else {}
-        return {**bound, "unknown": self.policy, "unknown_cells": counts}
+        return {
+            **({"bound": BOUND} if self.policy == "obstacle" else {}),
+            "unknown": self.policy,
+            "unknown_cells": {"never_seen": self.num_never_seen, "changed": self.num_changed},
+        }
 
 
 def baked_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:

@@ -248,8 +248,9 @@ def share_of_loss(length: float, tolerance: float) -> float:
 
 def log_row_sums(kernel: Kernel, spheres: Spheres, *, threads: int = 0) -> Float64:
     """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
-    is_matern = isinstance(kernel, Matern12)
-    sums = native.row_sums(spheres.clusters, spheres.is_point, kernel.length, is_matern=is_matern, threads=threads)
+    sums = native.row_sums(
+        spheres.clusters, spheres.is_point, kernel.length, is_matern=isinstance(kernel, Matern12), threads=threads
+    )
     return np.asarray(np.log(spheres.gathered(sums)))
 
 

@@ -162,8 +162,7 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
     """
     began = time.perf_counter()
     roots = checked_postures(clearance, start, goals, config)
-    trees = _Tree(roots[:1]), _Tree(roots[1:])
-    search = _Search(clearance, config, trees, np.random.default_rng(seed), began)
+    search = _Search(clearance, config, (_Tree(roots[:1]), _Tree(roots[1:])), np.random.default_rng(seed), began)
     outcome, found, goal = search.run()
     searched = time.perf_counter()
     waypoints = found
@@ -264,8 +263,7 @@ def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float6
 
 def _cut(path: Float64, cut: Float64) -> Float64:
     first, last = int(np.floor(cut[0])), int(np.ceil(cut[1]))
-    ends = _points(path, cut)
-    rows = np.concatenate([path[: first + 1], ends, path[last:]])
+    rows = np.concatenate([path[: first + 1], _points(path, cut), path[last:]])
     is_new = np.r_[True, np.linalg.norm(np.diff(rows, axis=0), axis=1) > 1e-12]
     cut_path = rows[is_new]
     cut_path[-1] = path[-1]

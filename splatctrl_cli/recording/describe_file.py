@@ -79,10 +79,9 @@ def _npz(path: Path, _head: bytes) -> Summary:
         for name, (shape, dtype) in arrays.items()
     ]
     names = {str(row[0]) for row in rows}
-    kind = "occupancy grid" if "log_odds" in names else "distance grid" if {"sdf"} & names else "arrays"
     return Summary(
         path=str(path),
-        kind=kind,
+        kind="occupancy grid" if "log_odds" in names else "distance grid" if {"sdf"} & names else "arrays",
         facts=facts,
         grids=(Grid(name="arrays", header=("array", "shape", "dtype"), rows=rows),),
     )
@@ -126,11 +125,16 @@ def _urdf(path: Path, _head: bytes) -> Summary:
         "joints": len(joints),
         "movable_joints": len(movable),
     }
-    notes = () if movable else ("no movable joint: an unexpanded xacro looks like this; expand it with `xacro`",)
     grid = Grid(
         name="joint_table", header=("joint", "type", "parent", "child", "lower", "upper", "velocity"), rows=rows
     )
-    return Summary(path=str(path), kind="URDF", facts=facts, grids=(grid,), notes=notes)
+    return Summary(
+        path=str(path),
+        kind="URDF",
+        facts=facts,
+        grids=(grid,),
+        notes=() if movable else ("no movable joint: an unexpanded xacro looks like this; expand it with `xacro`",),
+    )
 
 
 def _json(path: Path, _head: bytes) -> Summary:
@@ -159,9 +163,10 @@ def _yaml(path: Path, _head: bytes) -> Summary:
     spheres = _find(content, "collision_spheres")
     if isinstance(spheres, dict):
         rows = [[link, len(items)] for link, items in spheres.items() if isinstance(items, list)]
-        total = sum(int(row[1]) for row in rows)
         grid = Grid(name="links", header=("link", "spheres"), rows=rows)
-        return Summary(path=str(path), kind="robot spheres", facts={"spheres": total}, grids=(grid,))
+        return Summary(
+            path=str(path), kind="robot spheres", facts={"spheres": sum(int(row[1]) for row in rows)}, grids=(grid,)
+        )
     return Summary(path=str(path), kind="YAML", facts={"keys": list(content) if isinstance(content, dict) else []})
 
 
@@ -169,11 +174,14 @@ def _image(path: Path, _head: bytes) -> Summary:
     pixels = decode_file(path.read_bytes(), color=False)
     if pixels is None:
         raise InputError(f"{path}: not an image that can be read", remedy="the file is damaged")
-    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     return Summary(
         path=str(path),
         kind="image",
-        facts={"size": f"{pixels.shape[1]}x{pixels.shape[0]}", "channels": channels, "dtype": str(pixels.dtype)},
+        facts={
+            "size": f"{pixels.shape[1]}x{pixels.shape[0]}",
+            "channels": 1 if pixels.ndim == 2 else pixels.shape[2],
+            "dtype": str(pixels.dtype),
+        },
     )
 
 

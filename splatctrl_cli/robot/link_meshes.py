@@ -181,8 +181,13 @@ def _primitive(shape: Shape) -> Solid:
         corners, faces, gap = _unit_ball()
         vertices, slack = shape.size[0] * corners, shape.size[0] * gap + 1e-12
     mesh = TriangleMesh(vertices=transform_points(shape.T_link_shape, vertices), faces=faces, is_closed=True)
-    ball = (shape.T_link_shape[:3, 3].copy(), shape.size[0]) if shape.kind == "sphere" else None
-    return Solid(link=shape.link, surface=mesh, slack=float(slack), body=mesh, ball=ball)
+    return Solid(
+        link=shape.link,
+        surface=mesh,
+        slack=float(slack),
+        body=mesh,
+        ball=(shape.T_link_shape[:3, 3].copy(), shape.size[0]) if shape.kind == "sphere" else None,
+    )
 
 
 def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
@@ -194,8 +199,11 @@ def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
             f"link '{shape.link}': mesh {shape.filename}: expected a length of 1 mm to 10 m, got {length:g} m",
             remedy=_unit_words(shape, length),
         )
-    faces = mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]
-    return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces))
+    return replace(
+        mesh,
+        vertices=vertices,
+        faces=np.ascontiguousarray(mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]),
+    )
 
 
 def _unit_words(shape: MeshShape, length: float) -> str:

@@ -114,8 +114,9 @@ class RobotModel:
             spheres = spheres_of(file)
         asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
         sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
-        is_renamed = are_links_renamed(asked, file)
-        return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed, packages=packages)
+        return cls(
+            file, model, sphere_set, T, left_out, are_links_renamed=are_links_renamed(asked, file), packages=packages
+        )
 
     def moved_by(self, names: Sequence[str]) -> "RobotModel":
         """Return the robot for a log of these joints.
@@ -302,8 +303,9 @@ class RobotModel:
 
     def _framed(self, q: Float64, frame: str) -> tuple[Float64, Float64]:
         there = self._model.frames[self._frame(frame)]
-        in_body = np.ascontiguousarray(there.placement.homogeneous[:3])
-        return self.chain.frame(self._checked(q), there.parentJoint, in_body)
+        return self.chain.frame(
+            self._checked(q), there.parentJoint, np.ascontiguousarray(there.placement.homogeneous[:3])
+        )
 
     def lever_arms(self) -> Float64:
         """Return upper bounds (S, J) [m] on a centre's travel per radian (or metre) of a joint, in any posture."""

@@ -108,12 +108,11 @@ def self_collision_pairs(
     pairs = []
     for index, (i, j) in enumerate(zip(a, b, strict=True)):
         column = gaps[:, index]
-        size = int((owner == i).sum() * (owner == j).sum())
         pairs.append(
             LinkPair(
                 links=(links[i], links[j]),
                 left_out=known.get(frozenset((links[i], links[j]))) or _sampled_reason(column, drop_never),
-                num_sphere_pairs=size,
+                num_sphere_pairs=int((owner == i).sum() * (owner == j).sum()),
                 least_gap=float(column.min()) if len(column) else np.nan,
                 largest_gap=float(column.max()) if len(column) else np.nan,
                 hit_share=float(np.mean(column <= 0)) if len(column) else np.nan,

@@ -303,8 +303,11 @@ def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape
         scale = _numbers(f"{where}: scale", element.get("scale", "1 1 1"), 3)
         if 0 in scale:
             raise InputError(f"{where}: scale: expected three numbers that are not 0, got {scale}")
-        filename = _attribute(path, element, "filename")
-        return [MeshShape(link=link, filename=filename, scale=scale, T_link_mesh=T_link_shape)]
+        return [
+            MeshShape(
+                link=link, filename=_attribute(path, element, "filename"), scale=scale, T_link_mesh=T_link_shape
+            )
+        ]
     if element.tag == "box":
         size = _numbers(where, element.get("size"), 3)
     elif element.tag in {"cylinder", "capsule"}:

@@ -106,9 +106,11 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
         until.append(_side_by_side(depths, CONTRADICTING_PIXELS))
     for (frame, _), end, passed in zip(seen, until, through, strict=True):
         side = _side(frame)
-        is_blank = np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2))
         yield Contradicted(
-            side=side, until=end, is_blank=is_blank, through=_side_by_side(passed, SEEN_THROUGH_PIXELS)
+            side=side,
+            until=end,
+            is_blank=np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2)),
+            through=_side_by_side(passed, SEEN_THROUGH_PIXELS),
         )
 
 

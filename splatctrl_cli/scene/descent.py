@@ -108,8 +108,9 @@ class Descent:
 
     def evaluate(self, view: View) -> LossTerms:
         """Loss of a view."""
-        planes = self.planes(view)
-        return self._loss.evaluate(planes, view.target, self._weights(), empty_planes(*view.target.depth.shape))
+        return self._loss.evaluate(
+            self.planes(view), view.target, self._weights(), empty_planes(*view.target.depth.shape)
+        )
 
     def _weights(self) -> LossWeights:
         return loss_weights(self._config, self.background or BLACK)

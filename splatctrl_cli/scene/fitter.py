@@ -108,8 +108,12 @@ class SceneFitter:
             others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
             masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
             masks = voted(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
-        is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
-        rays = list(contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
+        rays = list(
+            contradicted(
+                list(zip(frames, masks, strict=True)),
+                is_drawn=robot is not None and robot.surface is not None and robot.surface.is_drawn,
+            )
+        )
         masks = list(map(without_contradicted, masks, rays))
         frames = [without(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
         known = {view.frame.camera: view.frame for view in self.window.newest if view.frame.camera in self.objects}
@@ -244,9 +248,13 @@ class SceneFitter:
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
         """Frame as the optimiser takes it; mask: of a robot in it."""
         mappable = inside_workspace(frame, world_points(frame), self.workspace, self.occupancy.config.min_range)
-        reach = fixed.NEAREST_REACH * (self.config.scale or 1.0)
-        is_robot = None if mask is None else mask.kinds == PixelKind.ROBOT
-        return make_view(frame, mappable, self.mounted.get(frame.camera), is_robot=is_robot, reach=reach)
+        return make_view(
+            frame,
+            mappable,
+            self.mounted.get(frame.camera),
+            is_robot=None if mask is None else mask.kinds == PixelKind.ROBOT,
+            reach=fixed.NEAREST_REACH * (self.config.scale or 1.0),
+        )
 
     def _find_mounted(self, frames: Sequence[RgbdFrame]) -> None:
         for camera in sorted({frame.camera for frame in frames} - set(self.mounted)):
@@ -440,8 +448,9 @@ class SceneFitter:
 
         least 0 counts as unlimited.
         """
-        gap = min(self.occupancy.config.see_through, least or np.inf)
-        return ~seen_through(points, views, gap, self.num_threads, label)
+        return ~seen_through(
+            points, views, min(self.occupancy.config.see_through, least or np.inf), self.num_threads, label
+        )
 
     def _audit(
         self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]

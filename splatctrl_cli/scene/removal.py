@@ -61,16 +61,13 @@ def removals(
     is_free, is_uncertain = _verdict(value, is_observed, config)
     if counts_time:
         buffer.num_uncertain[:] = np.where(is_uncertain, buffer.num_uncertain + 1, 0)
-    has_lost_patience = is_uncertain & (
-        (buffer.num_uncertain > config.uncertain_patience) | (config.rule == "literal")
-    )
     masks = {
         "broken": is_broken,
         "workspace": ~workspace.contains(centers),
         "opacity": buffer.opacities < min_opacity,
         "free": is_free,
         "seen_through": is_floating,
-        "uncertain": has_lost_patience,
+        "uncertain": is_uncertain & ((buffer.num_uncertain > config.uncertain_patience) | (config.rule == "literal")),
         "trail": is_trail,
         "robot": np.zeros(len(centers), bool),
         "weak": np.zeros(len(centers), bool),
@@ -138,8 +135,9 @@ def redundant(
     of_splat = cKDTree(voxels).query_ball_point(splats.centers[order], reach, workers=num_threads)
     asked = np.unique(np.concatenate([np.asarray(found, np.intp) for found in of_splat]))
     count = np.zeros(len(voxels), np.int64)
-    ranks = np.arange(1, min(fixed.EVICT_NEAREST, len(splats)) + 1)
-    distance, nearest = cKDTree(splats.centers).query(voxels[asked], k=ranks, workers=num_threads)
+    distance, nearest = cKDTree(splats.centers).query(
+        voxels[asked], k=np.arange(1, min(fixed.EVICT_NEAREST, len(splats)) + 1), workers=num_threads
+    )
     count[asked] = (distance - splats.radii[nearest] <= tolerance).sum(axis=1)
     chosen: list[np.intp] = []
     for splat, found in zip(order, of_splat, strict=True):

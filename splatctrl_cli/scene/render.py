@@ -69,8 +69,9 @@ def render(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64, *,
         np.ascontiguousarray(splats.colors, np.float32),
     )
     planes = raster.forward()
-    color = np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2))
-    return Rendering(color=color, depth=planes[3].copy(), opacity=planes[4].copy())
+    return Rendering(
+        color=np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2)), depth=planes[3].copy(), opacity=planes[4].copy()
+    )
 
 
 def loss_weights(config: SceneConfig, background: Color = BLACK) -> LossWeights:
@@ -130,5 +131,6 @@ def render_gaussians(
     raster = GaussianRasteriser(num_threads(threads))
     raster.prepare(camera_array(intrinsics, T_world_camera), parameters_of(gaussians))
     planes = raster.forward()
-    color = np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2))
-    return Rendering(color=color, depth=planes[3].copy(), opacity=planes[4].copy())
+    return Rendering(
+        color=np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2)), depth=planes[3].copy(), opacity=planes[4].copy()
+    )

@@ -46,8 +46,12 @@ class RecordedDepth:
             return None
         nearest, median, farthest = (float(q) for q in np.percentile(depth, [10.0, 50.0, 99.5]))
         cameras = sorted({frame.camera for frame in frames})
-        noise = max(depth_noise([f.depth for f in frames if f.camera == camera]) for camera in cameras)
-        return cls(median=median, nearest=nearest, farthest=farthest, noise=noise)
+        return cls(
+            median=median,
+            nearest=nearest,
+            farthest=farthest,
+            noise=max(depth_noise([f.depth for f in frames if f.camera == camera]) for camera in cameras),
+        )
 
 
 def depth_noise(images: Sequence[Float32]) -> float:

@@ -33,5 +33,7 @@ def steadied(
     weight = is_same.astype(np.float32)
     total, num = (cv2.boxFilter(image, -1, (side, side), normalize=False) for image in (weight * offset, weight))
     is_same &= np.abs(total) <= fixed.STEADY_MOVED * error * num
-    depth = np.where(is_same & was_object, earlier.depth + np.float32(fixed.STEADY_GAIN) * offset, frame.depth)
-    return replace(frame, depth=depth), np.asarray(is_same)
+    return replace(
+        frame,
+        depth=np.where(is_same & was_object, earlier.depth + np.float32(fixed.STEADY_GAIN) * offset, frame.depth),
+    ), np.asarray(is_same)

@@ -30,8 +30,9 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     centers = occupancy.centers_of(voxels)
     is_missing = SplatTree(others.centers, others.radii, occupancy.num_threads).are_further(centers, reach)
     is_human = occupancy.entity.reshape(-1)[voxels[is_missing]] & Label.HUMAN > 0
-    labels = np.where(is_human, np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
-    return Balls.of_voxels(centers[is_missing], occupancy.config.voxel, labels)
+    return Balls.of_voxels(
+        centers[is_missing], occupancy.config.voxel, np.where(is_human, np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
+    )
 
 
 def confirmed(found: Balls, before: Balls | None) -> Balls:

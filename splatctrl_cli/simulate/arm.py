@@ -146,9 +146,12 @@ def link_shape(link: str, shape: Capsule | Block) -> Shape:
     if isinstance(shape, Block):
         return Shape(link=link, kind="box", size=shape.size, T_link_shape=pose_at(shape.middle))
     start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
-    T_link_shape = pose_at((start + end) / 2, frame_along(end - start))
-    size = (shape.radius, float(np.linalg.norm(end - start)))
-    return Shape(link=link, kind="capsule", size=size, T_link_shape=T_link_shape)
+    return Shape(
+        link=link,
+        kind="capsule",
+        size=(shape.radius, float(np.linalg.norm(end - start))),
+        T_link_shape=pose_at((start + end) / 2, frame_along(end - start)),
+    )
 
 
 def arm_urdf(visual: Mapping[str, tuple[Capsule | Block, ...]] = SHAPES) -> str:

@@ -203,10 +203,17 @@ def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
 
 
 def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
-    rows = [[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels]
-    facts = {**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)}
-    table = Grid(name="channels", header=("channel", "dtype", "unit"), rows=rows)
-    return Summary(path=str(path), kind=kind, facts=facts, grids=(table,))
+    table = Grid(
+        name="channels",
+        header=("channel", "dtype", "unit"),
+        rows=[[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels],
+    )
+    return Summary(
+        path=str(path),
+        kind=kind,
+        facts={**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)},
+        grids=(table,),
+    )
 
 
 def json_value(text: object) -> object:
@@ -279,8 +286,12 @@ class GridSlabs:
         channels: dict[str, Values] = {
             name: np.lib.format.open_memmap(self.folder / f"{name}.npy", mode="r") for name in self.plan.channels
         }
-        origin = np.array(self.plan.origin, np.float64)
-        return DistanceGrid(origin=origin, voxel=self.plan.voxel, channels=channels, header=dict(header))
+        return DistanceGrid(
+            origin=np.array(self.plan.origin, np.float64),
+            voxel=self.plan.voxel,
+            channels=channels,
+            header=dict(header),
+        )
 
     def _shape(self, name: str, num_layers: int) -> tuple[int, ...]:
         return CHANNELS[name].shape((num_layers, *self.plan.shape[1:]))

@@ -147,9 +147,14 @@ def describe_moveit(path: Path, head: bytes) -> Summary | None:
         return None
     numbers, start = read_moveit_head(path)
     cells = [int(numbers[f"size_{axis}"] * (1.0 / numbers["resolution"])) for axis in "xyz"]
-    place = covers([numbers[f"origin_{axis}"] for axis in "xyz"], numbers["resolution"], cells)
-    facts = {**place, "packed_bytes": path.stat().st_size - start}
-    return Summary(path=str(path), kind="MoveIt distance field", facts=facts)
+    return Summary(
+        path=str(path),
+        kind="MoveIt distance field",
+        facts={
+            **covers([numbers[f"origin_{axis}"] for axis in "xyz"], numbers["resolution"], cells),
+            "packed_bytes": path.stat().st_size - start,
+        },
+    )
 
 
 ENTRIES = (

@@ -185,8 +185,11 @@ def describe_vti(path: Path, head: bytes) -> Summary | None:
         return summary_of(path, "ParaView image data", read_vti_head(path))
     facts: dict[str, object] = dict(_ATTRIBUTE.findall(image[1]))
     arrays = [dict(_ATTRIBUTE.findall(attributes)) for attributes in re.findall(r"<DataArray\b([^>]*)>", text)]
-    rows = [[a.get("Name", "-"), a.get("type", "-"), a.get("NumberOfComponents", "1")] for a in arrays]
-    grid = Grid(name="arrays", header=("array", "type", "components"), rows=rows)
+    grid = Grid(
+        name="arrays",
+        header=("array", "type", "components"),
+        rows=[[a.get("Name", "-"), a.get("type", "-"), a.get("NumberOfComponents", "1")] for a in arrays],
+    )
     return Summary(path=str(path), kind="ParaView image data", facts=facts, grids=(grid,))
 
 

@@ -182,9 +182,11 @@ class SceneFolder:
         robot.
         """
         metrics = self.run.get("metrics", {})
-        bend = {"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}
-        kept = {name: metrics[name] for name in MADE_FROM if name in metrics}
-        return {"inputs": self.run.get("inputs", {}), **kept, **bend}
+        return {
+            "inputs": self.run.get("inputs", {}),
+            **{name: metrics[name] for name in MADE_FROM if name in metrics},
+            **({"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}),
+        }
 
     @property
     def cameras(self) -> tuple[str, ...]:

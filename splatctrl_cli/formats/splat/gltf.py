@@ -122,8 +122,11 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     }
     if (gaussians.labels != Label.OBJECT).any():
         tables["_LABEL"] = gaussians.labels[:, None].astype(np.float32)
-    attributes = {name: number for number, name in enumerate(tables)}
-    primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: PROPERTIES}}
+    primitive = {
+        "mode": 0,
+        "attributes": {name: number for number, name in enumerate(tables)},
+        "extensions": {EXTENSION: PROPERTIES},
+    }
     document = {
         "asset": {"version": "2.0", "generator": "splatctrl", "extras": {"frame": "world", **comments}},
         "extensionsUsed": [EXTENSION],

@@ -153,8 +153,11 @@ def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
     """Clip to the format's ranges, without labels."""
     harmonics = np.clip(gaussians.harmonics, *HARMONICS)
     harmonics[:, 0] = np.clip(gaussians.harmonics[:, 0], -127.5 / COLOR_SCALE, 127.5 / COLOR_SCALE)
-    scales = np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32)
-    return replace(without_labels(gaussians), harmonics=harmonics, scales=scales)
+    return replace(
+        without_labels(gaussians),
+        harmonics=harmonics,
+        scales=np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32),
+    )
 
 
 def spz_bound(gaussians: GaussianSet) -> Differences:

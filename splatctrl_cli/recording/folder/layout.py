@@ -132,17 +132,20 @@ def paired_by_stamp(
     """Pair files by stamp [ns] within the tolerance; the pose is that at the colour's stamp."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
     pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
-    views = [
-        ListedView(
-            name=f"{colors[i][0] / 1e9:.6f}",
-            color=colors[i][1],
-            depth=depths[j][1],
-            matrix=pose_at(colors[i][0]),
-            stamp_ns=colors[i][0],
-        )
-        for i, j in pairs
-    ]
-    return Pairs(path=path, views=views, unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)))
+    return Pairs(
+        path=path,
+        views=[
+            ListedView(
+                name=f"{colors[i][0] / 1e9:.6f}",
+                color=colors[i][1],
+                depth=depths[j][1],
+                matrix=pose_at(colors[i][0]),
+                stamp_ns=colors[i][0],
+            )
+            for i, j in pairs
+        ],
+        unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)),
+    )
 
 
 def described(

@@ -68,9 +68,14 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
         for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))
         if (stamp := _stamp_ns(path))
     }
-    views = [replace(view, camera=named_lens(lenses, _arkit_lens(pincams, view), str(root))) for view in pairs.views]
     return described(
-        replace(pairs, views=views),
+        replace(
+            pairs,
+            views=[
+                replace(view, camera=named_lens(lenses, _arkit_lens(pincams, view), str(root)))
+                for view in pairs.views
+            ],
+        ),
         root,
         options,
         poses=PosesTable(format="rotation-vectors", file=TRAJECTORY),

@@ -127,13 +127,16 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
         )
         columns = {name: _blocks(checked(f"{place}/{name}.npy")) for name in stream["columns"]}
         streams.append(JointStream(tuple(stream["joints"]), stamps, log_times, columns))
-    topic = Topic(
-        name=entry["topic"],
-        type_name=entry["type"],
-        encoding="cdr",
-        definition="kept" if entry["has_definition"] else "",
+    return TopicSurvey(
+        topic=Topic(
+            name=entry["topic"],
+            type_name=entry["type"],
+            encoding="cdr",
+            definition="kept" if entry["has_definition"] else "",
+        ),
+        count=int(entry["messages"]),
+        joints=JointLog(streams, int(entry["states"])),
     )
-    return TopicSurvey(topic=topic, count=int(entry["messages"]), joints=JointLog(streams, int(entry["states"])))
 
 
 def write_rows(stream: IO[bytes], rows: Table) -> None:
