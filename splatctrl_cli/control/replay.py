@@ -115,13 +115,16 @@ class StepRecord(Protocol):
     """Storage of T steps: stamps (T,), postures (T, J) and steps."""
 
     @property
-    def stamp_ns(self) -> Stamps: ...
+    def stamp_ns(self) -> Stamps:
+        """Stamps (T,) [ns]."""
 
     @property
-    def position(self) -> FloatRows: ...
+    def position(self) -> FloatRows:
+        """Postures (T, J) before each step."""
 
     @property
-    def steps(self) -> Sequence[ControlStep]: ...
+    def steps(self) -> Sequence[ControlStep]:
+        """Steps so far."""
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
         """Append a step."""
