@@ -20,7 +20,7 @@ from splatctrl_cli.kernels.raster import (
 from splatctrl_cli.records import Float32, Float64
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.keyframes import View
-from splatctrl_cli.scene.relocation import Misfit
+from splatctrl_cli.scene.removal import Misfit
 from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
 
 

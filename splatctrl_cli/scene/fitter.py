@@ -22,8 +22,7 @@ from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
-from splatctrl_cli.scene.relocation import use_idle
-from splatctrl_cli.scene.removal import REASONS, removals, room_for
+from splatctrl_cli.scene.removal import REASONS, removals, room_for, use_idle
 from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
     Candidates,
@@ -50,8 +49,7 @@ from splatctrl_cli.scene.self_mask import (
     without,
 )
 from splatctrl_cli.scene.shell import Shell
-from splatctrl_cli.scene.steady_depth import steadied
-from splatctrl_cli.scene.time_steps import AuditRow, Refined
+from splatctrl_cli.scene.time_steps import AuditRow, Refined, steadied
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
 from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 

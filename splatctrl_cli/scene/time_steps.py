@@ -1,14 +1,16 @@
-"""Time steps from records, the workspace's box, and a step's report."""
+"""Time steps from records, the workspace's box, a step's report, and depth averaged over steps."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.config.fixed import FRAMES_PER_STEP, JOINTS_GAP_NS
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Box, Float32, Float64, JointState, PointCloud, Record, RgbdFrame
+from splatctrl_cli.records import Bool, Box, Float32, Float64, JointState, PointCloud, Record, RgbdFrame
 from splatctrl_cli.scene.buffer import Filled
 from splatctrl_cli.scene.seeding import thinned, thinning, world_points_at
 
@@ -178,3 +180,33 @@ def depth_box(frames: Sequence[RgbdFrame], max_range: float, scale: float = 1.0)
     lower, upper = np.percentile(joined, [0.5, 99.5], axis=0)
     margin = 0.02 * (upper - lower) + 0.02 * scale
     return Box(lower=lower - margin, upper=upper + margin)
+
+
+def steadied(
+    frame: RgbdFrame, before: tuple[RgbdFrame, Bool] | None, is_object: Bool, config: OccupancyConfig
+) -> tuple[RgbdFrame, Bool]:
+    """Frame with a running mean of its depth, and its steady pixels (H, W).
+
+    An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2. Depths around
+    it may change by at most `STEADY_MOVED` `depth_error` z^2 on average: a moving surface lags no more. Only what was
+    an object before is averaged: a mean with the robot's surface is in mid-air.
+
+    before: the camera's last averaged frame and object pixels; None: no pixel is steady. If the camera moved, depth
+    stays, and all pixels are steady.
+    """
+    if before is None or before[1].shape != frame.depth.shape:
+        return frame, np.zeros(frame.depth.shape, bool)
+    earlier, was_object = before
+    if not np.array_equal(earlier.T_world_camera, frame.T_world_camera):
+        return frame, np.ones(frame.depth.shape, bool)
+    offset = frame.depth - earlier.depth
+    error = config.depth_error * frame.depth**2
+    is_same = is_object & (earlier.depth > 0) & (np.abs(offset) <= fixed.STEADY_SIGMAS * error)
+    side = 2 * round(frame.intrinsics.width / fixed.MASK_EDGE) + 1
+    weight = is_same.astype(np.float32)
+    total, num = (cv2.boxFilter(image, -1, (side, side), normalize=False) for image in (weight * offset, weight))
+    is_same &= np.abs(total) <= fixed.STEADY_MOVED * error * num
+    return replace(
+        frame,
+        depth=np.where(is_same & was_object, earlier.depth + np.float32(fixed.STEADY_GAIN) * offset, frame.depth),
+    ), np.asarray(is_same)
