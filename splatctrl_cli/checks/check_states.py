@@ -361,7 +361,6 @@ def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) 
     agreement = pose_agreement(model, states)
     if agreement is not None and agreement.verdict != "still":
         is_good = agreement.verdict in {"agree", "tool"}
-        value = 1e3 * agreement.difference.median_position
         make = note if is_good else error
         found.append(
             make(
@@ -369,7 +368,7 @@ def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) 
                 where,
                 agreement.sentence,
                 "" if is_good else "give the URDF of this very robot, and its --base",
-                value=value,
+                value=1e3 * agreement.difference.median_position,
                 unit="mm",
             )
         )

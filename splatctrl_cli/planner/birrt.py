@@ -109,8 +109,7 @@ class _Search:
         """
         near = tree.nearest(targets)
         way = targets - tree.q[near]
-        length = np.linalg.norm(way, axis=1)
-        way *= np.minimum(1.0, self.config.reach / np.maximum(length, 1e-12))[:, None]
+        way *= np.minimum(1.0, self.config.reach / np.maximum(np.linalg.norm(way, axis=1), 1e-12))[:, None]
         is_free = self.free_shares(tree.q[near], tree.q[near] + way, only_whole=True) >= 1.0
         return tree.add(tree.q[near[is_free]] + way[is_free], near[is_free])
 
@@ -264,8 +263,7 @@ def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float6
 def _cut(path: Float64, cut: Float64) -> Float64:
     first, last = int(np.floor(cut[0])), int(np.ceil(cut[1]))
     rows = np.concatenate([path[: first + 1], _points(path, cut), path[last:]])
-    is_new = np.r_[True, np.linalg.norm(np.diff(rows, axis=0), axis=1) > 1e-12]
-    cut_path = rows[is_new]
+    cut_path = rows[np.r_[True, np.linalg.norm(np.diff(rows, axis=0), axis=1) > 1e-12]]
     cut_path[-1] = path[-1]
     return cut_path
 

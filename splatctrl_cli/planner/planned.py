@@ -129,10 +129,14 @@ def planned_path(
         room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
         outcome, way = _found(room, task, goals, approach, planner, control)
         if outcome is PlanOutcome.SOLVED:
-            rates = effector_rates(
-                model, way, frame, max_linear=control.max_linear_speed, max_angular=control.max_angular_speed
+            path = timed(
+                way,
+                model.velocity_limit,
+                planner.max_acceleration,
+                max_rate=effector_rates(
+                    model, way, frame, max_linear=control.max_linear_speed, max_angular=control.max_angular_speed
+                ),
             )
-            path = timed(way, model.velocity_limit, planner.max_acceleration, max_rate=rates)
             check = check_edges(room, way[:-1], way[1:], contact=planner.contact / 2)
             num_edges, num_proved = len(check.free_share), int(np.sum(check.is_free))
     return PlannedPath(
@@ -203,8 +207,7 @@ def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlCo
         best = int(np.argmin(short))
         margin, self_margin = min(margin, float(scene[1 + best])), min(self_margin, float(own[1 + best]))
     keeps = (scene[1:] >= margin) & (own[1:] >= self_margin)
-    is_free = (scene[1:] > 0) & (own[1:] > 0)
-    return margin, self_margin, goals[keeps & is_free]
+    return margin, self_margin, goals[keeps & ((scene[1:] > 0) & (own[1:] > 0))]
 
 
 def planned_detours(

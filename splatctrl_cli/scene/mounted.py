@@ -33,8 +33,7 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None
     colors = np.stack([_blurred(frame) for frame in frames])
-    median = np.median(colors, axis=0)
-    deviation = np.median(np.abs(colors - median), axis=0).max(axis=-1)
+    deviation = np.median(np.abs(colors - np.median(colors, axis=0)), axis=0).max(axis=-1)
     has_depth = np.mean([frame.depth >= min_range for frame in frames], axis=0, dtype=np.float64)
     depth_share = uniform_filter(has_depth, fixed.MOUNTED_WINDOW)
     found = (deviation < fixed.MOUNTED_DEVIATION) & (depth_share < fixed.MOUNTED_DEPTH)

@@ -97,8 +97,7 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
 
     Raises InputError without sdf, or for an unknown name, dtype or shape.
     """
-    strange = [channel for channel in arrays if channel not in CHANNELS]
-    if strange or "sdf" not in arrays:
+    if not {"sdf"} <= arrays.keys() <= CHANNELS.keys():
         raise InputError(
             f"{name}: expected the channel sdf and any of {', '.join(list(CHANNELS)[1:])}, "
             f"got {', '.join(arrays) or 'none'}",
