@@ -171,7 +171,8 @@ class ArrayFile(ABC):
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
     ) -> tuple[Stamps, dict[str, Rows]]:
         """Read `stamps`, and each group's `columns`."""
-        return self.stamps(time, unit_ns, epoch_ns), {key: self.columns(names) for key, names in groups.items()}
+        columns = {key: self.columns(names) for key, names in groups.items()}
+        return self.stamps(time, unit_ns, epoch_ns), columns
 
     def rows(self, name: str) -> Rows:
         """An array (T, ...); T may be 0. Raises InputError if not numbers."""

@@ -92,11 +92,8 @@ def read_states(path: Path) -> OccupancyGrid:
     with _refused(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         header = json.loads(str(arrays["header"]))
-        return OccupancyGrid.from_states(
-            np.array(header["origin"], np.float64),
-            float(header["voxel"]),
-            _voxels(arrays["states"], "states", np.uint8, header),
-        )
+        states = _voxels(arrays["states"], "states", np.uint8, header)
+        return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
