@@ -28,7 +28,7 @@ from splatctrl_cli.config.fixed import BANDS
 from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, band_accuracy
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, LogSumExpField, SafeField, SeField, SphereField
-from splatctrl_cli.field.health import median_spacing
+from splatctrl_cli.field.slabs import median_spacing
 from splatctrl_cli.field.weights import METHODS
 from splatctrl_cli.records import Float64
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli import InputError
-from splatctrl_cli.blocks import ArmModel, Clearance, Float64, fixed, pose_error
+from splatctrl_cli.blocks import Clearance, Float64, RobotModel, fixed, pose_error
 
 MAX_PIECES = 200_000  # of a path, when its clearance is proved
 ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances
@@ -29,7 +29,7 @@ def joint_length(waypoints: Float64) -> float:
     return float(np.sum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
 
 
-def effector_length(model: ArmModel, postures: Float64, frame: str) -> tuple[float, float]:
+def effector_length(model: RobotModel, postures: Float64, frame: str) -> tuple[float, float]:
     """Return the length [m] and the turn [degrees] of a frame's path over postures (K, J)."""
     poses = [model.frame_pose(q, frame) for q in postures]
     steps = [pose_error(a, b) for a, b in pairwise(poses)]

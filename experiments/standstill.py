@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from splatctrl_cli import Box, UsageError
-from splatctrl_cli.blocks import ArmModel, Bool, Float64, LoggedMotion, Stamps, runs_of
+from splatctrl_cli.blocks import Bool, Float64, LoggedMotion, RobotModel, Stamps, runs_of
 
 MAX_RESUME = 100.0  # [m] a zone wider than any hall would hold the arm for ever
 ZONE_RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
@@ -36,7 +36,7 @@ class StopZone(Protocol):
     """Where people must not be for the arm to move."""
 
     def is_entered(
-        self, model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
+        self, model: RobotModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
     ) -> bool:
         """Whether the arm at q (J,) has to hold; one that is held already goes on only after more room."""
         ...
@@ -56,7 +56,7 @@ class Zone:
             )
 
     def is_entered(
-        self, model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
+        self, model: RobotModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
     ) -> bool:
         """See `StopZone`."""
         return distance_to_people(model, q, stamp_ns, people) < (self.resume if is_held else self.stop)
@@ -74,7 +74,7 @@ class BoxZone:
             raise UsageError(f"zone: expected a hysteresis of 0 or more, got {self.hysteresis:g} m")
 
     def is_entered(
-        self, model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
+        self, model: RobotModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
     ) -> bool:
         """See `StopZone`; wherever the arm is."""
         room = self.hysteresis if is_held else 0.0
@@ -134,7 +134,7 @@ class Separation:
         }
 
 
-def distance_to_people(model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople) -> float:
+def distance_to_people(model: RobotModel, q: Float64, stamp_ns: int, people: DistanceToPeople) -> float:
     """The distance [m] of the nearest moving sphere's surface at q (J,) to the nearest person."""
     moving = np.flatnonzero(model.moving_spheres)
     centers = np.ascontiguousarray(model.sphere_centers(q)[moving])
@@ -152,7 +152,7 @@ class Standstill(Separation):
 
 
 def monitored_standstill(
-    model: ArmModel, motion: LoggedMotion, people: DistanceToPeople, zone: StopZone, *,
+    model: RobotModel, motion: LoggedMotion, people: DistanceToPeople, zone: StopZone, *,
     start_ns: int, period: float, max_wait: float, max_acceleration: float = 0.0,
 ) -> Standstill:  # fmt: skip
     """The path of `motion` from `start_ns`, time-stretched by every stop; people move in the log's time all along.
@@ -199,7 +199,7 @@ def _fastest(motion: LoggedMotion, start_ns: int) -> float:
 
 
 def separation_of(
-    model: ArmModel, stamp_ns: Stamps, position: Float64, velocity: Float64, people: DistanceToPeople, *,
+    model: RobotModel, stamp_ns: Stamps, position: Float64, velocity: Float64, people: DistanceToPeople, *,
     still: float, is_complete: bool,
 ) -> Separation:  # fmt: skip
     """The same of a known motion, T states with velocity (T, J); stopped: no joint faster than `still` [rad/s]."""

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli.blocks import (
-    ArmModel,
     ControlConfig,
     ControlStep,
     DistanceField,
@@ -14,6 +13,7 @@ from splatctrl_cli.blocks import (
     Guide,
     PlannerConfig,
     QpIkController,
+    RobotModel,
     SceneStep,
     TimedPath,
     guided_goal,
@@ -25,7 +25,7 @@ from splatctrl_cli.blocks import (
 FOLLOW_GAIN = 10.0  # [1/s] joint error to velocity, following a path in joint space
 
 
-def follow_joints(path: TimedPath, model: ArmModel, control: ControlConfig) -> Float64:
+def follow_joints(path: TimedPath, model: RobotModel, control: ControlConfig) -> Float64:
     """Follow in joint space: the path's velocity plus a pull towards its position, within the velocity limits.
 
     Returns the position (T, J) [rad] at every period.
@@ -42,7 +42,7 @@ def follow_joints(path: TimedPath, model: ArmModel, control: ControlConfig) -> F
 
 def follow_with_controller(
     path: TimedPath,
-    model: ArmModel,
+    model: RobotModel,
     field_at: Callable[[int], DistanceField],
     frame: str,
     planner: PlannerConfig,

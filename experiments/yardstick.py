@@ -10,12 +10,12 @@ import numpy as np
 
 from experiments.paths import effector_length, joint_length
 from splatctrl_cli.blocks import (
-    ArmModel,
     Bool,
     ControlConfig,
     DistanceFunction,
     DistancesAt,
     Float64,
+    RobotModel,
     Stamps,
     audit,
     is_at_goal,
@@ -74,7 +74,7 @@ class Yardstick:
     `proved_clearance` takes it; truth is None where it is not known.
     """
 
-    model: ArmModel
+    model: RobotModel
     frame: str
     T_world_goal: Float64
     config: ControlConfig
@@ -104,7 +104,7 @@ class Yardstick:
         )
 
 
-def proved_clearance(model: ArmModel, motion: Motion, certified_at: Callable[[int], DistanceFunction]) -> float:
+def proved_clearance(model: RobotModel, motion: Motion, certified_at: Callable[[int], DistanceFunction]) -> float:
     """What no moving sphere's distance [m] goes below, at the states and between them; NaN where one is missing.
 
     certified_at gives at a stamp a lower bound of a 1-Lipschitz distance, the same object for the same scene. Half
@@ -123,7 +123,7 @@ def proved_clearance(model: ArmModel, motion: Motion, certified_at: Callable[[in
     return least
 
 
-def _true_clearance(model: ArmModel, motion: Motion, truth: TrueDistance) -> float:
+def _true_clearance(model: RobotModel, motion: Motion, truth: TrueDistance) -> float:
     moving = np.flatnonzero(model.moving_spheres)
     centers = model.sphere_centers_batch(motion.position)[:, moving]
     radii = model.sphere_set.radii[moving]

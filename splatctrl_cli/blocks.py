@@ -6,7 +6,6 @@ Jobs and requests are in `splatctrl_cli.api`; these names may change with a mino
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
 from splatctrl_cli.config.fixed import START_ROOM
 from splatctrl_cli.config.ranges import checked_pose
-from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audit
 from splatctrl_cli.control.barriers import SceneStep, rate_of
 from splatctrl_cli.control.events import runs_of
@@ -66,7 +65,17 @@ from splatctrl_cli.kernels import raster as gaussian_kernels
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
 from splatctrl_cli.libraries import is_installed, mpl, of_extra
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, OnlyDistance, check_edges
+from splatctrl_cli.planner.configuration_clearance import (
+    Ball,
+    Clearance,
+    Cuboid,
+    HasDistance,
+    OnlyDistance,
+    Rod,
+    Solid,
+    Solids,
+    check_edges,
+)
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     START_BLOCKED,
@@ -76,7 +85,6 @@ from splatctrl_cli.planner.planned import (
     planned_path,
     resampled,
 )
-from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.recording.calibrated import Perturbation
 from splatctrl_cli.recording.folder.dtu import scan_folders
 from splatctrl_cli.recording.folder.idr import idr_scans
@@ -99,6 +107,7 @@ from splatctrl_cli.records import (
 from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
+from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.fitter import SceneFitter
@@ -130,7 +139,6 @@ __all__ = [
     "START_NS",
     "START_ROOM",
     "SURFACE_SCANS",
-    "ArmModel",
     "AuditRow",
     "Baker",
     "Ball",

@@ -4,7 +4,8 @@ Wording is ``thing: expected X, got Y``; the remedy follows a semicolon.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 DAMAGED = 3  # exit code: done, but part of the recording is damaged
 DAMAGE = "part of the recording is damaged and left out"
@@ -37,6 +38,15 @@ class InputError(SplatCtrlError):
     """The input is missing or unusable (exit code 4)."""
 
     exit_code = 4
+
+
+@contextmanager
+def refuse_faults(what: str, *faults: type[Exception], remedy: str = "") -> Iterator[None]:
+    """Raise InputError ``what: fault`` for one of these faults in the block."""
+    try:
+        yield
+    except faults as fault:
+        raise InputError(f"{what}: {fault}", remedy=remedy) from None
 
 
 class NotEvaluableError(SplatCtrlError):

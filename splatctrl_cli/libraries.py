@@ -5,9 +5,10 @@ Lazy ones take most of a second to load.
 
 from importlib import import_module
 from importlib.util import find_spec
+from operator import attrgetter
 from pkgutil import iter_modules
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from splatctrl_cli.errors import UsageError
 
@@ -53,18 +54,11 @@ def of_extra(module: str, extra: str, what: str) -> Any:
 __all__ = ["distributed", "is_installed", "mpl", "of_extra", "scipy_io", "trimesh"]
 
 
-class Ordered(Protocol):
-    """A registry entry; lists and trials start with the lowest `order`."""
-
-    @property
-    def order(self) -> int: ...
-
-
-Entry = TypeVar("Entry", bound=Ordered)
+Entry = TypeVar("Entry")  # of a registry; lists and trials start with the lowest `order`
 
 
 def entries_of(room: str, kind: type[Entry]) -> tuple[Entry, ...]:
     """Return the entries of type `kind` in the ``ENTRIES`` of a room's modules, in order."""
     modules = [import_module(f"{room}.{found.name}") for found in iter_modules(import_module(room).__path__)]
     found = [entry for module in modules for entry in getattr(module, "ENTRIES", ()) if isinstance(entry, kind)]
-    return tuple(sorted(found, key=lambda entry: entry.order))
+    return tuple(sorted(found, key=attrgetter("order")))

@@ -35,13 +35,17 @@ class FloatRows(Protocol):
     """Rows (T, ...) of float64 by number, slice or index (K,), in memory or a file."""
 
     @property
-    def shape(self) -> tuple[int, ...]: ...
+    def shape(self) -> tuple[int, ...]:
+        """(T, ...)."""
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        """T."""
 
-    def __getitem__(self, which: Any, /) -> Any: ...
+    def __getitem__(self, which: Any, /) -> Any:
+        """Return a row, or rows of a slice or an index."""
 
-    def __iter__(self) -> Iterator[Any]: ...
+    def __iter__(self) -> Iterator[Any]:
+        """Yield the rows."""
 
 
 class Label(IntEnum):
@@ -113,17 +117,7 @@ def spread(items: Sequence[Item], most: int) -> list[Item]:
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))]
 
 
-class Stamped(Protocol):
-    """An item with a time."""
-
-    @property
-    def stamp_ns(self) -> int: ...
-
-
-_Item = TypeVar("_Item", bound=Stamped)
-
-
-def by_stamp(*streams: Iterable[_Item]) -> Iterator[_Item]:
+def by_stamp(*streams: Iterable[Item]) -> Iterator[Item]:
     """Merge sorted streams by stamp; at equal stamps, earlier streams come first."""
     return heapq.merge(*streams, key=attrgetter("stamp_ns"))
 
@@ -157,39 +151,37 @@ class LossReport:
     def plus(self, other: "LossReport", notes: list[str], sign: int = 1) -> "LossReport":
         """Return the sum of both counts (sign -1: the difference), with these notes."""
         names = [column.name for column in fields(self) if column.name != "notes"]
-        counts = {name: getattr(self, name) + sign * getattr(other, name) for name in names}
-        return LossReport(**counts, notes=notes)
+        return LossReport(**{name: getattr(self, name) + sign * getattr(other, name) for name in names}, notes=notes)
 
 
 class RecordSource(Protocol):
     """A recorded dataset as records in time order (log, capture, image folder)."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The file's or folder's name."""
 
     @property
-    def cameras(self) -> tuple[str, ...]: ...
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
 
     @property
-    def joint_names(self) -> tuple[str, ...]: ...
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints in the order of the states."""
 
     @property
     def has_clock(self) -> bool:
         """False for invented stamps (static views)."""
-        ...
 
     @property
     def loss(self) -> LossReport:
         """Complete once `records` is exhausted."""
-        ...
 
     def records(self) -> Iterator[Record]:
         """Yield records by stamp; joint states precede frames of the same stamp."""
-        ...
 
     def digests(self) -> dict[str, str]:
         """Return sha256 of every input file, by name."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,7 +289,6 @@ class DistanceField(Protocol):
 
         The gradient is not normalised.
         """
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

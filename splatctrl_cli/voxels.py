@@ -92,9 +92,13 @@ class OccupancyGrid:
         log_odds = np.zeros(states.shape, np.float32)
         log_odds[states == VoxelState.FREE] = -20.0
         log_odds[states == VoxelState.OCCUPIED] = 20.0
-        entity = np.where(states == VoxelState.SWEPT_BY_ROBOT, np.uint8(SWEPT), np.uint8(0))
-        num_updates = is_seen.astype(np.uint16)
-        return cls(origin=origin, voxel=voxel, log_odds=log_odds, num_updates=num_updates, entity=entity)
+        return cls(
+            origin=origin,
+            voxel=voxel,
+            log_odds=log_odds,
+            num_updates=is_seen.astype(np.uint16),
+            entity=np.where(states == VoxelState.SWEPT_BY_ROBOT, np.uint8(SWEPT), np.uint8(0)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from experiments.gaussian_fitter import (
 from splatctrl_cli.config import Config, SceneConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Box, GaussianSet, RgbdFrame
-from splatctrl_cli.scene.gaussians import parameters_of, render_gaussians
+from splatctrl_cli.scene.render import parameters_of, render_gaussians
 from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame, looking_down
 
 FAST = GaussianSettings(iterations=300, densify_from=60, densify_every=30, reset_every=0.2)

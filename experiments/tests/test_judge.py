@@ -16,13 +16,13 @@ from experiments.problems import Problem, Views, read_problem, views_of
 from experiments.tests.conftest import HOME, blind
 from experiments.trial import OURS, Attempt, Rig, Trial, trial_of
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict, held, verdict_of
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.replay import evidence_criteria
 from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.sphere_files import sphere_names
 
 
 def test_a_way_that_touches_a_thing_between_two_states_alone_has_collided(problem: Problem, views: Views) -> None:

@@ -209,8 +209,7 @@ class Adjustment:
         T = invert_transform(T_b) @ T_a
         there = transform_points(T, points)
         lands, recorded, normals = landed(there, b)
-        z = np.where(lands, recorded[:, 2], 1.0)
-        surface = recorded * (scale_b + bias_b / z)[:, None]
+        surface = recorded * (scale_b + bias_b / np.where(lands, recorded[:, 2], 1.0))[:, None]
         behind, turned = there[:, 2] - surface[:, 2], a.point_normals @ T[:3, :3].T
         lands &= (behind < 3 * reach) & (np.einsum("ki,ki->k", turned, there) < 0)  # else b cannot see them
         lands &= np.any(normals != 0, axis=1)

@@ -113,8 +113,9 @@ def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
         corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(gray)
         if ids is None or len(ids) < FEWEST_MARKERS:
             continue
-        size = (board.columns + 1, board.rows + 1)
-        drawn = cv2.aruco.CharucoBoard(size, board.square, 0.5 * board.square, dictionary)
+        drawn = cv2.aruco.CharucoBoard(
+            (board.columns + 1, board.rows + 1), board.square, 0.5 * board.square, dictionary
+        )
         numbers, places = np.ravel(np.asarray(drawn.getIds())), np.asarray(drawn.getObjPoints())
         middles = dict(zip(numbers.tolist(), places.mean(axis=1), strict=True))
         seen = [(middles[i], c.reshape(4, 2).mean(axis=0)) for i, c in zip(ids.ravel().tolist(), corners, strict=True)
@@ -133,15 +134,15 @@ def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
         window = int(np.clip(edge / 4, 2, 10))
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
         start = np.ascontiguousarray(pixels.reshape(-1, 1, 2), np.float32)
-        refined = cv2.cornerSubPix(gray, start, (window, window), (-1, -1), stop)
-        return np.asarray(refined, np.float64).reshape(-1, 2)
+        return np.asarray(cv2.cornerSubPix(gray, start, (window, window), (-1, -1), stop), np.float64).reshape(-1, 2)
     return None
 
 
 def _sighting(board: Board, frame: RgbdFrame, pixels: Float64) -> Sighting | None:
     """The board's pose: a plane's corners allow two, and depth decides."""
-    matrix = matrix_of(frame.intrinsics)
-    _, turns, moves, errors = cv2.solvePnPGeneric(board.points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    _, turns, moves, errors = cv2.solvePnPGeneric(
+        board.points, pixels, matrix_of(frame.intrinsics), None, flags=cv2.SOLVEPNP_IPPE
+    )
     fits: list[tuple[float, Float64, float | None]] = []
     for turn, move, error in zip(turns, moves, np.ravel(errors), strict=True):
         T = pose_at(np.ravel(move), cv2.Rodrigues(turn)[0])
@@ -379,5 +380,4 @@ def middle_pose(poses: Sequence[Float64]) -> Float64:
     few = np.array(spread(poses, 100))
     moves = np.linalg.norm(few[:, None, :3, 3] - few[None, :, :3, 3], axis=2)
     cosines = (np.einsum("iab,jab->ij", few[:, :3, :3], few[:, :3, :3]) - 1) / 2
-    away = moves + 0.3 * np.arccos(np.clip(cosines, -1, 1))
-    return np.asarray(few[int(np.argmin(away.sum(axis=1)))])
+    return np.asarray(few[int(np.argmin((moves + 0.3 * np.arccos(np.clip(cosines, -1, 1))).sum(axis=1)))])

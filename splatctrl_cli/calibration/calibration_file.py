@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.summary import Grid, Summary
+from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.geometry import quat_from_rotation, transform_from
 from splatctrl_cli.records import Float64
 
@@ -109,12 +110,8 @@ def calibration_text(calibration: Calibration) -> str:
 
 def read_calibration(path: Path) -> Calibration:
     """Read a calibration. Raises InputError for a missing, another or a damaged file."""
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give what calibrate wrote") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not TOML: {error}", remedy=AGAIN) from None
+    with refuse_faults(f"{path}: not TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=AGAIN):
+        content = tomllib.loads(read_text(path, "give what calibrate wrote"))
     if content.get("format") != FORMAT:
         raise InputError(f"{path}: expected a calibration, got another file", remedy="give what calibrate wrote")
     if content.get("version") != VERSION:

@@ -221,8 +221,9 @@ class Arm:
         for stamp in stamps:
             poses = self.surface_poses(stamp)
             if poses is not None:
-                tips = [transform_points(T, 0.1 * np.eye(3)) for T in poses]
-                places.append(np.concatenate([poses[:, :3, 3], *tips]))
+                places.append(
+                    np.concatenate([poses[:, :3, 3], *[transform_points(T, 0.1 * np.eye(3)) for T in poses]])
+                )
         if len(places) < 2:
             return 0.0
         return float(np.linalg.norm(np.array(places) - places[0], axis=2).max())

@@ -43,10 +43,12 @@ def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
         valid=None,
     )
     view = DepthView.of(small, fixed.REFINE_POINTS, 2)
-    slope = np.stack([cv2.Sobel(gray, cv2.CV_32F, dx, 1 - dx, ksize=3) / 8 for dx in (1, 0)], axis=-1)
     u, v = np.round(project(view.lens, view.points)).astype(np.int64).T
     return GrayView(
-        depth=view, gray=np.asarray(gray, np.float32), slope=slope, points_gray=gray[v, u].astype(np.float64)
+        depth=view,
+        gray=np.asarray(gray, np.float32),
+        slope=np.stack([cv2.Sobel(gray, cv2.CV_32F, dx, 1 - dx, ksize=3) / 8 for dx in (1, 0)], axis=-1),
+        points_gray=gray[v, u].astype(np.float64),
     )
 
 

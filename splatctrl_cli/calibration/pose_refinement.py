@@ -336,8 +336,9 @@ def _distances(
     """Median distance of points from other surfaces; `odd`: those not in `rows_of`."""
     found = [np.zeros(0)]
     for i, j in pairs:
-        T = invert_transform(poses[j]) @ poses[i]
-        _, lands, _, _, distance = on_surface(views[i], views[j], T, slice(int(odd), None, 2))
+        _, lands, _, _, distance = on_surface(
+            views[i], views[j], invert_transform(poses[j]) @ poses[i], slice(int(odd), None, 2)
+        )
         found.append(np.minimum(np.abs(distance[lands]), fixed.REFINE_FARTHEST[0]))
     every = np.concatenate(found)
     return float(np.median(every)) if len(every) else 0.0

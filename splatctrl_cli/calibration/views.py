@@ -74,10 +74,13 @@ def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
     """Every n-th pixel, for at most about `rows` rows; without colour."""
     stride = max(1, frame.depth.shape[0] // rows)
     depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
-    lens = strided_lens(frame.intrinsics, stride)
-    human = None if frame.human is None else frame.human[::stride, ::stride]
     return replace(
-        frame, depth=depth, color=np.zeros((*depth.shape, 3), np.uint8), intrinsics=lens, human=human, valid=None
+        frame,
+        depth=depth,
+        color=np.zeros((*depth.shape, 3), np.uint8),
+        intrinsics=strided_lens(frame.intrinsics, stride),
+        human=None if frame.human is None else frame.human[::stride, ::stride],
+        valid=None,
     )
 
 
@@ -140,8 +143,7 @@ def overlap_rows(
     points (K, 3): of the other view, at T (4, 4); which (K,): those that land (`landed`).
     """
     there, normal = transform_points(T, points[which]), normals[which]
-    residual = np.einsum("ki,ki->k", there - surface[which], normal)
-    return residual, by_twists(points[which], there, normal, T)
+    return np.einsum("ki,ki->k", there - surface[which], normal), by_twists(points[which], there, normal, T)
 
 
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:

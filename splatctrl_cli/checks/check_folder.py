@@ -65,8 +65,12 @@ def judged(
     """
     findings = [*report.findings, *alignment_findings(evidence.frames)]
     frames, is_still = usable_frames(evidence.frames, findings), report.start_ns is None
-    is_sure = not is_still or not (evidence.is_guessed or are_far(frames))
-    wrong, scaled, corrected = check_views(frames, evidence.depth_units, is_sure=is_sure, only_errors=only_errors)
+    wrong, scaled, corrected = check_views(
+        frames,
+        evidence.depth_units,
+        is_sure=not is_still or not (evidence.is_guessed or are_far(frames)),
+        only_errors=only_errors,
+    )
     findings += wrong if only_errors else [*wrong, *exposure_findings(corrected)]
     states = None if only_errors else evidence.states
     if states is not None and not any(finding.code == "joints-degrees" for finding in findings):

@@ -76,8 +76,15 @@ class ImageWatch:
         if self.kept.is_next():
             stride = stride_of(height)
             small = cv2.resize(color, (-(-width // stride), -(-height // stride)), interpolation=cv2.INTER_AREA)
-            kept = np.asarray(small, dtype=np.uint8)
-            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, pixels=kept))
+            self.kept.add(
+                Kept(
+                    stamp_ns=stamp_ns,
+                    stride=stride,
+                    width=width,
+                    height=height,
+                    pixels=np.asarray(small, dtype=np.uint8),
+                )
+            )
 
     def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
         """Take a depth image (H, W) [m], 0 = none."""
@@ -111,8 +118,8 @@ class ImageWatch:
         self.scale = scale
         if factor != 1.0:
             self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
-            self.medians.change(lambda median: float(median * factor))
-            self.kept.change(lambda kept: replace(kept, pixels=_scaled(kept.pixels, factor)))
+            self.medians[:] = [float(median * factor) for median in self.medians]
+            self.kept[:] = [replace(kept, pixels=_scaled(kept.pixels, factor)) for kept in self.kept]
             self.thumbnails = [(stamp_ns, _scaled(image, factor)) for stamp_ns, image in self.thumbnails]
 
     @property
@@ -213,7 +220,7 @@ def depth_findings(images: ImageWatch) -> Iterator[Finding]:
         )
         if every:
             return
-    share = float(np.median(list(images.shares)))
+    share = float(np.median(images.shares))
     if share < limits.SOME_DEPTH:
         severity = warning if share < limits.LITTLE_DEPTH else note
         yield severity(

@@ -230,8 +230,7 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
 
 
 def _enlarged(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
-    rows = np.repeat(image, kept.stride, axis=0)[: kept.height]
-    return np.repeat(rows, kept.stride, axis=1)[:, : kept.width]
+    return np.repeat(np.repeat(image, kept.stride, axis=0)[: kept.height], kept.stride, axis=1)[:, : kept.width]
 
 
 def image_motion(

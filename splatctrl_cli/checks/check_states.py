@@ -214,8 +214,7 @@ def _inverse(poses: Float64) -> Float64:
 
 def _spread(poses: Float64, logged: Float64) -> Spread:
     position = np.linalg.norm(poses[:, :3, 3] - logged[:, :3, 3], axis=1)
-    relative = np.swapaxes(poses[:, :3, :3], 1, 2) @ logged[:, :3, :3]
-    rotation = np.array([_angle(R) for R in relative])
+    rotation = np.array([_angle(R) for R in np.swapaxes(poses[:, :3, :3], 1, 2) @ logged[:, :3, :3]])
     return Spread(
         median_position=float(np.median(position)),
         max_position=float(position.max()),
@@ -358,7 +357,6 @@ def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) 
     agreement = pose_agreement(model, states)
     if agreement is not None and agreement.verdict != "still":
         is_good = agreement.verdict in {"agree", "tool"}
-        value = 1e3 * agreement.difference.median_position
         make = note if is_good else error
         found.append(
             make(
@@ -366,7 +364,7 @@ def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) 
                 where,
                 agreement.sentence,
                 "" if is_good else "give the URDF of this very robot, and its --base",
-                value=value,
+                value=1e3 * agreement.difference.median_position,
                 unit="mm",
             )
         )

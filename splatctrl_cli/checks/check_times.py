@@ -1,10 +1,10 @@
 """Timing of topics: rate, gaps, repeated or decreasing stamps, clocks."""
 
 import heapq
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,12 +18,12 @@ _NS = 1e-9
 T = TypeVar("T")
 
 
-class Thinned(Generic[T]):
+class Thinned(list[T]):
     """Every k-th of a series; k doubles beyond `limit` values."""
 
     def __init__(self, limit: int) -> None:
+        super().__init__()
         self._limit, self._step, self._num = limit, 1, 0
-        self._kept: list[T] = []
 
     def is_next(self) -> bool:
         """True if the next value is kept; call once each, before `add`."""
@@ -32,19 +32,10 @@ class Thinned(Generic[T]):
         return is_kept
 
     def add(self, value: T) -> None:
-        self._kept.append(value)
-        if len(self._kept) > self._limit:
-            self._kept = self._kept[::2]
+        self.append(value)
+        if len(self) > self._limit:
+            del self[1::2]
             self._step *= 2
-
-    def change(self, by: Callable[[T], T]) -> None:
-        self._kept = [by(value) for value in self._kept]
-
-    def __iter__(self) -> Iterator[T]:
-        return iter(self._kept)
-
-    def __len__(self) -> int:
-        return len(self._kept)
 
 
 class TimesWatch:
@@ -88,22 +79,22 @@ class TimesWatch:
     @property
     def median_interval(self) -> float | None:
         """Median interval [s]; None for fewer than two different times."""
-        return float(np.median(list(self._intervals))) if len(self._intervals) else None
+        return float(np.median(self._intervals)) if self._intervals else None
 
     @property
     def delays(self) -> Float64:
         """Rows (K, 2) [s]: log time, log time minus stamp."""
-        return np.array(list(self._delays), dtype=np.float64).reshape(-1, 2)
+        return np.array(self._delays, dtype=np.float64).reshape(-1, 2)
 
     @property
     def delay(self) -> float | None:
         """Median log time minus stamp [s]."""
-        return float(np.median(self.delays[:, 1])) if len(self._delays) and not self.num_zero else None
+        return float(np.median(self.delays[:, 1])) if self._delays and not self.num_zero else None
 
     def gaps(self) -> list[tuple[float, int]]:
         """Intervals [s] far above the median, with the stamp before each; none without a rate."""
         median = self.median_interval
-        if median is None or float(np.quantile(list(self._intervals), 0.9)) > limits.REGULAR * median:
+        if median is None or float(np.quantile(self._intervals, 0.9)) > limits.REGULAR * median:
             return []  # no steady rate
         limit = max(limits.GAP_SECONDS, limits.GAP_RATIO * median)
         return sorted(((i * _NS, at) for i, at in self._longest if i * _NS > limit), key=lambda gap: gap[1])
@@ -167,8 +158,11 @@ def _overlap(a: Finding, b: Finding) -> bool:
 def _joined(group: list[Finding]) -> Finding:
     worst = max(group, key=lambda f: f.value or 0.0)
     names = [f.where for f in group]
-    where = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-    return replace(worst, where=where, what=f"{len(names)} pause together; of {worst.where}: {worst.what}")
+    return replace(
+        worst,
+        where=", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else ""),
+        what=f"{len(names)} pause together; of {worst.where}: {worst.what}",
+    )
 
 
 def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:

@@ -183,18 +183,16 @@ def _scale_findings(scales: Mapping[str, float], used: Mapping[str, float | None
                 value=factor,
             )
         ]
-    found = []
-    for camera, factor in sorted(scales.items()):
-        found.append(
-            error(
-                "views-scale",
-                f"camera {camera}",
-                f"its views fit those of the other cameras only where its depths are multiplied by {factor:.3g}",
-                "set the depth unit of its driver as that of the others, or leave it out with --cameras",
-                value=factor,
-            )
+    return [
+        error(
+            "views-scale",
+            f"camera {camera}",
+            f"its views fit those of the other cameras only where its depths are multiplied by {factor:.3g}",
+            "set the depth unit of its driver as that of the others, or leave it out with --cameras",
+            value=factor,
         )
-    return found
+        for camera, factor in sorted(scales.items())
+    ]
 
 
 def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
@@ -321,8 +319,7 @@ def _fitting(
     num_fit = num = 0
     for i, j in pairs:
         a, b = views[i], views[j]
-        scales = [scale if view.camera in cameras else 1.0 for view in (a, b)]
-        off, depth = _distances(a, b, *scales)
+        off, depth = _distances(a, b, *[scale if view.camera in cameras else 1.0 for view in (a, b)])
         num_fit += int((off < limits.VIEWS_FIT * share * depth).sum())
         num += len(off)
     return num_fit, num

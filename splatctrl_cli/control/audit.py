@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from splatctrl_cli.config.fixed import HALVED_DOWN_TO, MAX_HALVINGS
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Bool, Float64, Floats, Index, Integers, Stamps, UInt8
+from splatctrl_cli.robot.model import RobotModel
 
 DistanceFunction = Callable[[Float64], Float64]
 """points (Q, 3) [m], world -> distance (Q,) [m], NaN where there is none."""
@@ -77,7 +77,7 @@ class AuditTrace:
 
 
 def part_clearances(
-    model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
+    model: RobotModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Float64, Bool]:
     """Return the moving parts' clearances (T, M) [m] at postures (T, J), and which (M,) are of link surfaces.
 
@@ -104,18 +104,17 @@ def part_clearances(
 
 
 def moving_clearance(
-    model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
+    model: RobotModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Clearance, Float64]:
     """Return the least of `part_clearances` (T,), and all (T, M) [m]."""
     distance, _ = part_clearances(model, positions, distance_to, centers)
     moving = np.flatnonzero(model.moving_spheres)
     nearest = np.argmin(distance, axis=1)
-    least = Clearance(distance=distance[np.arange(len(distance)), nearest], sphere=moving[nearest])
-    return least, distance
+    return Clearance(distance=distance[np.arange(len(distance)), nearest], sphere=moving[nearest]), distance
 
 
 def audit(
-    model: ArmModel,
+    model: RobotModel,
     stamps: Stamps,
     positions: Float64,
     distances_at: DistancesAt,
@@ -173,17 +172,16 @@ def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]
     yield first, len(stamps)
 
 
-def _self_clearance(model: ArmModel, centers: Float64) -> Clearance:
+def _self_clearance(model: RobotModel, centers: Float64) -> Clearance:
     pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
     if not len(pairs):
-        nothing = np.full(len(centers), -1, dtype=np.int64)
-        return Clearance(distance=np.full(len(centers), np.inf), sphere=nothing)
+        return Clearance(distance=np.full(len(centers), np.inf), sphere=np.full(len(centers), -1, dtype=np.int64))
     distance = np.array([pair_gaps(c, model.sphere_set.radii, pairs)[0] for c in centers])
     nearest = distance.argmin(axis=1)
     return Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=nearest)
 
 
-def _unknown_share(model: ArmModel, centers: Float64, observed: Observed | None) -> Float64:
+def _unknown_share(model: RobotModel, centers: Float64, observed: Observed | None) -> Float64:
     if observed is None:
         return np.full(len(centers), np.nan)
     moving = centers[:, np.flatnonzero(model.moving_spheres)]
@@ -210,7 +208,7 @@ class Reach:
     velocity_limit: Float64
 
     @classmethod
-    def of(cls, model: ArmModel) -> "Reach":
+    def of(cls, model: RobotModel) -> "Reach":
         """Return the reach of a model's moving spheres."""
         moving = np.flatnonzero(model.moving_spheres)
         deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)[moving]), 0.0)
@@ -236,7 +234,7 @@ class Between:
 
 
 def between_states(
-    model: ArmModel,
+    model: RobotModel,
     reach: Reach,
     stamps: Index,
     positions: Float64,
@@ -281,7 +279,7 @@ def between_states(
 
 
 def _refined(
-    model: ArmModel,
+    model: RobotModel,
     reach: Reach,
     q_first: Float64,
     q_last: Float64,
@@ -324,7 +322,7 @@ def _refined(
     return least, is_met
 
 
-def clearances(model: ArmModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
+def clearances(model: RobotModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
     """Return moving spheres' clearances (T, M) [m], less their uncovered surface."""
     each, is_surface = part_clearances(model, positions, distance_to)
     return np.asarray(each - np.where(is_surface, 0.0, reach.radii - model.sphere_set.radii[reach.moving]))

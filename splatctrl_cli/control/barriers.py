@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import BRAKING_SHARE, IMMOVABLE_ROW, SURFACE_STEP
-from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.limits import braking_speed
 from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import sphere_names
 
 MARGIN = "margin"
 
@@ -28,7 +28,7 @@ class SceneRows(BarrierTerm):
     kind = RowKind.SCENE
 
     def __init__(
-        self, model: ArmModel, config: ControlConfig, field: DistanceField, acceleration: Float64 | None
+        self, model: RobotModel, config: ControlConfig, field: DistanceField, acceleration: Float64 | None
     ) -> None:
         """acceleration (J,) [rad/s^2]: of braking; None: joints stop at once."""
         self._model, self._config, self._field, self._acceleration = model, config, field, acceleration
@@ -54,15 +54,14 @@ class SceneRows(BarrierTerm):
         """
         if self._balls is None or not chosen.any():
             return distance
-        postures = q[None] if G is None else q + SURFACE_STEP * np.eye(len(q) + 1, len(q), -1)
+        postures = q[None] if G is None else q + fixed.SURFACE_STEP * np.eye(len(q) + 1, len(q), -1)
         links = set(self._links[chosen].tolist())
-        gaps = self._model.surface_gaps(postures, self._balls.centers, self._balls.radii, links)
-        for link, gap in gaps.items():
+        for link, gap in self._model.surface_gaps(postures, self._balls.centers, self._balls.radii, links).items():
             raised = gap[0] + self.margin - self._config.margin
             is_raised = chosen & (self._links == link) & (raised > distance)
             distance = np.where(is_raised, raised, distance)
             if G is not None:
-                G[is_raised] = (gap[0] - gap[1:]) / SURFACE_STEP
+                G[is_raised] = (gap[0] - gap[1:]) / fixed.SURFACE_STEP
         return distance
 
     def rows(self, state: State) -> Barrier:
@@ -118,7 +117,7 @@ class SelfRows(BarrierTerm):
 
     kind = RowKind.SELF
 
-    def __init__(self, model: ArmModel, config: ControlConfig, acceleration: Float64 | None) -> None:
+    def __init__(self, model: RobotModel, config: ControlConfig, acceleration: Float64 | None) -> None:
         """acceleration as for `SceneRows`."""
         self._config, self._acceleration = config, acceleration
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
@@ -157,14 +156,14 @@ class SelfRows(BarrierTerm):
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
         motion = jacobians @ velocity
         apart = motion[self._pairs[:, 0]] - motion[self._pairs[:, 1]]
-        h = distance_bound(self._config, None, distance, self.margin, None)
+        h = barrier_bound(distance, margin=self.margin, gain=self._config.barrier_gain)
         return np.asarray(h + np.sum(direction * apart, axis=1))
 
     def distances(self, centers: Float64) -> Float64:
         return pair_gaps(centers, self._radii, self._pairs)[0]
 
 
-def scene_margin(model: ArmModel, config: ControlConfig) -> Float64:
+def scene_margin(model: RobotModel, config: ControlConfig) -> Float64:
     """Return spheres' scene margins (S,) [m]: epsilon, plus deficits if `config.coverage` is "margin".
 
     The surface is within that deficit of a sphere, so by the triangle inequality it keeps epsilon for any 1-Lipschitz
@@ -179,7 +178,7 @@ def distance_bound(
     acceleration: Float64 | None,
     distance: Float64,
     margin: Float64,
-    G: Float64 | None,
+    G: Float64,
     rate: float | Float64 = 0.0,
 ) -> Float64:
     """Return h (M,), with the braking distance where joints cannot stop at once.
@@ -187,9 +186,9 @@ def distance_bound(
     Only then G (M, J) counts. A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it counts,
     because it changes on the way and other rows share it. rate [m/s]: dd/dt of a field that changes with time.
     """
-    if acceleration is None or G is None:
+    if acceleration is None:
         return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)
-    deceleration = BRAKING_SHARE * (np.abs(G) @ acceleration)
+    deceleration = fixed.BRAKING_SHARE * (np.abs(G) @ acceleration)
     return np.asarray(braking_speed(distance - margin, config.barrier_gain, deceleration, config.period) + rate)
 
 
@@ -200,8 +199,7 @@ def external_gradient(gradient: Float64, jacobians: Float64) -> Float64:
 
 def pair_gradient(direction: Float64, jacobians: Float64, pairs: Integers) -> Float64:
     """Return ``dd/dq`` (P, J) of sphere pairs; jacobians (S, 3, J)."""
-    relative = jacobians[pairs[:, 0]] - jacobians[pairs[:, 1]]
-    return np.asarray(np.matmul(direction[:, None, :], relative)[:, 0, :])
+    return np.asarray(np.matmul(direction[:, None, :], jacobians[pairs[:, 0]] - jacobians[pairs[:, 1]])[:, 0, :])
 
 
 def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, rate: float | Float64 = 0.0) -> Float64:
@@ -227,7 +225,7 @@ def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Fl
 
 def is_immovable(G: Float64, velocity_limit: Float64) -> Bool:
     """True for rows (M,) that no joint velocity changes: fixed spheres or flat field."""
-    return np.asarray(np.abs(G) @ velocity_limit < IMMOVABLE_ROW)
+    return np.asarray(np.abs(G) @ velocity_limit < fixed.IMMOVABLE_ROW)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +254,7 @@ def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> floa
 
 
 def rate_of(
-    config: ControlConfig, model: ArmModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
+    config: ControlConfig, model: RobotModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
 ) -> float | Float64:
     """Return the configured dd/dt of the moving spheres at a posture (J,) and stamp."""
     step = None if scene_step_at is None or config.distance_rate == "none" else scene_step_at(stamp_ns)

@@ -234,13 +234,12 @@ def audit_signals(
     for source, clearance in audit.clearance.items():
         signals += clearance_signals(source, clearance.distance, clearance.sphere, margin, spheres)
         is_blank = np.isnan(clearance.distance)
-        names = OneEach(names=spheres, index=clearance.sphere)
         signals.append(
             Signal(
                 kind=EventKind.WITHOUT_DISTANCE,
                 is_on=is_blank,
                 value=is_blank.astype(np.float64),
-                names_at=names,
+                names_at=OneEach(names=spheres, index=clearance.sphere),
                 source=source,
             )
         )

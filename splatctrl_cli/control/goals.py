@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.records import Bool, Float64, FloatRows, Floats, Stamps
+from splatctrl_cli.robot.model import RobotModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,16 +82,17 @@ class LoggedMotion:
         )
         return position, velocity
 
-    def goal_at(self, model: ArmModel, frame: str, stamp_ns: int) -> tuple[Float64, Guide]:
+    def goal_at(self, model: RobotModel, frame: str, stamp_ns: int) -> tuple[Float64, Guide]:
         """Return a frame's logged pose (4, 4) and motion at a stamp."""
         position, velocity = self.at(stamp_ns)
         return guided_goal(model, frame, position, velocity)
 
 
-def guided_goal(model: ArmModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
+def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
     """Return a frame's pose (4, 4) and motion at a posture and velocity (J,)."""
-    twist = model.frame_jacobian(position, frame) @ velocity
-    return model.frame_pose(position, frame), Guide(twist=twist, posture=position, velocity=velocity)
+    return model.frame_pose(position, frame), Guide(
+        twist=model.frame_jacobian(position, frame) @ velocity, posture=position, velocity=velocity
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +140,7 @@ class Detour:
         """True at the path's end."""
         return self.clock >= self.path.duration
 
-    def goal(self, model: ArmModel, frame: str) -> tuple[Float64, Guide]:
+    def goal(self, model: RobotModel, frame: str) -> tuple[Float64, Guide]:
         """Return a frame's pose (4, 4) and motion at the clock's time."""
         position, velocity = self.path.at(self.clock)
         return guided_goal(model, frame, position[0], velocity[0])
@@ -178,7 +179,7 @@ class TwistTrack:
         age = (stamp_ns - self.stamp_ns[np.maximum(index, 0)]) * 1e-9
         return np.asarray((index >= 0) & (age <= timeout))
 
-    def asked(self, model: ArmModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
+    def asked(self, model: RobotModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
         """Return a stamp's twist (6,) in world axes at q (J,), not capped."""
         twist = self.at(stamp_ns, timeout)
         if self.axes is None:
@@ -186,7 +187,7 @@ class TwistTrack:
         R = model.frame_pose(q, self.axes)[:3, :3]
         return np.concatenate([R @ twist[:3], R @ twist[3:]])
 
-    def reference(self, model: ArmModel, config: ControlConfig, q: Float64, stamp_ns: int) -> Float64:
+    def reference(self, model: RobotModel, config: ControlConfig, q: Float64, stamp_ns: int) -> Float64:
         """Return the twist (6,), world, each part capped in norm."""
         return reference_velocity(
             self.asked(model, q, stamp_ns, config.twist_timeout),
@@ -196,8 +197,9 @@ class TwistTrack:
         )
 
     def goal_at(
-        self, model: ArmModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
+        self, model: RobotModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
     ) -> tuple[Float64, Guide]:
         """Return the frame's own pose (4, 4), moving with the twist, without a posture."""
-        twist = self.reference(model, config, q, stamp_ns)
-        return model.frame_pose(q, frame), Guide(twist=twist, posture=q, velocity=np.zeros(len(q)))
+        return model.frame_pose(q, frame), Guide(
+            twist=self.reference(model, config, q, stamp_ns), posture=q, velocity=np.zeros(len(q))
+        )

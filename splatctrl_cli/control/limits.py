@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import ENCODER, MOTION_WINDOW
-from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Float64, Index, Stamps
+from splatctrl_cli.robot.model import RobotModel
 
 Rows = tuple[Float64, Float64]
 FR3 = "fr3"
@@ -107,7 +106,7 @@ class JointLimits:
     by_position: VelocityLimits | None = None
 
     @classmethod
-    def of(cls, model: ArmModel, config: ControlConfig) -> "JointLimits":
+    def of(cls, model: RobotModel, config: ControlConfig) -> "JointLimits":
         """Return an arm's configured limits.
 
         Raises UsageError for a wrong number of accelerations, or for other joints than an FR3's with its limits.
@@ -226,12 +225,12 @@ class MotionLimits:
         everything = np.concatenate([self._positions, positions])
         first = len(all_stamps) - num
         share = np.zeros((num, positions.shape[1]))
-        window = np.int64(MOTION_WINDOW * 1e9)
+        window = np.int64(fixed.MOTION_WINDOW * 1e9)
         last = np.arange(first, first + num) - 1
         for before in (last, np.minimum(last, np.searchsorted(all_stamps, stamps - window, "right") - 1)):
             has = np.flatnonzero(before >= 0)
             seconds = (stamps[has] - all_stamps[before[has]]) * 1e-9
-            moved = np.maximum(np.abs(positions[has] - everything[before[has]]) - 2 * ENCODER, 0.0)
+            moved = np.maximum(np.abs(positions[has] - everything[before[has]]) - 2 * fixed.ENCODER, 0.0)
             speed = moved / np.maximum(seconds, 1e-9)[:, None]
             share[has] = np.maximum(share[has], speed / self._velocity)
         sudden = np.zeros_like(share)
@@ -253,9 +252,9 @@ class MotionLimits:
         seconds = (all_stamps - all_stamps[0]) * 1e-9
         now = (stamps - all_stamps[0]) * 1e-9
         found = np.zeros((len(stamps), everything.shape[1]))
-        old = now >= 2 * MOTION_WINDOW
+        old = now >= 2 * fixed.MOTION_WINDOW
         for joint in range(everything.shape[1]):
-            at = [np.interp(now[old] - k * MOTION_WINDOW, seconds, everything[:, joint]) for k in range(3)]
-            second = np.abs(at[0] - 2 * at[1] + at[2]) - 4 * ENCODER
-            found[old, joint] = np.maximum(second, 0.0) / MOTION_WINDOW**2
+            at = [np.interp(now[old] - k * fixed.MOTION_WINDOW, seconds, everything[:, joint]) for k in range(3)]
+            second = np.abs(at[0] - 2 * at[1] + at[2]) - 4 * fixed.ENCODER
+            found[old, joint] = np.maximum(second, 0.0) / fixed.MOTION_WINDOW**2
         return found

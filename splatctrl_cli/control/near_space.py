@@ -12,9 +12,9 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Float64, Index, UInt8
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import EvidenceClass
 
 NEVER_SEEN = (
@@ -65,7 +65,7 @@ class Account:
 class NearSpace:
     """Evaluates states of a motion far enough apart in time or space."""
 
-    def __init__(self, model: ArmModel, margin: float, max_age: float = np.inf) -> None:
+    def __init__(self, model: RobotModel, margin: float, max_age: float = np.inf) -> None:
         """max_age [s]: older evidence is stale."""
         self._model, self._margin, self._max_age = model, margin, max_age
         self._moving = model.moving_spheres

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import SceneStepAt, rate_of
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.robot.model import RobotModel
 
 FieldAt = Callable[[int], DistanceField]
 
@@ -50,7 +50,7 @@ class OpenLoopTrace:
 
 
 def open_loop(
-    model: ArmModel,
+    model: RobotModel,
     config: ControlConfig,
     motion: LoggedMotion,
     task: OpenLoopTask,

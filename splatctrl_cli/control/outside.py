@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.line_process import Fault, LineProcess, Misbehaved, shown
-from splatctrl_cli.control.step import ControlStep, Moment, QpIkController, View
+from splatctrl_cli.control.step import Commander, ControlStep, Moment, QpIkController, View
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.control.user_controller import PROTOCOL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
 
 STEP_LIMIT = 10.0  # [s] for one answer, also on a busy machine
 PATIENCE = 3.0  # times that limit, after which waiting ends
@@ -59,8 +59,7 @@ class Program(LineProcess):
                 f"{name}: cannot be started: {reason}", remedy="check its path, and that it may be executed"
             ) from None
         try:
-            limit = max(START_LIMIT, step_limit)
-            version = _document(self.exchange(_line(start), limit)).get("protocol")
+            version = _document(self.exchange(_line(start), max(START_LIMIT, step_limit))).get("protocol")
             if version != PROTOCOL:
                 raise Misbehaved(Fault.OTHER_PROTOCOL, f"expected protocol {PROTOCOL}, got {shown(repr(version))}")
         except Misbehaved as error:
@@ -106,7 +105,7 @@ class Program(LineProcess):
         return _document(answer)
 
 
-class OutsideController(AbstractContextManager["OutsideController"]):
+class OutsideController(Commander, AbstractContextManager["OutsideController"]):
     """The `Commander` of a user's controller, or of two copies that must agree to the bit.
 
     num_answers, seconds, slowest: count of answers, total and longest time [s].
@@ -116,7 +115,7 @@ class OutsideController(AbstractContextManager["OutsideController"]):
         self,
         name: str,
         command: Sequence[str],
-        model: ArmModel,
+        model: RobotModel,
         config: ControlConfig,
         *,
         frame: str,
@@ -185,16 +184,15 @@ def class_command(target: str) -> tuple[str, ...]:
     return sys.executable, "-P", "-c", SERVE, target
 
 
-def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) -> Document:
+def _start(model: RobotModel, config: ControlConfig, frame: str, home: Float64) -> Document:
     """First line; see `ControllerStart`."""
-    acceleration = JointLimits.of(model, config).acceleration
     return {
         "protocol": PROTOCOL,
         "joints": list(model.joint_names),
         "lower": _list(model.lower),
         "upper": _list(model.upper),
         "velocity_limit": _list(model.velocity_limit),
-        "acceleration_limit": _list(acceleration),
+        "acceleration_limit": _list(JointLimits.of(model, config).acceleration),
         "frame": frame,
         "home": _list(home),
         "period": config.period,
@@ -202,7 +200,7 @@ def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) ->
     }
 
 
-def _question(model: ArmModel, frame: str, moment: Moment, view: View) -> Document:
+def _question(model: RobotModel, frame: str, moment: Moment, view: View) -> Document:
     """Line of a step; see `ControllerInput`."""
     guide = moment.guide
     return {

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import MOUNTED_CHANGE, STATIC_CHANGE, STATIC_REACH
-from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, part_clearances
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import sphere_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +21,7 @@ class StaticViolation:
     clearance: float
 
 
-def check_model(model: ArmModel) -> None:
+def check_model(model: RobotModel) -> None:
     """Raise InputError for a robot without velocity limits or moving spheres."""
     has_limit = np.asarray(model.velocity_limit) > 0
     if not np.all(has_limit):
@@ -35,7 +35,7 @@ def check_model(model: ArmModel) -> None:
         raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
 
 
-def check_coverage(model: ArmModel, config: ControlConfig) -> None:
+def check_coverage(model: RobotModel, config: ControlConfig) -> None:
     """Raise InputError if rows should compensate for uncovered surface that was not measured."""
     unknown = np.isnan(model.sphere_deficit) & np.asarray(model.moving_spheres)
     if config.coverage == "margin" and np.any(unknown):
@@ -46,7 +46,7 @@ def check_coverage(model: ArmModel, config: ControlConfig) -> None:
         )
 
 
-def checked_posture(model: ArmModel, q: Float64, *, what: str = "joint positions") -> Float64:
+def checked_posture(model: RobotModel, q: Float64, *, what: str = "joint positions") -> Float64:
     """Return q as (J,) float64. Raises InputError for another size or a non-finite value."""
     posture = np.asarray(q, dtype=np.float64)
     if posture.shape != (len(model.joint_names),):
@@ -58,7 +58,7 @@ def checked_posture(model: ArmModel, q: Float64, *, what: str = "joint positions
     return posture
 
 
-def check_within_limits(model: ArmModel, q: Float64, tolerance: float, what: str = "start") -> None:
+def check_within_limits(model: RobotModel, q: Float64, tolerance: float, what: str = "start") -> None:
     """Raise InputError for q (J,) outside the position limits by more than `tolerance` [rad]."""
     outside = np.maximum(q - model.upper, model.lower - q)
     worst = int(np.argmax(outside))
@@ -72,7 +72,7 @@ def check_within_limits(model: ArmModel, q: Float64, tolerance: float, what: str
 
 
 def check_free(
-    model: ArmModel, field: DistanceField, q: Float64, distance_to: DistanceFunction | None = None
+    model: RobotModel, field: DistanceField, q: Float64, distance_to: DistanceFunction | None = None
 ) -> None:
     """Raise NotEvaluableError for a start q (J,) in collision, naming the deepest sphere.
 
@@ -90,7 +90,7 @@ def check_free(
         )
 
 
-def check_goal(model: ArmModel, T_world_goal: Float64) -> None:
+def check_goal(model: RobotModel, T_world_goal: Float64) -> None:
     """Raise InputError for a goal that is no pose, or beyond the robot's reach."""
     if np.shape(T_world_goal) != (4, 4) or not np.all(np.isfinite(T_world_goal)):
         raise InputError("goal: expected a finite pose x,y,z,qx,qy,qz,qw")
@@ -104,7 +104,7 @@ def check_goal(model: ArmModel, T_world_goal: Float64) -> None:
 
 
 def static_violations(
-    model: ArmModel, field: DistanceField, q: Float64, margin: float | Float64
+    model: RobotModel, field: DistanceField, q: Float64, margin: float | Float64
 ) -> tuple[StaticViolation, ...]:
     """Return fixed spheres within the margin [m], one or (S,): mounting, not control."""
     if np.all(model.moving_spheres):
@@ -118,7 +118,7 @@ def static_violations(
     )
 
 
-def sphere_clearance(model: ArmModel, field: DistanceField, q: Float64, chosen: Bool) -> tuple[Integers, Float64]:
+def sphere_clearance(model: RobotModel, field: DistanceField, q: Float64, chosen: Bool) -> tuple[Integers, Float64]:
     """Return indices (M,) of chosen spheres and their surfaces' distances (M,) [m] at q (J,)."""
     index = np.flatnonzero(chosen)
     distance = field.query(np.ascontiguousarray(model.sphere_centers(q)[index]))[0]
@@ -138,7 +138,7 @@ class FixedParts:
     farther away.
     """
 
-    def __init__(self, model: ArmModel, near: float) -> None:
+    def __init__(self, model: RobotModel, near: float) -> None:
         """near [m]: spheres with less first clearance stand near their mount."""
         self._model, self._near = model, near
         self._still = np.flatnonzero(~np.asarray(model.moving_spheres))
@@ -158,7 +158,7 @@ class FixedParts:
         if is_first:
             self.found = {name: (float(mine), float(mine)) for name, mine in zip(self._names, own, strict=True)}
         first = np.array([self.found[name][0] for name in self._names])
-        change = np.where(first < self._near, MOUNTED_CHANGE, STATIC_CHANGE)
+        change = np.where(first < self._near, fixed.MOUNTED_CHANGE, fixed.STATIC_CHANGE)
         came = own
         if isinstance(distance_to, BallDistance):
             if is_first:
@@ -175,7 +175,7 @@ class FixedParts:
         model, least = self._model, np.full(len(centers), np.inf)
         radii = model.sphere_set.radii[self._still]
         away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii
-        near = np.flatnonzero(away.min(axis=0) < STATIC_REACH)
+        near = np.flatnonzero(away.min(axis=0) < fixed.STATIC_REACH)
         places = np.asarray(balls.centers[near], np.float64)
         if was_seen is not None and len(near):
             is_new_place = ~was_seen(places)
@@ -187,8 +187,8 @@ class FixedParts:
         is_splat = near < len(balls.radii) - balls.num_voxels
         for number in np.flatnonzero(has_come):
             scenes = before[-1:] if is_splat[number] else before
-            gaps = [np.linalg.norm(scene - places[number], axis=1).min(initial=np.inf) for scene in scenes]
-            has_come[number] = max(gaps) <= MOUNTED_CHANGE
+            moves = [np.linalg.norm(scene - places[number], axis=1).min(initial=np.inf) for scene in scenes]
+            has_come[number] = max(moves) <= fixed.MOUNTED_CHANGE
         for k in np.unique(owner[has_come]).tolist():
             chosen = near[(owner == k) & has_come]
             link = model.sphere_set.links[self._still[k]]

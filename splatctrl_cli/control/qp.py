@@ -86,8 +86,9 @@ def solve_clarabel(program: QuadraticProgram, *, tolerance: float | None = None)
         settings.iterative_refinement_reltol = settings.iterative_refinement_abstol = 0.1 * tolerance
         settings.iterative_refinement_max_iter = 30
     H, G = sparse.csc_matrix(np.triu(program.H)), sparse.csc_matrix(program.G)
-    cones = [clarabel.NonnegativeConeT(len(program.h))]
-    answer = clarabel.DefaultSolver(H, program.c, G, program.h, cones, settings).solve()
+    answer = clarabel.DefaultSolver(
+        H, program.c, G, program.h, [clarabel.NonnegativeConeT(len(program.h))], settings
+    ).solve()
     z, multipliers = np.asarray(answer.x), np.asarray(answer.z)
     return QpSolution(
         z=z,

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind, is_immovable
 from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, held, is_usable
 from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
+from splatctrl_cli.robot.model import RobotModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +54,7 @@ class Rows:
 
     @property
     def for_qp(self) -> tuple[Barrier, ...]:
-        ends = np.cumsum([len(barrier) for barrier in self.barriers])[:-1]
-        parts = np.split(self.in_qp, ends)
+        parts = np.split(self.in_qp, np.cumsum([len(barrier) for barrier in self.barriers])[:-1])
         rows = tuple(barrier.select(part) for barrier, part in zip(self.barriers, parts, strict=True))
         return rows if self.cuts is None else (*rows, self.cuts)
 
@@ -73,7 +72,7 @@ class RowBuilder:
 
     def __init__(
         self,
-        model: ArmModel,
+        model: RobotModel,
         config: ControlConfig,
         field: DistanceField,
         acceleration: Float64 | None = None,

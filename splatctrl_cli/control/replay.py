@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction
 from splatctrl_cli.control.barriers import SceneStepAt, rate_of, scene_margin
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
@@ -23,6 +22,7 @@ from splatctrl_cli.control.preconditions import (
 )
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController
 from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
+from splatctrl_cli.robot.model import RobotModel
 
 FieldAt = Callable[[int], DistanceField]
 
@@ -115,13 +115,16 @@ class StepRecord(Protocol):
     """Storage of T steps: stamps (T,), postures (T, J) and steps."""
 
     @property
-    def stamp_ns(self) -> Stamps: ...
+    def stamp_ns(self) -> Stamps:
+        """Stamps (T,) [ns]."""
 
     @property
-    def position(self) -> FloatRows: ...
+    def position(self) -> FloatRows:
+        """Postures (T, J) before each step."""
 
     @property
-    def steps(self) -> Sequence[ControlStep]: ...
+    def steps(self) -> Sequence[ControlStep]:
+        """Steps so far."""
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
         """Append a step."""
@@ -150,7 +153,7 @@ class InMemory:
 
 
 def closed_loop(
-    model: ArmModel,
+    model: RobotModel,
     config: ControlConfig,
     task: ReplayTask,
     field_at: FieldAt,
@@ -235,7 +238,7 @@ class _Course:
     """Goals by step: waypoints in order, or the logged motion."""
 
     def __init__(
-        self, model: ArmModel, config: ControlConfig, task: ReplayTask, plan_detour: PlanDetour | None
+        self, model: RobotModel, config: ControlConfig, task: ReplayTask, plan_detour: PlanDetour | None
     ) -> None:
         self._model, self._config, self._task, self._plan_detour = model, config, task, plan_detour
         self._waypoints = (*task.via, Waypoint(T_world_goal=task.T_world_goal, posture=None))
@@ -288,8 +291,9 @@ class _Course:
         waypoint = self._waypoints[self.num_reached]
         if waypoint.posture is None:
             return waypoint.T_world_goal, None
-        still = np.zeros(len(waypoint.posture))
-        return waypoint.T_world_goal, Guide(twist=np.zeros(6), posture=waypoint.posture, velocity=still)
+        return waypoint.T_world_goal, Guide(
+            twist=np.zeros(6), posture=waypoint.posture, velocity=np.zeros(len(waypoint.posture))
+        )
 
     def has_ended(self, stamp_ns: int, index: int, step: ControlStep) -> bool:
         """True at the last goal; an earlier one advances to the next. Twists have none."""
@@ -307,7 +311,7 @@ class _Course:
 
 
 def divergence(
-    model: ArmModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
+    model: RobotModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
 ) -> tuple[Float64, Float64, Float64]:
     """Return distances of T postures (T, J) from those logged at their stamps.
 
@@ -329,7 +333,7 @@ def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:
 
 
 def scene_change(
-    model: ArmModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField
+    model: RobotModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField
 ) -> SceneChange:
     """Return how a newer scene changes the clearance at q (J,)."""
     moving = np.asarray(model.moving_spheres)
@@ -342,5 +346,4 @@ def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
     num_back = round(config.stall_time / config.period)
     if len(positions) <= num_back:
         return False
-    moved = np.max(np.abs(positions[-1] - positions[-1 - num_back]))
-    return bool(moved < config.stall_speed * config.stall_time)
+    return bool(np.max(np.abs(positions[-1] - positions[-1 - num_back])) < config.stall_speed * config.stall_time)

@@ -3,13 +3,10 @@
 from collections.abc import Collection, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import MULTIPLIER, STEP_SCALES, WITHIN_SHARE
-from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
@@ -29,6 +26,7 @@ from splatctrl_cli.control.terms import (
     summed,
 )
 from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.robot.model import RobotModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +126,7 @@ class QpIkController:
 
     def __init__(
         self,
-        model: ArmModel,
+        model: RobotModel,
         config: ControlConfig,
         field: DistanceField,
         *,
@@ -146,8 +144,9 @@ class QpIkController:
         self._model, self._config, self._frame = model, config, frame
         self._solver: QpSolver = SOLVERS[config.solver] if solver is None else solver
         self._limits = JointLimits.of(model, config)
-        further = [term for term in terms if isinstance(term, BarrierTerm)]
-        self._builder = RowBuilder(model, config, field, self._limits.acceleration, further)
+        self._builder = RowBuilder(
+            model, config, field, self._limits.acceleration, [term for term in terms if isinstance(term, BarrierTerm)]
+        )
         self._limit_names = tuple(f"{joint} {side}" for side in ("highest", "lowest") for joint in model.joint_names)
         self.row_names, self.row_kinds = self._builder.names, self._builder.kinds
         costs = [term for term in terms if not isinstance(term, BarrierTerm)]
@@ -289,8 +288,7 @@ class QpIkController:
         """True for spheres (M,) with relaxed rows whose links' surfaces are farther away."""
         distance, scene = rows.external.distance, self._builder.scene
         has_given_way = rows.spread(choice.slack)[: len(distance)] > self._config.slack_tolerance
-        raised = scene.by_surfaces(state.q, distance, has_given_way & ~state.by_surface)
-        return np.asarray(raised > distance)
+        return np.asarray(scene.by_surfaces(state.q, distance, has_given_way & ~state.by_surface) > distance)
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
         """True for rows (M,) whose `later` distance, a period on, breaks their promise.
@@ -303,11 +301,11 @@ class QpIkController:
         config = self._config
         promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
         is_within = rows.distance < rows.margin
-        tolerance = np.where(is_within, WITHIN_SHARE, 1.0) * config.promise_tolerance
+        tolerance = np.where(is_within, fixed.WITHIN_SHARE, 1.0) * config.promise_tolerance
         broken = ~(later >= np.minimum(promised, rows.distance) - tolerance)
         if np.any(broken) and np.all(is_within[broken]):
             lack, lack_later = (float(np.sum(np.maximum(rows.margin - d, 0.0))) for d in (rows.distance, later))
-            if lack_later < lack - WITHIN_SHARE * config.promise_tolerance:
+            if lack_later < lack - fixed.WITHIN_SHARE * config.promise_tolerance:
                 return np.zeros_like(broken)
         return np.asarray(broken)
 
@@ -315,10 +313,9 @@ class QpIkController:
         """Return the largest of STEP_SCALES that keeps the promises, else 0."""
         if choice.rung is Rung.HOLD:
             return 0.0
-        for scale in STEP_SCALES:
+        for scale in fixed.STEP_SCALES:
             q = state.q + self._config.period * _blend(choice.velocity, rest, scale)
-            later = self._builder.distances(q, state.by_surface)
-            if not np.any(self._broken(choice, rows, later)):
+            if not np.any(self._broken(choice, rows, self._builder.distances(q, state.by_surface))):
                 return scale
         return 0.0
 
@@ -355,34 +352,27 @@ class QpIkController:
                 kind=RowKind.LIMIT if i < num_limits else self.row_kinds[i - num_limits],
                 multiplier=float(multipliers[i]),
             )
-            for i in np.flatnonzero(multipliers > MULTIPLIER)
+            for i in np.flatnonzero(multipliers > fixed.MULTIPLIER)
         )
 
     def _named(self, rows: Bool) -> tuple[str, ...]:
         return tuple(self.row_names[i] for i in np.flatnonzero(rows))
 
 
-class Commander(Protocol):
-    """Source of commands; `controller` is ours in the current scene."""
+class Commander:
+    """Source of commands: our own controller."""
 
     @property
     def is_over(self) -> bool:
         """True once no step will follow; the last one was to rest."""
+        return False
 
     def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
-        """Return the step at a moment."""
-
-
-class Ours:
-    """The `Commander` that uses our own controller."""
-
-    is_over = False
-
-    def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
+        """Return the step at a moment; `controller` is ours in the current scene."""
         return controller.decide(controller.view(moment))
 
 
-OURS = Ours()
+OURS = Commander()
 
 
 def _blend(velocity: Float64, rest: Float64, scale: float) -> Float64:

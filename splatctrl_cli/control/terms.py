@@ -13,9 +13,9 @@ from functools import cached_property, partial
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import Guide
 from splatctrl_cli.records import Bool, Float64, Integers
+from splatctrl_cli.robot.model import RobotModel
 
 Cost = tuple[Float64, Float64]
 """H (J, J) and c (J,) of a cost ``1/2 v' H v + c' v`` over joint velocities v (J,)."""
@@ -32,7 +32,7 @@ class State:
     of the moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
     """
 
-    model: ArmModel
+    model: RobotModel
     frame: str
     q: Float64
     box: tuple[Float64, Float64]
@@ -130,7 +130,8 @@ class RowKind(StrEnum):
 class Barrier:
     """M barrier rows ``G v - s <= h``, with ``G = -dd/dq`` (M, J).
 
-    ``h = alpha (d - epsilon) + dd/dt`` (M,); distance d (M,) [m]; index (M,): place among names (spheres, or pairs).
+    ``h = alpha (d - epsilon) + dd/dt`` (M,), less where joints cannot stop at once (`barriers.distance_bound`);
+    distance d (M,) [m]; index (M,): place among names (spheres, or pairs).
     Slack costs ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
     """
 

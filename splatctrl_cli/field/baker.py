@@ -103,9 +103,13 @@ class Baker:
 
     def span(self, first: int, last: int, mask: UInt8 | None = None) -> GridSpan:
         """Cells of x-planes [first, last), in the spheres' frame."""
-        origin = self.layout.origin - self.spheres.anchor
         return GridSpan(
-            origin=origin, voxel=self.layout.voxel, shape=self.layout.shape, first=first, last=last, mask=mask
+            origin=self.layout.origin - self.spheres.anchor,
+            voxel=self.layout.voxel,
+            shape=self.layout.shape,
+            first=first,
+            last=last,
+            mask=mask,
         )
 
     def _bake_planes(self, first: int, last: int, out: Planes, mask: UInt8 | None) -> None:

@@ -8,8 +8,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.config.fixed import MARCH_STEPS, SIGNED_CARE
+from splatctrl_cli.config import FieldConfig, fixed
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.grid_cells import RESOLUTION
@@ -42,8 +41,7 @@ class SphereField:
     def nearest(self, points: Float64) -> NDArray[np.int64]:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the distance."""
         local = self.spheres.relative(checked_points(points))
-        entry = native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]
-        return self.spheres.source[entry]
+        return self.spheres.source[native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]]
 
 
 class LogSumExpField(ABC):
@@ -57,7 +55,7 @@ class LogSumExpField(ABC):
         self.weights = METHODS[config.weights](spheres, self.kernel, config.noise, threads)
         sign = self.weights.sign
         self.sign = None if sign is None else spheres.laid_out(sign, spare=1.0).astype(np.float32)
-        self.tolerance = config.truncation * (1.0 if sign is None else SIGNED_CARE)
+        self.tolerance = config.truncation * (1.0 if sign is None else fixed.SIGNED_CARE)
 
     @abstractmethod
     def terms(self) -> LogSumExp:
@@ -249,12 +247,12 @@ class March:
     rest: Float64
 
 
-def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps: int = MARCH_STEPS) -> March:
+def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps: int = fixed.MARCH_STEPS) -> March:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
     Each of the `steps` goes against the local gradient: with a fixed direction, a walk can pass an object by. It is
     as long as the field reads, at most the `exact` distance, and so crosses no sphere. The Matern field's zero level
-    stands before the spheres (`health.planar_zero_level`). Points at or behind it stay. Raises UsageError for less
+    stands before the spheres (`slabs.planar_zero_level`). Points at or behind it stay. Raises UsageError for less
     than one step.
     """
     if steps < 1:
@@ -319,6 +317,10 @@ def device_field(
     """Put the exact distance and `kernels` on a device, for ``config.distance``."""
     chosen = KERNEL_OF[config.distance]
     choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
-    terms = {name: field.terms() for name, field in kernels.items()}
-    radii = spheres.offsets(spheres.radii)
-    return DeviceField(device, spheres.clusters, radii, terms, choice)
+    return DeviceField(
+        device,
+        spheres.clusters,
+        spheres.offsets(spheres.radii),
+        {name: field.terms() for name, field in kernels.items()},
+        choice,
+    )

@@ -163,8 +163,7 @@ class GridField:
         self._bound = None if bound is None else np.ascontiguousarray(bound, dtype=np.float32)
         self._origin = np.ascontiguousarray(grid.origin, dtype=np.float64)
         self._voxel = grid.voxel
-        upper = self._origin + grid.voxel * (np.array(self._values.shape) - 1)
-        self.box = Box(lower=self._origin, upper=upper)
+        self.box = Box(lower=self._origin, upper=self._origin + grid.voxel * (np.array(self._values.shape) - 1))
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and the interpolant's gradient, as in `DistanceField.query`."""

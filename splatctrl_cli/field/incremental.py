@@ -45,8 +45,9 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
             se = baker.kernels["se"] if with_weights else None
             offsets, length = (baker.exact.radii, None) if se is None else (se.terms().offsets, se.kernel.length)
             if changed.any():
-                clusters = baker.spheres.clusters
-                native.touched_blocks(clusters, offsets, changed, length, span, mask, threads=baker.threads)
+                native.touched_blocks(
+                    baker.spheres.clusters, offsets, changed, length, span, mask, threads=baker.threads
+                )
     return Changes(mask=mask, num_blocks=num_blocks)
 
 

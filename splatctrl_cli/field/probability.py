@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import log_ndtr, ndtr
 
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.config.fixed import CERTAIN_OCCUPANCY, LEAST_VARIANCE, VARIANCE_DIVISOR
+from splatctrl_cli.config import FieldConfig, fixed
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points
 from splatctrl_cli.field.distance import GpdfField
@@ -96,11 +95,11 @@ class PaperProbability:
         return self._combined(gpdf.astype(np.float64), half.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:
-        return {"meaning": "eq. 13 and 14 with lumped weights: a score", "variance_divisor": VARIANCE_DIVISOR}
+        return {"meaning": "eq. 13 and 14 with lumped weights: a score", "variance_divisor": fixed.VARIANCE_DIVISOR}
 
     def _combined(self, gpdf: Float64, half: Float64) -> Float64:
         explained = np.exp(np.minimum(-half / self._half, 0.0))  # the sum never exceeds 1 but by rounding
-        occupancy = np.exp(np.minimum(-gpdf / self._gpdf.kernel.length, CERTAIN_OCCUPANCY))
+        occupancy = np.exp(np.minimum(-gpdf / self._gpdf.kernel.length, fixed.CERTAIN_OCCUPANCY))
         return probability_of_occupancy(occupancy, explained)
 
 
@@ -109,7 +108,7 @@ def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
 
     In logarithms, as 1 - Phi loses small values. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, not zero.
     """
-    deviation = np.sqrt(np.maximum(1.0 - explained, LEAST_VARIANCE) / VARIANCE_DIVISOR)
+    deviation = np.sqrt(np.maximum(1.0 - explained, fixed.LEAST_VARIANCE) / fixed.VARIANCE_DIVISOR)
     return np.asarray(np.exp(log_ndtr((occupancy - 1.0) / deviation) - log_ndtr(occupancy / deviation)))
 
 

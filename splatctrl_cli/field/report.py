@@ -141,5 +141,9 @@ def _parts(grid: DistanceGrid) -> Iterator[DistanceGrid]:
     num_planes, *rest = grid.channels["sdf"].shape
     step = max(1, (1 << 20) // int(np.prod(rest)))
     for first in range(0, num_planes, step):
-        channels = {name: values[first : first + step] for name, values in grid.channels.items()}
-        yield DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header)
+        yield DistanceGrid(
+            origin=grid.origin,
+            voxel=grid.voxel,
+            channels={name: values[first : first + step] for name, values in grid.channels.items()},
+            header=grid.header,
+        )

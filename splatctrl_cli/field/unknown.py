@@ -47,8 +47,9 @@ def obstacle_spheres(
         labels=balls.labels[kept],
         density=np.zeros(count, np.float32),
     )
-    index = np.concatenate([np.flatnonzero(is_chosen), np.full(count, NO_SPLAT)])
-    return ObstacleSpheres(splats=chosen.joined(added), index=index)
+    return ObstacleSpheres(
+        splats=chosen.joined(added), index=np.concatenate([np.flatnonzero(is_chosen), np.full(count, NO_SPLAT)])
+    )
 
 
 def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -> SplatSet:

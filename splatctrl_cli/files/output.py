@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import DeviceFault, InputError, UsageError, WriteError
+from splatctrl_cli.errors import DeviceFault, InputError, UsageError, WriteError, refuse_faults
 
 REMEDY = "make it again with the command in run.json"
 
@@ -51,10 +51,8 @@ class Parts:
         file = path.parent / "run.json"
         if not file.is_file():
             return cls(folder=path.parent)
-        try:
+        with refuse_faults(f"{file}: cannot be read", OSError, ValueError):
             run = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{file}: cannot be read: {error}") from None
         return cls.of_run(path.parent, run if isinstance(run, dict) else {})
 
     def has(self, path: Path) -> bool:

@@ -48,8 +48,9 @@ def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) 
             size = np.dtype(array.dtype).itemsize * int(np.prod(array.shape))
             with archive.open(f"{name}.npy", "w", force_zip64=size >= 2**30) as stream:
                 if isinstance(array, Pieces):
-                    layout = {"descr": array.dtype, "fortran_order": False, "shape": array.shape}
-                    np.lib.format.write_array_header_1_0(stream, layout)
+                    np.lib.format.write_array_header_1_0(
+                        stream, {"descr": array.dtype, "fortran_order": False, "shape": array.shape}
+                    )
                     for piece in array.make():
                         stream.write(piece.tobytes())
                 else:

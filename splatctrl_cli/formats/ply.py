@@ -10,7 +10,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from splatctrl_cli.config.ranges import MAX_PLACE
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults
 from splatctrl_cli.formats.unpacking import read_bytes
 from splatctrl_cli.records import Array, Float64, PointCloud
 
@@ -64,13 +64,9 @@ class _Element:
     count: int
     properties: list[tuple[str, str]]
 
-    @property
-    def has_lists(self) -> bool:
-        return any(" " in kind for _, kind in self.properties)
-
     def dtype(self, path: Path, byte_order: str) -> "np.dtype[Any]":
         """The row's type; float text becomes float64 to keep its digits."""
-        if self.has_lists:
+        if any(" " in kind for _, kind in self.properties):
             raise InputError(f"{path}: element {self.name} has list properties: expected a table of numbers")
         types = [(name, SCALARS[kind]) for name, kind in self.properties]
         return np.dtype(
@@ -80,7 +76,7 @@ class _Element:
     def end(self, content: bytes, offset: int, byte_order: str) -> int:
         """End of the element at `offset`; beyond `content` if truncated."""
         kinds = [[np.dtype(byte_order + SCALARS[word]) for word in kind.split()] for _, kind in self.properties]
-        if not self.has_lists:
+        if not any(" " in kind for _, kind in self.properties):
             return offset + self.count * sum(kind.itemsize for (kind,) in kinds)
         for _ in range(self.count):
             for kind, *values in kinds:
@@ -137,8 +133,7 @@ def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
         if not key or ":" in key or any(mark in key + value for mark in "\r\n"):
             raise UsageError(f"PLY comment {key!r}: expected one line and a key without a colon, got {value!r}")
         lines.append(f"comment {key}: {value}".rstrip() if value else f"comment {key}")
-    header = "\n".join([*lines, "end_header", ""]).encode("ascii", "backslashreplace")
-    path.write_bytes(header + rows.tobytes())
+    path.write_bytes("\n".join([*lines, "end_header", ""]).encode("ascii", "backslashreplace") + rows.tobytes())
 
 
 def _read_binary(
@@ -173,10 +168,8 @@ def _read_ascii(
             f"{path}: {wanted.name} {bad}: expected {len(wanted.properties)} numbers, got {len(rows[bad])}"
         )
     for index, (name, _) in enumerate(wanted.properties):
-        try:
+        with refuse_faults(f"{path}: {wanted.name}: property {name}", ValueError, OverflowError):
             table[name] = [float(row[index]) for row in rows]
-        except (ValueError, OverflowError) as error:
-            raise InputError(f"{path}: {wanted.name}: property {name}: {error}") from None
     return table
 
 

@@ -26,6 +26,14 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
+def read_text(path: Path, remedy: str) -> str:
+    """Read UTF-8 text. Raises InputError with the remedy if unreadable, UnicodeDecodeError for other bytes."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy=remedy) from None
+
+
 class BadBlockError(ValueError):
     """A skipped block, and why."""
 

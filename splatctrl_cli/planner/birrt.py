@@ -10,8 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.config.fixed import SHORTCUT_WORTH
+from splatctrl_cli.config import PlannerConfig, fixed
 from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
@@ -110,8 +109,7 @@ class _Search:
         """
         near = tree.nearest(targets)
         way = targets - tree.q[near]
-        length = np.linalg.norm(way, axis=1)
-        way *= np.minimum(1.0, self.config.reach / np.maximum(length, 1e-12))[:, None]
+        way *= np.minimum(1.0, self.config.reach / np.maximum(np.linalg.norm(way, axis=1), 1e-12))[:, None]
         is_free = self.free_shares(tree.q[near], tree.q[near] + way, only_whole=True) >= 1.0
         return tree.add(tree.q[near[is_free]] + way[is_free], near[is_free])
 
@@ -163,8 +161,7 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
     """
     began = time.perf_counter()
     roots = checked_postures(clearance, start, goals, config)
-    trees = _Tree(roots[:1]), _Tree(roots[1:])
-    search = _Search(clearance, config, trees, np.random.default_rng(seed), began)
+    search = _Search(clearance, config, (_Tree(roots[:1]), _Tree(roots[1:])), np.random.default_rng(seed), began)
     outcome, found, goal = search.run()
     searched = time.perf_counter()
     waypoints = found
@@ -257,19 +254,16 @@ def _over_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) 
 def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float64:
     places = np.sort(_places(path, random.random((num, 2))), axis=1)
     places = places[np.floor(places[:, 0]) < np.floor(places[:, 1])]
-    along = _lengths(path)
-    way = np.interp(places, np.arange(len(path)), along)
+    way = np.interp(places, np.arange(len(path)), _lengths(path))
     saved = way[:, 1] - way[:, 0] - np.linalg.norm(_points(path, places[:, 1]) - _points(path, places[:, 0]), axis=1)
     order = np.argsort(-saved, kind="stable")
-    return np.asarray(places[order[saved[order] > SHORTCUT_WORTH]])
+    return np.asarray(places[order[saved[order] > fixed.SHORTCUT_WORTH]])
 
 
 def _cut(path: Float64, cut: Float64) -> Float64:
     first, last = int(np.floor(cut[0])), int(np.ceil(cut[1]))
-    ends = _points(path, cut)
-    rows = np.concatenate([path[: first + 1], ends, path[last:]])
-    is_new = np.r_[True, np.linalg.norm(np.diff(rows, axis=0), axis=1) > 1e-12]
-    cut_path = rows[is_new]
+    rows = np.concatenate([path[: first + 1], _points(path, cut), path[last:]])
+    cut_path = rows[np.r_[True, np.linalg.norm(np.diff(rows, axis=0), axis=1) > 1e-12]]
     cut_path[-1] = path[-1]
     return cut_path
 

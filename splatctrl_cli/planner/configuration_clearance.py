@@ -1,19 +1,111 @@
-"""Clearance of many postures, its loss over motions, and proofs of free edges.
+"""Scenes of solids, clearance of many postures, its loss over motions, and proofs of free edges.
 
 B postures, J joints; R rows: moving spheres, then pairs of spheres.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
 from splatctrl_cli.config.fixed import SHORTEST_EDGE, STILL_ROW
-from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.kernels.chain import EdgeRoom
-from splatctrl_cli.planner.solid_scene import Solids
+from splatctrl_cli.kernels.points import solid_distance
+from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE, CYLINDER
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import sphere_names
+
+STEP = 1e-6  # [m] of the differences that give a gradient
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ball:
+    """A ball at center (3,)."""
+
+    center: Float64
+    radius: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cuboid:
+    """A box of full size (3,) along its axes, placed by T_world_shape (4, 4)."""
+
+    size: Float64
+    T_world_shape: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rod:
+    """A cylinder; `is_round`: a capsule, with caps of its radius on both ends."""
+
+    radius: float
+    length: float
+    T_world_shape: Float64
+    is_round: bool = False
+
+
+Solid = Ball | Cuboid | Rod
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solids:
+    """A `DistanceField` of solids: signed distance, negative inside, 1-Lipschitz.
+
+    Inside several solids: the depth in the deepest, at most the way out. Raises InputError for a size not above zero.
+    """
+
+    solids: Sequence[Solid]
+    _packed: Float64 = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for index, solid in enumerate(self.solids):
+            if not min(_sizes(solid)) > 0:
+                raise InputError(f"solid {index}: expected sizes above 0 m, got {_sizes(solid)}")
+        object.__setattr__(self, "_packed", np.array([_packed(solid) for solid in self.solids]).reshape(-1, 16))
+
+    def rows(self) -> tuple[Float64, Float64, Float64]:
+        """Return balls (., 4), boxes (., 15), rods (., 15) for `kernels.chain.EdgeRoom`."""
+        balls, boxes, cylinders, capsules = (
+            self._packed[self._packed[:, 0] == kind, 1:] for kind in (BALL, BOX, CYLINDER, CAPSULE)
+        )
+        # A capsule is a line padded by its radius, a cylinder has no padding.
+        rods = np.concatenate([cylinders, capsules[:, [*range(12), 14, 13, 12]]])
+        return np.column_stack([-balls[:, 9:12], balls[:, 12]]), boxes, rods
+
+    def distance(self, points: Float64) -> Float64:
+        """Return signed distances (Q,) at points (Q, 3), inf without solids."""
+        return solid_distance(points, self._packed)
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """Return distance (Q,) and central-difference gradient (Q, 3)."""
+        steps = STEP * np.eye(3)
+        gradient = [(self.distance(points + step) - self.distance(points - step)) / (2 * STEP) for step in steps]
+        return self.distance(points), np.stack(gradient, axis=1)
+
+
+def _packed(solid: Solid) -> Float64:
+    """A solid's row (16,) of `kernels.points.solid_distance`."""
+    if isinstance(solid, Ball):
+        kind, T, sizes = BALL, pose_at(solid.center), np.array([solid.radius, 0.0, 0.0])
+    elif isinstance(solid, Cuboid):
+        kind, T, sizes = BOX, solid.T_world_shape, solid.size / 2
+    else:
+        kind, T = CAPSULE if solid.is_round else CYLINDER, solid.T_world_shape
+        sizes = np.array([solid.radius, solid.length / 2, 0.0])
+    into = invert_transform(T)
+    return np.concatenate([[kind], into[:3, :3].ravel(), into[:3, 3], sizes])
+
+
+def _sizes(solid: Solid) -> tuple[float, ...]:
+    if isinstance(solid, Ball):
+        return (float(solid.radius),)
+    if isinstance(solid, Cuboid):
+        return tuple(float(v) for v in solid.size)
+    return float(solid.radius), float(solid.length)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +134,7 @@ class Clearance:
     `lipschitz` scales its rows). compiled: kernel for edges among `Solids`, None without a chain.
     """
 
-    model: ArmModel
+    model: RobotModel
     scene: HasDistance
     taken: Float64
     moving: Integers
@@ -54,7 +146,7 @@ class Clearance:
     @classmethod
     def of(
         cls,
-        model: ArmModel,
+        model: RobotModel,
         scene: HasDistance,
         *,
         margin: float | Float64 = 0.0,

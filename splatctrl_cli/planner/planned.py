@@ -11,7 +11,6 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import Detour, PlanDetour, TimedPath, pose_error
 from splatctrl_cli.control.replay import ReplayTask
@@ -19,6 +18,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.planner.birrt import Plan, PlanOutcome, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, check_edges
 from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
 
 
 def resampled(waypoints: Float64, spacing: float) -> Float64:
@@ -31,7 +31,7 @@ def resampled(waypoints: Float64, spacing: float) -> Float64:
 
 
 def effector_rates(
-    model: ArmModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
+    model: RobotModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
     """Return edge shares per second (W - 1,) within a frame's speeds [m/s], [rad/s].
 
@@ -98,7 +98,7 @@ class PlannedPath:
 
 
 def planned_path(
-    model: ArmModel,
+    model: RobotModel,
     scene: HasDistance,
     task: ReplayTask,
     planner: PlannerConfig,
@@ -129,10 +129,14 @@ def planned_path(
         room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
         outcome, way = _found(room, task, goals, approach, planner, control)
         if outcome is PlanOutcome.SOLVED:
-            rates = effector_rates(
-                model, way, frame, max_linear=control.max_linear_speed, max_angular=control.max_angular_speed
+            path = timed(
+                way,
+                model.velocity_limit,
+                planner.max_acceleration,
+                max_rate=effector_rates(
+                    model, way, frame, max_linear=control.max_linear_speed, max_angular=control.max_angular_speed
+                ),
             )
-            path = timed(way, model.velocity_limit, planner.max_acceleration, max_rate=rates)
             check = check_edges(room, way[:-1], way[1:], contact=planner.contact / 2)
             num_edges, num_proved = len(check.free_share), int(np.sum(check.is_free))
     return PlannedPath(
@@ -203,12 +207,11 @@ def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlCo
         best = int(np.argmin(short))
         margin, self_margin = min(margin, float(scene[1 + best])), min(self_margin, float(own[1 + best]))
     keeps = (scene[1:] >= margin) & (own[1:] >= self_margin)
-    is_free = (scene[1:] > 0) & (own[1:] > 0)
-    return margin, self_margin, goals[keeps & is_free]
+    return margin, self_margin, goals[keeps & ((scene[1:] > 0) & (own[1:] > 0))]
 
 
 def planned_detours(
-    model: ArmModel,
+    model: RobotModel,
     scene_at: Callable[[int], HasDistance],
     frame: str,
     planner: PlannerConfig,
@@ -227,7 +230,7 @@ def planned_detours(
 
 
 def goal_postures(
-    model: ArmModel, frame: str, T_world_goal: Float64, guesses: Float64, config: ControlConfig, *, at_most: int
+    model: RobotModel, frame: str, T_world_goal: Float64, guesses: Float64, config: ControlConfig, *, at_most: int
 ) -> Float64:
     """Return distinct postures (G, J) within limits that bring `frame` to a pose.
 
@@ -244,7 +247,7 @@ def goal_postures(
 
 
 def _solved(
-    model: ArmModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
+    model: RobotModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
 ) -> Float64 | None:
     """Levenberg's method with steps clipped at the limits; None without convergence."""
     scale = 1.0 / np.repeat([fixed.GOAL_SHARE * config.goal_position, fixed.GOAL_SHARE * config.goal_rotation], 3)

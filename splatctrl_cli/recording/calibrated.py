@@ -149,8 +149,11 @@ class CalibratedSource(FrameSource):
     def loss(self) -> LossReport:
         """The source's, a note, and frames the clock leaves unposed."""
         loss = self.inner.loss
-        notes = self._correction.notes(list(self.inner.digests().values()))
-        return replace(loss, without_pose=loss.without_pose + self._num_without_pose, notes=[*loss.notes, *notes])
+        return replace(
+            loss,
+            without_pose=loss.without_pose + self._num_without_pose,
+            notes=[*loss.notes, *self._correction.notes(list(self.inner.digests().values()))],
+        )
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         for stamp, camera, T_recorded in self.inner.poses():

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.formats.grid.grid_format import json_value
@@ -60,7 +60,7 @@ def _ply(path: Path, head: bytes) -> Summary:
 
 
 def _npz(path: Path, _head: bytes) -> Summary:
-    try:
+    with refuse_faults(f"{path}: not a readable .npz", *DAMAGE, OSError, remedy="the file is damaged"):
         with zipfile.ZipFile(path) as archive:
             arrays = {n: _npy_header(archive, n) for n in archive.namelist() if n.endswith(".npy")}
         if not arrays:
@@ -74,17 +74,14 @@ def _npz(path: Path, _head: bytes) -> Summary:
             name: json_value(str(array)) if array.dtype.kind in "US" else array.tolist()
             for name, array in read_arrays(path, short, most=1 << 24).items()
         }
-    except (*DAMAGE, OSError) as error:
-        raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
     rows = [
         [name.removesuffix(".npy"), "x".join(map(str, shape)) or "-", str(dtype)]
         for name, (shape, dtype) in arrays.items()
     ]
     names = {str(row[0]) for row in rows}
-    kind = "occupancy grid" if "log_odds" in names else "distance grid" if {"sdf"} & names else "arrays"
     return Summary(
         path=str(path),
-        kind=kind,
+        kind="occupancy grid" if "log_odds" in names else "distance grid" if {"sdf"} & names else "arrays",
         facts=facts,
         grids=(Grid(name="arrays", header=("array", "shape", "dtype"), rows=rows),),
     )
@@ -97,10 +94,11 @@ def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
 
 
 def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:
-    try:
+    # ValueError: what defusedxml forbids, too
+    with refuse_faults(
+        f"{path}: not {what}", ValueError, EOFError, ParseError, yaml.YAMLError, remedy="the file is damaged"
+    ):
         return parse()
-    except (ValueError, EOFError, ParseError, yaml.YAMLError) as error:  # ValueError: what defusedxml forbids, too
-        raise InputError(f"{path}: not {what}: {error}", remedy="the file is damaged") from None
 
 
 def _npy(path: Path, _head: bytes) -> Summary:
@@ -127,11 +125,16 @@ def _urdf(path: Path, _head: bytes) -> Summary:
         "joints": len(joints),
         "movable_joints": len(movable),
     }
-    notes = () if movable else ("no movable joint: an unexpanded xacro looks like this; expand it with `xacro`",)
     grid = Grid(
         name="joint_table", header=("joint", "type", "parent", "child", "lower", "upper", "velocity"), rows=rows
     )
-    return Summary(path=str(path), kind="URDF", facts=facts, grids=(grid,), notes=notes)
+    return Summary(
+        path=str(path),
+        kind="URDF",
+        facts=facts,
+        grids=(grid,),
+        notes=() if movable else ("no movable joint: an unexpanded xacro looks like this; expand it with `xacro`",),
+    )
 
 
 def _json(path: Path, _head: bytes) -> Summary:
@@ -149,10 +152,8 @@ def _json(path: Path, _head: bytes) -> Summary:
 def _rows(path: Path, _head: bytes) -> Summary:
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     if path.suffix == ".jsonl":
-        try:
+        with refuse_faults(f"{path}: the first line is not JSON", ValueError, remedy="the file is damaged"):
             first = json.loads(lines[0])
-        except ValueError as error:
-            raise InputError(f"{path}: the first line is not JSON: {error}", remedy="the file is damaged") from None
         return Summary(path=str(path), kind="JSON lines", facts={"rows": len(lines), "keys": list(first)})
     return Summary(path=str(path), kind="CSV", facts={"rows": len(lines) - 1, "columns": lines[0].split(",")})
 
@@ -162,9 +163,10 @@ def _yaml(path: Path, _head: bytes) -> Summary:
     spheres = _find(content, "collision_spheres")
     if isinstance(spheres, dict):
         rows = [[link, len(items)] for link, items in spheres.items() if isinstance(items, list)]
-        total = sum(int(row[1]) for row in rows)
         grid = Grid(name="links", header=("link", "spheres"), rows=rows)
-        return Summary(path=str(path), kind="robot spheres", facts={"spheres": total}, grids=(grid,))
+        return Summary(
+            path=str(path), kind="robot spheres", facts={"spheres": sum(int(row[1]) for row in rows)}, grids=(grid,)
+        )
     return Summary(path=str(path), kind="YAML", facts={"keys": list(content) if isinstance(content, dict) else []})
 
 
@@ -172,11 +174,14 @@ def _image(path: Path, _head: bytes) -> Summary:
     pixels = decode_file(path.read_bytes(), color=False)
     if pixels is None:
         raise InputError(f"{path}: not an image that can be read", remedy="the file is damaged")
-    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     return Summary(
         path=str(path),
         kind="image",
-        facts={"size": f"{pixels.shape[1]}x{pixels.shape[0]}", "channels": channels, "dtype": str(pixels.dtype)},
+        facts={
+            "size": f"{pixels.shape[1]}x{pixels.shape[0]}",
+            "channels": 1 if pixels.ndim == 2 else pixels.shape[2],
+            "dtype": str(pixels.dtype),
+        },
     )
 
 

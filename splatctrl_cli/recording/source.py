@@ -229,8 +229,7 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
         return describe_log(open_log(path), options)
     if (layout := layout_of(path)) is not None:
         return _describe_images(path, open_layout(path, options), layout.name)
-    known = ("run.json", "splats.ply", "occupancy.npz", "field.json")
-    names = {name for name in known if (path / name).is_file()}
+    names = {name for name in ("run.json", "splats.ply", "occupancy.npz", "field.json") if (path / name).is_file()}
     is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
     if not ("run.json" in names or "splats.ply" in names or is_dtu):
         refuse_foreign(path)

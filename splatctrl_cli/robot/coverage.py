@@ -197,7 +197,7 @@ def uncovered_area(
         upper, _ = _bounds(pending, centers, radii)
         middle = pending.mean(axis=1)
         reach = np.linalg.norm(pending - middle[:, None], axis=2).max(axis=1)
-        phi = _phi(middle, centers, radii)
+        phi = np.concatenate([(cdist(middle[p], centers) - radii).min(axis=1) for p in _chunks(middle, len(radii))])
         area = areas(pending)
         is_in, is_out = upper <= 0, phi > reach  # 1-Lipschitz: phi > 0 all over the triangle
         is_small = ~is_in & ~is_out & (_longest_edges(pending)[0] <= resolution)
@@ -286,10 +286,6 @@ def _bounds(triangles: Float64, centers: Float64, radii: Float64) -> tuple[Float
         upper[part] = gap.max(axis=1).min(axis=1)
         at_corners[part] = gap.min(axis=2)
     return upper, at_corners
-
-
-def _phi(points: Float64, centers: Float64, radii: Float64) -> Float64:
-    return np.concatenate([(cdist(points[p], centers) - radii).min(axis=1) for p in _chunks(points, len(radii))])
 
 
 def _longest_edges(triangles: Float64) -> tuple[Float64, Index]:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Bool, Box, Floats
 
 REMEDY = "see splatctrl help declare for the keys of a declaration"
@@ -112,12 +113,8 @@ def read_declarations(path: Path, links: Collection[str] | None = None) -> Decla
     Raises InputError for an unreadable file, unknown tables, keys or links, an invalid box, or an end before the
     start.
     """
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give --declare a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}", remedy=REMEDY) from None
+    with refuse_faults(f"{path}: not valid TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=REMEDY):
+        document = tomllib.loads(read_text(path, "give --declare a TOML file"))
     unknown = sorted(set(document) - {"carried", "expected_contact"})
     if unknown:
         raise InputError(f"{path}: expected [[carried]] and [[expected_contact]], got {unknown[0]}", remedy=REMEDY)

@@ -1,6 +1,6 @@
 """Collision geometry of a robot's links as closed triangle surfaces, and exact distance to them, in float64."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -181,8 +181,13 @@ def _primitive(shape: Shape) -> Solid:
         corners, faces, gap = _unit_ball()
         vertices, slack = shape.size[0] * corners, shape.size[0] * gap + 1e-12
     mesh = TriangleMesh(vertices=transform_points(shape.T_link_shape, vertices), faces=faces, is_closed=True)
-    ball = (shape.T_link_shape[:3, 3].copy(), shape.size[0]) if shape.kind == "sphere" else None
-    return Solid(link=shape.link, surface=mesh, slack=float(slack), body=mesh, ball=ball)
+    return Solid(
+        link=shape.link,
+        surface=mesh,
+        slack=float(slack),
+        body=mesh,
+        ball=(shape.T_link_shape[:3, 3].copy(), shape.size[0]) if shape.kind == "sphere" else None,
+    )
 
 
 def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
@@ -194,8 +199,11 @@ def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
             f"link '{shape.link}': mesh {shape.filename}: expected a length of 1 mm to 10 m, got {length:g} m",
             remedy=_unit_words(shape, length),
         )
-    faces = mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]
-    return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces))
+    return replace(
+        mesh,
+        vertices=vertices,
+        faces=np.ascontiguousarray(mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]),
+    )
 
 
 def _unit_words(shape: MeshShape, length: float) -> str:
@@ -218,7 +226,7 @@ def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
     ]
 
 
-def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
+def _taken_apart(mesh: TriangleMesh) -> Iterator[TriangleMesh]:
     size = len(mesh.vertices)
     ends = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
     _, label = connected_components(coo_matrix((np.ones(len(ends[0])), ends), shape=(size, size)), directed=False)
@@ -226,13 +234,10 @@ def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
     closed = [value for value in np.unique(of_face) if _is_closed(mesh.faces[of_face == value])]
     parts = [of_face == value for value in closed]
     is_open = ~np.isin(of_face, closed)
-    pieces = []
     for part in [*parts, *([is_open] if is_open.any() else [])]:
         used, inverse = np.unique(mesh.faces[part], return_inverse=True)
         local = inverse.reshape(-1, 3).astype(np.int64)
-        is_closed = _is_closed(local)
-        pieces.append(replace(mesh, vertices=mesh.vertices[used], faces=local, is_closed=is_closed))
-    return pieces
+        yield replace(mesh, vertices=mesh.vertices[used], faces=local, is_closed=_is_closed(local))
 
 
 def _is_closed(faces: Index) -> bool:
@@ -248,8 +253,7 @@ def _hull(vertices: Float64) -> TriangleMesh | None:
     except QhullError:
         return None
     faces = hull.simplices.astype(np.int64)
-    normal = face_normals(vertices[faces])
-    is_inward = np.einsum("fa,fa->f", normal, hull.equations[:, :3]) < 0
+    is_inward = np.einsum("fa,fa->f", face_normals(vertices[faces]), hull.equations[:, :3]) < 0
     faces[is_inward] = faces[is_inward][:, ::-1]
     return TriangleMesh(vertices=vertices, faces=faces, is_closed=True)
 
@@ -257,8 +261,7 @@ def _hull(vertices: Float64) -> TriangleMesh | None:
 def _box(size: Float64) -> tuple[Float64, Index]:
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    faces = [face for a, b, c, d in quads for face in ([a, b, c], [a, c, d])]
-    return corners, np.array(faces, dtype=np.int64)
+    return corners, np.array([face for a, b, c, d in quads for face in ([a, b, c], [a, c, d])], dtype=np.int64)
 
 
 def _prism(radius: float, length: float) -> tuple[Float64, Index]:
@@ -284,8 +287,7 @@ def _prism(radius: float, length: float) -> tuple[Float64, Index]:
 def _unit_ball() -> tuple[Float64, Index, float]:
     """A polyhedron inside the unit sphere, and its largest distance from it."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
-    corners = axes[np.array(faces)]
+    corners = axes[np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])]
     for _ in range(SPHERE_ROUNDS):
         a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
         ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Box, Float64, Floats, Index, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
@@ -106,18 +106,17 @@ class RobotModel:
         with their mimics. packages: folders for ``package://``, before those above the URDF. Raises InputError.
         """
         file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
-        try:
+        with refuse_faults(f"{file.path}: not a URDF that can be built", ValueError, RuntimeError):
             model = pinocchio.buildModelFromXML(file.text)
-        except (ValueError, RuntimeError) as error:
-            raise InputError(f"{file.path}: not a URDF that can be built: {error}") from None
         model = _without(model, file.with_followers(locked or {}), file.path)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
             spheres = spheres_of(file)
         asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
         sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
-        is_renamed = are_links_renamed(asked, file)
-        return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed, packages=packages)
+        return cls(
+            file, model, sphere_set, T, left_out, are_links_renamed=are_links_renamed(asked, file), packages=packages
+        )
 
     def moved_by(self, names: Sequence[str]) -> "RobotModel":
         """Return the robot for a log of these joints.
@@ -304,8 +303,9 @@ class RobotModel:
 
     def _framed(self, q: Float64, frame: str) -> tuple[Float64, Float64]:
         there = self._model.frames[self._frame(frame)]
-        in_body = np.ascontiguousarray(there.placement.homogeneous[:3])
-        return self.chain.frame(self._checked(q), there.parentJoint, in_body)
+        return self.chain.frame(
+            self._checked(q), there.parentJoint, np.ascontiguousarray(there.placement.homogeneous[:3])
+        )
 
     def lever_arms(self) -> Float64:
         """Return upper bounds (S, J) [m] on a centre's travel per radian (or metre) of a joint, in any posture."""
@@ -400,8 +400,7 @@ class RobotModel:
     def _moved(self) -> Bool:
         """Spheres on the base, or centred on their only axes, never move."""
         postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
-        gain = [np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures]
-        return np.asarray(np.max(gain, axis=0) > 1e-9)
+        return np.asarray(np.max([np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures], axis=0) > 1e-9)
 
     def _lever_arms(self) -> Float64:
         length = np.zeros(self.num_joints + 1)

@@ -9,7 +9,8 @@ import numpy as np
 from defusedxml import ElementTree
 
 from splatctrl_cli.config.fixed import NEVER_MARGIN
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64, Index
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
@@ -28,12 +29,11 @@ def read_srdf(path: Path, urdf: UrdfFile) -> tuple[tuple[DisabledPair, ...], tup
 
     Raises InputError for a file that is no SRDF, a pair without links, or no pair within the URDF.
     """
-    try:
-        root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give the robot's SRDF file") from None
-    except (ElementTree.ParseError, ValueError) as error:  # ValueError: no text, or what defusedxml forbids
-        raise InputError(f"{path}: expected an SRDF, got broken XML: {error}", remedy="give an SRDF file") from None
+    # ValueError: no text, or what defusedxml forbids
+    with refuse_faults(
+        f"{path}: expected an SRDF, got broken XML", ElementTree.ParseError, ValueError, remedy="give an SRDF file"
+    ):
+        root = ElementTree.fromstring(read_text(path, "give the robot's SRDF file"))
     if root.tag != "robot" or root.find("link") is not None or root.find("joint") is not None:
         got = "a URDF" if root.tag == "robot" else f"<{root.tag}>"
         raise InputError(f"{path}: expected an SRDF, got {got}", remedy="give the file with <disable_collisions>")
@@ -108,12 +108,11 @@ def self_collision_pairs(
     pairs = []
     for index, (i, j) in enumerate(zip(a, b, strict=True)):
         column = gaps[:, index]
-        size = int((owner == i).sum() * (owner == j).sum())
         pairs.append(
             LinkPair(
                 links=(links[i], links[j]),
                 left_out=known.get(frozenset((links[i], links[j]))) or _sampled_reason(column, drop_never),
-                num_sphere_pairs=size,
+                num_sphere_pairs=int((owner == i).sum() * (owner == j).sum()),
                 least_gap=float(column.min()) if len(column) else np.nan,
                 largest_gap=float(column.max()) if len(column) else np.nan,
                 hit_share=float(np.mean(column <= 0)) if len(column) else np.nan,

@@ -273,8 +273,9 @@ def _kept(links: tuple[str, str], gap: Float64, margin: float, surface: Float64 
     apart = min(margin, SELF_SHARE * float((gap if surface is None else surface).max()))
     if surface is None:
         least = min(margin, float(np.quantile(gap, SELF_KEPT)))
-        kept = max(least, 0.0) if gap.max() > 0 else None
-        return KeptMargin(links=links, margin=kept, apart=apart, surface_gap=None)
+        return KeptMargin(
+            links=links, margin=max(least, 0.0) if gap.max() > 0 else None, apart=apart, surface_gap=None
+        )
     is_near = surface < apart
     least = min(margin, float(np.quantile(gap[~is_near], SELF_KEPT)))
     excluding = float(gap[is_near].max(initial=-np.inf)) + SELF_ROUNDING

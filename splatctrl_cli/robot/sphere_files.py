@@ -14,7 +14,8 @@ import numpy as np
 import yaml
 
 from splatctrl_cli.config.fixed import CARRIED_CELL
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.kernels.chain import PRISMATIC, Chain
 from splatctrl_cli.records import Box, Float64, SphereSet
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
@@ -73,8 +74,8 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
     names = {link: link for link in urdf.links}
     asked = spheres.links
     if are_links_renamed(spheres, urdf):
-        names = {_without_prefix(link): link for link in urdf.links}
-        asked = tuple(_without_prefix(link) for link in asked)
+        names = {link.partition("_")[2] or link: link for link in urdf.links}
+        asked = tuple(link.partition("_")[2] or link for link in asked)
     kept = [index for index, link in enumerate(asked) if link in names]
     if asked and not kept:
         raise InputError(
@@ -83,17 +84,12 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
     matched = SphereSet(
         links=tuple(names[asked[index]] for index in kept), centers=spheres.centers[kept], radii=spheres.radii[kept]
     )
-    left_out = {spheres.links[index] for index, link in enumerate(asked) if link not in names}
-    return matched, tuple(sorted(left_out))
+    return matched, tuple(sorted({spheres.links[index] for index, link in enumerate(asked) if link not in names}))
 
 
 def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:
     """True if the two have no link name in common."""
     return not set(spheres.links) & set(urdf.links)
-
-
-def _without_prefix(link: str) -> str:
-    return link.partition("_")[2] or link
 
 
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:
@@ -196,12 +192,9 @@ def spheres_yaml(spheres: SphereSet, comments: Sequence[str] = ()) -> str:
 
 
 def _yaml(path: Path) -> Any:
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give a spheres YAML file") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid YAML: {error}", remedy="give a spheres YAML file or a URDF") from None
+    remedy = "give a spheres YAML file"
+    with refuse_faults(f"{path}: not valid YAML", yaml.YAMLError, UnicodeDecodeError, remedy=f"{remedy} or a URDF"):
+        return yaml.safe_load(read_text(path, remedy))
 
 
 def _section(tree: Any) -> dict[Any, Any]:
@@ -263,3 +256,8 @@ def _sphere(where: str, sphere: Any) -> list[float]:
             f"{where}: expected {{center: [x, y, z], radius: r}}, got {sphere!r}", remedy="finite, in metres"
         )
     return row
+
+
+def sphere_names(spheres: SphereSet) -> tuple[str, ...]:
+    """Return each sphere's link and number on it: ``panda_hand[2]``."""
+    return tuple(f"{link}[{spheres.links[:index].count(link)}]" for index, link in enumerate(spheres.links))

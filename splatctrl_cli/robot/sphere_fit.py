@@ -71,8 +71,7 @@ def _check(options: FitOptions, num_links: int) -> None:
             f"sphere fit: {options.max_spheres} spheres for {num_links} links with collision geometry",
             remedy=f"allow at least {num_links}, one for each",
         )
-    lengths = {"protrusion": options.max_protrusion, "deficit": options.max_deficit}
-    for name, value in lengths.items():
+    for name, value in {"protrusion": options.max_protrusion, "deficit": options.max_deficit}.items():
         if value is not None and not (np.isfinite(value) and value >= 0):
             raise UsageError(f"sphere fit: largest {name}: expected 0 m or more, got {value:g}")
 
@@ -100,8 +99,7 @@ def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Fl
 def _covers(links: Sequence["_Link"], t: float, budget: int) -> list[Index] | None:
     covers: list[Index] = []
     for index, link in enumerate(links):
-        left = budget - sum(len(cover) for cover in covers) - (len(links) - index - 1)
-        cover = link.cover(t, at_most=left)
+        cover = link.cover(t, at_most=budget - sum(len(cover) for cover in covers) - (len(links) - index - 1))
         if cover is None:
             return None
         covers.append(cover)
@@ -117,8 +115,7 @@ class _Link:
         self._seed = (options.seed, index)
         self._parts = parts
         self._distance = SolidDistance(parts)
-        surface = np.concatenate([part.surface.corners for part in parts])
-        area = float(areas(surface).sum())
+        area = float(areas(np.concatenate([part.surface.corners for part in parts])).sum())
         if not area > 0:
             raise InputError(f"link '{name}': expected a collision surface, got none of any area")
         longest = max(FIT_MIN_PATCH, 2 * float(np.sqrt(area / options.num_patches)))
@@ -232,8 +229,7 @@ class _Link:
         return owner.astype(np.int64), float(cost[owner, np.arange(cost.shape[1])].max())
 
     def _reach(self, centers: Float64) -> Float64:
-        apart = cdist(centers, self._vertices)
-        return np.asarray(apart[:, self._faces].max(axis=2) + self._slack)
+        return np.asarray(cdist(centers, self._vertices)[:, self._faces].max(axis=2) + self._slack)
 
     def _lattice(self, patches: Float64) -> tuple[Float64, float]:
         """Lattice points in the body; for a thin one also the patches' middles."""

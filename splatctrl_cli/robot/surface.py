@@ -84,8 +84,12 @@ class RobotSurface:
         kept = [(link, corners) for link, corners in pieces if link not in left_out]
         bodies = urdf.rigid_bodies()
         children = {child for _, child in urdf.parents}
-        fixed = tuple(link for link in urdf.links if bodies[link][0] not in children)
-        surface = cls.from_parts([*shapes, *balls], kept, by_spheres=by_spheres, fixed=fixed)
+        surface = cls.from_parts(
+            [*shapes, *balls],
+            kept,
+            by_spheres=by_spheres,
+            fixed=tuple(link for link in urdf.links if bodies[link][0] not in children),
+        )
         return replace(surface, notes=_notes(by_spheres, {*seen.collision_links} - unread.keys(), lost | unread))
 
     @classmethod
@@ -212,8 +216,9 @@ class RobotSurface:
             link_poses=np.ascontiguousarray(T_camera_link[:, :3]),
         )
         packed = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64)
-        depth = np.ascontiguousarray(measured, np.float32)
-        return render_surface(scene, packed, depth, tolerance=tolerance, quadratic=quadratic)
+        return render_surface(
+            scene, packed, np.ascontiguousarray(measured, np.float32), tolerance=tolerance, quadratic=quadratic
+        )
 
     def distance(
         self,

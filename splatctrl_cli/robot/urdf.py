@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64
 
 MOVABLE = ("revolute", "continuous", "prismatic")
@@ -219,18 +220,15 @@ def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give the robot's URDF file") from None
+        return read_text(path, "give the robot's URDF file")
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected a URDF, got bytes that are not text") from None
 
 
 def _parse(path: Path, text: str) -> tuple[str, Any]:
-    try:
+    # ValueError: what defusedxml forbids
+    with refuse_faults(f"{path}: expected a URDF, got broken XML", ElementTree.ParseError, ValueError):
         root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:  # ValueError: what defusedxml forbids
-        raise InputError(f"{path}: expected a URDF, got broken XML: {error}") from None
     if root.tag != "robot":
         raise InputError(f"{path}: expected a URDF with root <robot>, got <{root.tag}>")
     return text, root
@@ -305,8 +303,11 @@ def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape
         scale = _numbers(f"{where}: scale", element.get("scale", "1 1 1"), 3)
         if 0 in scale:
             raise InputError(f"{where}: scale: expected three numbers that are not 0, got {scale}")
-        filename = _attribute(path, element, "filename")
-        return [MeshShape(link=link, filename=filename, scale=scale, T_link_mesh=T_link_shape)]
+        return [
+            MeshShape(
+                link=link, filename=_attribute(path, element, "filename"), scale=scale, T_link_mesh=T_link_shape
+            )
+        ]
     if element.tag == "box":
         size = _numbers(where, element.get("size"), 3)
     elif element.tag in {"cylinder", "capsule"}:

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import CONTACT_REACH, CONTACT_THICKNESS, ROBOT_REACH
+from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Bool, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.declared_contact import Declarations
@@ -21,7 +20,7 @@ from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, farthest_within, 
 
 def is_in_contact(points_world: NDArray[np.floating], robot: RobotPosture) -> Bool:
     """True for points (N, 3) [m] within `CONTACT_REACH` of moving links."""
-    return np.asarray(robot.distance_to_moving(points_world) < CONTACT_REACH)
+    return np.asarray(robot.distance_to_moving(points_world) < fixed.CONTACT_REACH)
 
 
 def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Bool:
@@ -30,9 +29,9 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
     chosen: Bool = mask.kinds == PixelKind.OBJECT
     if not is_robot.any():
         return np.zeros_like(chosen)
-    shown, reach = mask.robot_depth, pixels_of(CONTACT_REACH, frame, mask.robot_depth)
-    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT_REACH  # a quick superset
-    chosen &= frame.depth < farthest_within(shown, reach) + CONTACT_REACH + CONTACT_THICKNESS
+    shown, reach = mask.robot_depth, pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
+    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - fixed.CONTACT_REACH  # a quick superset
+    chosen &= frame.depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS
     chosen[chosen] = is_in_contact(world_points_at(frame, chosen), robot)
     return chosen
 
@@ -47,7 +46,7 @@ def count_carried(
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     poses = dict(zip(surface.links, T_world_link, strict=True))
     points = world_points_at(frame, mask.kinds == PixelKind.ROBOT)
-    is_own = bare.distance(bare.poses(poses), points) < CONTACT_REACH / 2
+    is_own = bare.distance(bare.poses(poses), points) < fixed.CONTACT_REACH / 2
     for link in dict.fromkeys(link for link, _ in declared.carried_at(time_s)):
         declared.is_carried(link, transform_points(invert_transform(poses[link]), points[~is_own]), time_s)
 
@@ -93,6 +92,5 @@ def hidden_objects(
     if robot is None:
         return np.zeros(0, np.intp)
     slots = np.flatnonzero(buffer.is_alive & (buffer.labels != Label.ROBOT))
-    slots = slots[robot.distance(buffer.centers[slots]) < ROBOT_REACH]
-    is_hidden = shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT
-    return np.asarray(slots[is_hidden], np.intp)
+    slots = slots[robot.distance(buffer.centers[slots]) < fixed.ROBOT_REACH]
+    return np.asarray(slots[shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT], np.intp)

@@ -21,9 +21,9 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
+from splatctrl_cli.scene.depth_holes import shadowed
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
-from splatctrl_cli.scene.stereo_shadow import shadowed
 
 T = TypeVar("T", bound=np.generic)
 BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
@@ -106,16 +106,17 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
         until.append(_side_by_side(depths, CONTRADICTING_PIXELS))
     for (frame, _), end, passed in zip(seen, until, through, strict=True):
         side = _side(frame)
-        is_blank = np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2))
         yield Contradicted(
-            side=side, until=end, is_blank=is_blank, through=_side_by_side(passed, SEEN_THROUGH_PIXELS)
+            side=side,
+            until=end,
+            is_blank=np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2)),
+            through=_side_by_side(passed, SEEN_THROUGH_PIXELS),
         )
 
 
 def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
     """Mask with contradicted depth marked."""
-    pixels = found.pixels(mask.kinds.shape)
-    return replace(mask, kinds=np.where(pixels, np.uint8(PixelKind.CONTRADICTED), mask.kinds))
+    return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
 
 def _side(frame: RgbdFrame) -> int:
@@ -125,8 +126,7 @@ def _side(frame: RgbdFrame) -> int:
 def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
     """Pixels (h, w, side^2) of an image's blocks, without incomplete ones at its ends."""
     h, w = (size // side for size in image.shape)
-    parts = image[: h * side, : w * side].reshape(h, side, w, side)
-    return parts.swapaxes(1, 2).reshape(h, w, side * side)
+    return image[: h * side, : w * side].reshape(h, side, w, side).swapaxes(1, 2).reshape(h, w, side * side)
 
 
 def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:

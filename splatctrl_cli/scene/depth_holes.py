@@ -1,24 +1,27 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
 Depth surrounds a hole. An object in it is on its rays, before what is seen around it. Rays of other cameras and later
-images clear it. Depth is also lost at depth edges: the nearer surface may extend there.
+images clear it. Depth is also lost at depth edges: the nearer surface may extend there. A stereo shadow, which only
+one imager sees, is no such hole. Voxels near the robot that no camera ever saw get a reason.
 """
 
 from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import NARROW_HOLE
+from splatctrl_cli.config import OccupancyConfig, fixed
+from splatctrl_cli.config.fixed import ASKED_REACH, MASK_EDGE, SHADOW_BASELINE, SHADOW_STEP
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.kernels import points
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
+from splatctrl_cli.scene.labels import Seen
+from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import camera_array
-from splatctrl_cli.scene.self_mask import PixelKind, SelfMask
-from splatctrl_cli.scene.stereo_shadow import shadowed
-from splatctrl_cli.voxels import LostEdges
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
+from splatctrl_cli.voxels import LostEdges, Unseen
 
 BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
 BESIDE_ROBOT = np.ones((9, 9), np.uint8)  # its outline is fattened, too
@@ -44,8 +47,8 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     if not holes.any():
         return iter(())
     behind = _nearest_depth(frame.depth)
-    width = _voxel_width(frame, behind[holes], config)
-    return _on_rays(frame, _wide(holes, NARROW_HOLE * width), behind, max(int(width), 1), config)
+    width = config.voxel * frame.intrinsics.fx / float(np.median(behind[holes]))
+    return _on_rays(frame, _wide(holes, fixed.NARROW_HOLE * width), behind, max(int(width), 1), config)
 
 
 def _with_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
@@ -53,10 +56,6 @@ def _with_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
     _, groups = cv2.connectedComponents(is_shadow.view(np.uint8), connectivity=8)
     is_beside = is_shadow & np.isin(groups, np.unique(groups[is_robot & is_shadow]))
     return np.asarray(is_robot | (cv2.dilate(is_beside.view(np.uint8), BESIDE) > 0))
-
-
-def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:
-    return config.voxel * frame.intrinsics.fx / float(np.median(depths))
 
 
 def _wide(pixels: Bool, width: float) -> Bool:
@@ -133,3 +132,92 @@ def _of_frame(frame: RgbdFrame, mask: SelfMask) -> LostEdges:
     depths = beside[v, u]
     places = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depths))
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))
+
+
+def shadowed(depth: Float32, focal: float) -> Bool:
+    """Pixels (H, W) without depth in the shadow of something nearer in their row.
+
+    depth (H, W) [m], 0 = none; focal [px]. With baseline B, an object at z hides B focal (1/z - 1/z_behind) pixels
+    behind it, always on the same side. Side and baseline are measured from the image (`_baseline`); z_behind is the
+    largest depth around connected pixels without depth.
+    """
+    is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
+    for turn in (1, -1):  # the nearer object is right of its shadow, then left
+        image = np.ascontiguousarray(depth[:, ::turn])
+        column = np.arange(image.shape[1], dtype=np.int32)
+        following = np.where(image > 0, column, np.int32(len(column)))  # column of the next pixel with depth
+        following = np.minimum.accumulate(following[:, ::-1], axis=1)[:, ::-1]
+        baseline = _baseline(image, following, focal)
+        if baseline:
+            rows, columns = np.nonzero((image <= 0) & (following < len(column)))
+            nearer = following[rows, columns]
+            inverse = 1.0 / image[rows, nearer] - 1.0 / _behind(image)[rows, columns]
+            is_beside = nearer - columns <= baseline * focal * inverse + fattened
+            is_shadow[:, ::turn][rows[is_beside], columns[is_beside]] = True
+    return is_shadow
+
+
+def _baseline(depth: Float32, following: Index, focal: float) -> float:
+    """Baseline [m] of shadows left of nearer objects; 0 without any.
+
+    following (H, W): column of the next depth, W = none. Each step nearer by `SHADOW_STEP` gives a baseline by its
+    lost pixels. The median is over the higher half of the steps, weighted by height: fattened outlines cover low
+    steps' shadows.
+    """
+    following = following[:, 1:]
+    before = depth[:, :-1]
+    after = np.take_along_axis(depth, np.minimum(following, depth.shape[1] - 1), axis=1)
+    is_step = (before > 0) & (after > 0) & (SHADOW_STEP * before * after <= focal * (before - after))
+    columns = np.nonzero(is_step)[1]
+    if not len(columns):
+        return 0.0
+    height = focal * (1.0 / after[is_step] - 1.0 / before[is_step])
+    baselines = (following[is_step] - 1 - columns) / height
+    higher = height >= _median(height, height)
+    return min(_median(baselines[higher], height[higher]), SHADOW_BASELINE)
+
+
+def _median(values: Float64, weights: Float64) -> float:
+    order = np.argsort(values)
+    share = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
+
+
+def _behind(depth: Float32) -> Float32:
+    """Largest depth (H, W) [m] around connected pixels without depth; 0 elsewhere."""
+    is_blank = depth <= 0
+    num, group = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
+    around = np.where(is_blank, cv2.dilate(depth, np.ones((3, 3), np.uint8)), np.float32(0.0))
+    is_rim = around > 0
+    of_group = np.zeros(num, np.float32)
+    np.maximum.at(of_group, group[is_rim], around[is_rim])
+    return np.asarray(of_group[group])
+
+
+OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
+
+
+def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> None:
+    """Note why (`Unseen`) no camera ever saw voxels within `ASKED_REACH` of the robot."""
+    voxels = occupancy.unexplained(robot.centers, robot.radii + ASKED_REACH)
+    points = occupancy.centers_of(voxels)
+    reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
+    for frame, mask in seen:
+        np.maximum(reasons, _in_frame(points, frame, mask), out=reasons)
+    reasons[robot.distance(points) <= 0] = Unseen.SWEPT
+    occupancy.explain(voxels, reasons)
+
+
+def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> NDArray[np.uint16]:
+    """Return why a frame does not show points (K, 3) [m]: `Unseen` (K,)."""
+    pixel, z = pixels_at(frame, points)
+    is_in_view = pixel >= 0
+    if frame.valid is not None:
+        is_in_view &= frame.valid.reshape(-1)[pixel]
+    robot = cv2.dilate(mask.robot_depth, OUTLINE).reshape(-1)[pixel]
+    depth = frame.depth.reshape(-1)[pixel]
+    is_lost = (frame.depth <= 0) & ~shadowed(frame.depth, frame.intrinsics.fx)
+    behind = np.where(is_lost.reshape(-1)[pixel], np.uint16(Unseen.NO_RETURN), np.uint16(Unseen.HIDDEN_BY_THING))
+    is_arm = (robot > 0) & ((robot < z) | (depth <= 0)) & (mask.kinds.reshape(-1)[pixel] != PixelKind.OBJECT)
+    behind[is_arm] = Unseen.HIDDEN_BY_ARM
+    return np.where(is_in_view, behind, np.uint16(Unseen.OUT_OF_VIEW))

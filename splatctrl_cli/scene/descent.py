@@ -20,7 +20,7 @@ from splatctrl_cli.kernels.raster import (
 from splatctrl_cli.records import Float32, Float64
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.keyframes import View
-from splatctrl_cli.scene.relocation import Misfit
+from splatctrl_cli.scene.removal import Misfit
 from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
 
 
@@ -108,8 +108,9 @@ class Descent:
 
     def evaluate(self, view: View) -> LossTerms:
         """Loss of a view."""
-        planes = self.planes(view)
-        return self._loss.evaluate(planes, view.target, self._weights(), empty_planes(*view.target.depth.shape))
+        return self._loss.evaluate(
+            self.planes(view), view.target, self._weights(), empty_planes(*view.target.depth.shape)
+        )
 
     def _weights(self) -> LossWeights:
         return loss_weights(self._config, self.background or BLACK)

@@ -8,18 +8,7 @@ from itertools import chain
 
 import numpy as np
 
-from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
-from splatctrl_cli.config.fixed import (
-    EVICT_EVERY,
-    MASK_SIGMAS,
-    NEAREST_REACH,
-    NOT_COVERED,
-    REFINE_BLOCKS,
-    ROBOT_REACH,
-    SEED_ASKED_VIEWS,
-    SEED_MUCH_MORE,
-    WELL_INSIDE,
-)
+from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel, fixed
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
@@ -27,15 +16,14 @@ from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFra
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
 from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
-from splatctrl_cli.scene.depth_holes import lost_edges, unanswered_points
+from splatctrl_cli.scene.depth_holes import explain_unseen, lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
-from splatctrl_cli.scene.relocation import use_idle
-from splatctrl_cli.scene.removal import REASONS, removals, room_for
+from splatctrl_cli.scene.removal import REASONS, removals, room_for, use_idle
 from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
     Candidates,
@@ -67,7 +55,6 @@ from splatctrl_cli.scene.shell import Shell
 from splatctrl_cli.scene.steady_depth import object_twice, steadied
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
-from splatctrl_cli.scene.unseen import explain_unseen
 from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 
 
@@ -123,8 +110,12 @@ class SceneFitter:
             others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
             masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
             masks = voted(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
-        is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
-        rays = list(contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
+        rays = list(
+            contradicted(
+                list(zip(frames, masks, strict=True)),
+                is_drawn=robot is not None and robot.surface is not None and robot.surface.is_drawn,
+            )
+        )
         masks = list(map(without_contradicted, masks, rays))
         frames = [without(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
         known = {view.frame.camera: view.frame for view in self.window.newest if view.frame.camera in self.objects}
@@ -199,27 +190,28 @@ class SceneFitter:
         `progress` gets the iterations done after each of ten blocks; a restored fitter continues with the next.
         """
         views = [self.view(view.frame) for view in (*self.window.newest, *self.window.keyframes)]
-        for block in range(self.refined.num_blocks, REFINE_BLOCKS):
+        for block in range(self.refined.num_blocks, fixed.REFINE_BLOCKS):
             self._refine_block(block, num_iterations, views)
-            progress(num_iterations * (block + 1) // REFINE_BLOCKS)
+            progress(num_iterations * (block + 1) // fixed.REFINE_BLOCKS)
         removed = dict(self.refined.removed)
         masks = [object_mask(view.frame) for view in views]
-        filled = self.refined.filled + self._fill_gaps(views, masks, removed)
-        return self._audit(views, filled, removed, {})
+        return self._audit(views, self.refined.filled + self._fill_gaps(views, masks, removed), removed, {})
 
     def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
         rng = np.random.default_rng([self.seed, self.num_steps, 1 + block])
         nowhere = np.zeros(self.config.max_splats, bool)
-        rate = self.config.final_rate ** (block / (REFINE_BLOCKS - 1))
-        count = num_iterations * (block + 1) // REFINE_BLOCKS - num_iterations * block // REFINE_BLOCKS
+        rate = self.config.final_rate ** (block / (fixed.REFINE_BLOCKS - 1))
+        count = num_iterations * (block + 1) // fixed.REFINE_BLOCKS - num_iterations * block // fixed.REFINE_BLOCKS
         settings = self.descent.settings(rate, rate * self.config.refine_geometry)
         self.descent.run(
-            self.window.schedule(count, rng), settings, self.config.refine_depth ** (block / (REFINE_BLOCKS - 1))
+            self.window.schedule(count, rng),
+            settings,
+            self.config.refine_depth ** (block / (fixed.REFINE_BLOCKS - 1)),
         )
         # Splats that a view sees through stay: removing them costs 0.6 dB if poses are off by millimetres.
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
-        if block < REFINE_BLOCKS - 2:
+        if block < fixed.REFINE_BLOCKS - 2:
             filled += self._seed(views, [object_mask(view.frame) for view in views])
             filled += self._use_idle(views, rng, removed)
         self.refined = Refined(
@@ -243,11 +235,13 @@ class SceneFitter:
             seen = [view.frame.depth[::8, ::8] for view in self.window.newest]
             depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0, np.float32)
             error = (
-                MASK_SIGMAS * self.occupancy.config.depth_error * float(np.median(depth)) ** 2 if len(depth) else 0.0
+                fixed.MASK_SIGMAS * self.occupancy.config.depth_error * float(np.median(depth)) ** 2
+                if len(depth)
+                else 0.0
             )
             found = unrepresented_voxels(self.occupancy, self.splats(), self.config, error)
             if self.posture is not None:
-                found = found.select(~self.posture.holds(found.centers, WELL_INSIDE))
+                found = found.select(~self.posture.holds(found.centers, fixed.WELL_INSIDE))
             self._unrepresented, self.bare = confirmed(found, self.bare), found
         return self._unrepresented
 
@@ -261,11 +255,14 @@ class SceneFitter:
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
         """Frame as the optimiser takes it; mask: of a robot in it."""
-        min_range = self.occupancy.config.min_range
-        mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
-        reach = NEAREST_REACH * (self.config.scale or 1.0)
-        is_robot = None if mask is None else mask.kinds == PixelKind.ROBOT
-        return make_view(frame, mappable, self.mounted.get(frame.camera), is_robot=is_robot, reach=reach)
+        mappable = inside_workspace(frame, world_points(frame), self.workspace, self.occupancy.config.min_range)
+        return make_view(
+            frame,
+            mappable,
+            self.mounted.get(frame.camera),
+            is_robot=None if mask is None else mask.kinds == PixelKind.ROBOT,
+            reach=fixed.NEAREST_REACH * (self.config.scale or 1.0),
+        )
 
     def _find_mounted(self, frames: Sequence[RgbdFrame]) -> None:
         for camera in sorted({frame.camera for frame in frames} - set(self.mounted)):
@@ -284,7 +281,7 @@ class SceneFitter:
         counted = [view.target.counted > 0 for view in views]
         if not any(view.mappable.any() for view in views):
             shown = [self.descent.rendering(view).opacity for view in views]
-            counted = [mask & (opacity < NOT_COVERED) for mask, opacity in zip(counted, shown, strict=True)]
+            counted = [mask & (opacity < fixed.NOT_COVERED) for mask, opacity in zip(counted, shown, strict=True)]
         return background_color([view.frame for view in views], counted)
 
     def _carry(self, robot: RobotPosture | None) -> None:
@@ -339,7 +336,7 @@ class SceneFitter:
         every = thinning(added)
 
         def offered(index: int) -> list[Candidates]:
-            view, others = views[index], spread(range(len(views)), SEED_ASKED_VIEWS)
+            view, others = views[index], spread(range(len(views)), fixed.SEED_ASKED_VIEWS)
             asked = [views[(index + k) % len(views)] for k in others]
             wanted = (thinned(added[index] & of_label(masks[index], label), every) for label in found)
             sources = (candidates(view.frame, pixels, self.num_threads) for pixels in wanted)
@@ -355,7 +352,7 @@ class SceneFitter:
         num_candidates = sum(len(source) for source in everything)
         if not num_candidates:
             return Filled()
-        if self.density is None or num_candidates > SEED_MUCH_MORE * self.density.num_candidates:
+        if self.density is None or num_candidates > fixed.SEED_MUCH_MORE * self.density.num_candidates:
             count = max(int(self.config.fill * self.config.max_splats), 1)
             self.density = density_for(everything, count, self.config, self.num_threads)
         reserve = int(self.config.gap_reserve * self.config.max_splats)
@@ -365,7 +362,7 @@ class SceneFitter:
                 continue
             live = self.buffer.centers[self._standing_for(label)]
             seeds = seeds_at(sources, live, self.density, self.config, self.num_threads)
-            if len(views) > SEED_ASKED_VIEWS:
+            if len(views) > fixed.SEED_ASKED_VIEWS:
                 seeds = seeds.select(self._is_grounded(seeds.centers, views, label))
             filled += self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve, label=label)
         return filled
@@ -403,7 +400,7 @@ class SceneFitter:
             if label == Label.OBJECT and is_lasting is not None:
                 seeds = seeds.select(is_lasting(seeds.centers))
             num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
-            if label == Label.OBJECT and num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
+            if label == Label.OBJECT and num_missing > 0 and self.num_steps % fixed.EVICT_EVERY == 0:
                 shown, gap = self.descent.misfits(views)[1], self.config.max_gap
                 is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, gap)
                 self.buffer.kill(is_evicted)
@@ -421,7 +418,7 @@ class SceneFitter:
         if robot is None:
             return np.ones(len(points), bool)
         distance = robot.distance(points)
-        is_lasting = (distance > ROBOT_REACH) | (distance >= robot.distance_to_moving(points))
+        is_lasting = (distance > fixed.ROBOT_REACH) | (distance >= robot.distance_to_moving(points))
         for view, pixels in zip(views, lasting, strict=True):
             pixel, z = pixels_at(view.frame, points)
             depth = view.frame.depth.ravel()[pixel]
@@ -463,7 +460,7 @@ class SceneFitter:
             return
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
-        slots = slots[robot.distance(self.buffer.centers[slots]) < ROBOT_REACH]
+        slots = slots[robot.distance(self.buffer.centers[slots]) < fixed.ROBOT_REACH]
         self.buffer.centers[slots] = on_surface(self.buffer.centers[slots], views, config.see_through)
         error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
         radii = kept_radii(
@@ -484,8 +481,9 @@ class SceneFitter:
 
         least 0 counts as unlimited.
         """
-        gap = min(self.occupancy.config.see_through, least or np.inf)
-        return ~seen_through(points, views, gap, self.num_threads, label)
+        return ~seen_through(
+            points, views, min(self.occupancy.config.see_through, least or np.inf), self.num_threads, label
+        )
 
     def _audit(
         self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import NEAREST_REACH, SHRINK
+from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.kernels import points
 from splatctrl_cli.kernels.raster import TargetView
@@ -44,7 +43,7 @@ def make_view(
     mounted: Bool | None = None,
     *,
     is_robot: Bool | None = None,
-    reach: float = NEAREST_REACH,
+    reach: float = fixed.NEAREST_REACH,
 ) -> View:
     """View of `frame`; `mappable` (H, W): pixels with depth in the workspace.
 
@@ -61,10 +60,14 @@ def make_view(
         depth=np.ascontiguousarray(frame.depth, np.float32),
         counted=counted.astype(np.uint8),
     )
-    camera = camera_array(frame.intrinsics, frame.T_world_camera)
     nearest = nearest_depth(frame, reach)
-    beside = nearest if is_robot is None else nearest_depth(frame, reach, is_robot)
-    return View(frame=frame, camera=camera, target=target, nearest=nearest, nearest_object=beside)
+    return View(
+        frame=frame,
+        camera=camera_array(frame.intrinsics, frame.T_world_camera),
+        target=target,
+        nearest=nearest,
+        nearest_object=nearest if is_robot is None else nearest_depth(frame, reach, is_robot),
+    )
 
 
 def seen_through(
@@ -125,7 +128,7 @@ def kept_radii(
             before = np.ascontiguousarray(centers[left] + kept[left, None] * towards[left, number])
             is_out |= points.seen_through(before, [camera], [depths[number]], tolerance, num_threads)
         left = left[is_out & (kept[left] > least)]
-        kept[left] = np.maximum(SHRINK * kept[left], np.float32(least))
+        kept[left] = np.maximum(fixed.SHRINK * kept[left], np.float32(least))
     return kept
 
 

@@ -33,8 +33,7 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None
     colors = np.stack([_blurred(frame) for frame in frames])
-    median = np.median(colors, axis=0)
-    deviation = np.median(np.abs(colors - median), axis=0).max(axis=-1)
+    deviation = np.median(np.abs(colors - np.median(colors, axis=0)), axis=0).max(axis=-1)
     has_depth = np.mean([frame.depth >= min_range for frame in frames], axis=0, dtype=np.float64)
     depth_share = uniform_filter(has_depth, fixed.MOUNTED_WINDOW)
     found = (deviation < fixed.MOUNTED_DEVIATION) & (depth_share < fixed.MOUNTED_DEPTH)
@@ -53,8 +52,7 @@ def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tu
         near_depth = uniform_filter((frame.depth > 0).astype(np.float32), fixed.MOUNTED_WINDOW) > 1e-4
         parts.append(frame.color[mask & ~near_depth])
     colors = np.concatenate(parts)
-    num_pixels = sum(frame.depth.size for frame in frames)
-    if len(colors) < fixed.MOUNTED_BACKGROUND * num_pixels:
+    if len(colors) < fixed.MOUNTED_BACKGROUND * sum(frame.depth.size for frame in frames):
         return (0.0, 0.0, 0.0)
     red, green, blue = (float(value) / 255.0 for value in np.median(colors, axis=0))
     return (red, green, blue)
@@ -64,8 +62,7 @@ def _entering(mask: Bool) -> Bool:
     parts, _ = label(mask)
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     area = np.bincount(parts.ravel())
-    kept = [part for part in border if part and area[part] >= fixed.MOUNTED_AREA * mask.size]
-    return np.isin(parts, kept)
+    return np.isin(parts, [part for part in border if part and area[part] >= fixed.MOUNTED_AREA * mask.size])
 
 
 def _blurred(frame: RgbdFrame) -> Float32:

@@ -87,5 +87,4 @@ def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float
     gap = np.linalg.norm(points[:, None] - before.centers[None], axis=2) - before.radii
     sphere = np.argmin(np.abs(gap), axis=1)
     T = after.T_world_link @ np.linalg.inv(before.T_world_link)
-    moved = np.einsum("nij,nj->ni", T[sphere, :3, :3], points) + T[sphere, :3, 3]
-    return np.asarray(moved, np.float32)
+    return np.asarray(np.einsum("nij,nj->ni", T[sphere, :3, :3], points) + T[sphere, :3, 3], np.float32)

@@ -1,4 +1,4 @@
-"""Rendering of a splat set, eq. 1 to 3 of the paper, and weights of its loss, eq. 4."""
+"""Rendering of splats, eq. 1 to 3 of the paper, and of Gaussians; weights of the loss, eq. 4."""
 
 import math
 from collections.abc import Sequence
@@ -6,12 +6,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import OPAQUE_ENOUGH
+from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.kernels import num_threads
-from splatctrl_cli.kernels.raster import LossTerms, LossWeights, Rasteriser, pack_camera
-from splatctrl_cli.records import Float32, Float64, Intrinsics, SplatSet
+from splatctrl_cli.kernels.raster import (
+    CENTER,
+    HARMONICS,
+    LOG_SCALE,
+    LOGIT,
+    NUM_PARAMETERS,
+    QUAT,
+    GaussianRasteriser,
+    LossTerms,
+    LossWeights,
+    Rasteriser,
+    pack_camera,
+)
+from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, SplatSet
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
@@ -37,7 +48,7 @@ class Rendering:
 
 def normalised_depth(depth: Float32, opacity: Float32) -> Float32:
     """Depth / opacity (H, W) [m] for opacity of 0.5 or more, else 0."""
-    is_opaque = opacity >= OPAQUE_ENOUGH
+    is_opaque = opacity >= fixed.OPAQUE_ENOUGH
     return np.where(is_opaque, depth / np.where(is_opaque, opacity, 1.0), 0.0).astype(np.float32)
 
 
@@ -58,8 +69,9 @@ def render(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64, *,
         np.ascontiguousarray(splats.colors, np.float32),
     )
     planes = raster.forward()
-    color = np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2))
-    return Rendering(color=color, depth=planes[3].copy(), opacity=planes[4].copy())
+    return Rendering(
+        color=np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2)), depth=planes[3].copy(), opacity=planes[4].copy()
+    )
 
 
 def loss_weights(config: SceneConfig, background: Color = BLACK) -> LossWeights:
@@ -91,3 +103,34 @@ def psnr_of(terms: Sequence[LossTerms]) -> float | None:
     if not terms:
         return None
     return -10.0 * math.log10(max(sum(t.squared for t in terms) / len(terms), 1e-12))
+
+
+LARGEST_LOGIT = 16.0  # opacity 1 to float32
+PER_CHANNEL = 16  # harmonics
+
+
+def parameters_of(gaussians: GaussianSet) -> Float32:
+    """Parameters (N, 59); opacities 0 and 1 become the nearest finite logit."""
+    rows = np.zeros((len(gaussians), NUM_PARAMETERS), np.float32)
+    rows[:, CENTER] = gaussians.centers
+    rows[:, LOG_SCALE] = np.log(gaussians.scales)
+    rows[:, QUAT] = gaussians.quats_wxyz
+    opacity = gaussians.opacities.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        logit = np.log(opacity) - np.log1p(-opacity)
+    rows[:, LOGIT] = np.clip(logit, -LARGEST_LOGIT, LARGEST_LOGIT)
+    coefficients = np.moveaxis(gaussians.harmonics, 2, 1)
+    rows[:, HARMONICS].reshape(-1, 3, PER_CHANNEL)[:, :, : coefficients.shape[2]] = coefficients
+    return rows
+
+
+def render_gaussians(
+    gaussians: GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0
+) -> Rendering:
+    """Render from a pinhole camera at T_world_camera (4, 4); black where empty."""
+    raster = GaussianRasteriser(num_threads(threads))
+    raster.prepare(camera_array(intrinsics, T_world_camera), parameters_of(gaussians))
+    planes = raster.forward()
+    return Rendering(
+        color=np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2)), depth=planes[3].copy(), opacity=planes[4].copy()
+    )

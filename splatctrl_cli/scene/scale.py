@@ -6,16 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from splatctrl_cli.config import Config, OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import (
-    NOISE_BLOCKS,
-    NOISE_FEWEST,
-    NOISE_LEAST_SIDE,
-    NOISE_QUANTILE,
-    NOISE_WIDER,
-    SCALE_DEPTH,
-    SCALE_NEAREST,
-)
+from splatctrl_cli.config import Config, OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.records import Float32, Float64, RgbdFrame
 
 Lengths = TypeVar("Lengths", SceneConfig, OccupancyConfig)
@@ -55,8 +46,12 @@ class RecordedDepth:
             return None
         nearest, median, farthest = (float(q) for q in np.percentile(depth, [10.0, 50.0, 99.5]))
         cameras = sorted({frame.camera for frame in frames})
-        noise = max(depth_noise([f.depth for f in frames if f.camera == camera]) for camera in cameras)
-        return cls(median=median, nearest=nearest, farthest=farthest, noise=noise)
+        return cls(
+            median=median,
+            nearest=nearest,
+            farthest=farthest,
+            noise=max(depth_noise([f.depth for f in frames if f.camera == camera]) for camera in cameras),
+        )
 
 
 def depth_noise(images: Sequence[Float32]) -> float:
@@ -67,14 +62,14 @@ def depth_noise(images: Sequence[Float32]) -> float:
     noise, and a low quantile leaves out edges. Fits absorb noise that neighbours share. Blocks two or three times as
     wide may raise it, up to twice; more is shape.
     """
-    narrow, *wider = (_linear_noise(images, times) for times in (1, *NOISE_WIDER))
+    narrow, *wider = (_linear_noise(images, times) for times in (1, *fixed.NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))
 
 
 def _linear_noise(images: Sequence[Float32], times: int) -> float:
     left: list[Float64] = []
     for depth in images:
-        side = times * _block_side(depth)
+        side = times * int(max(depth.shape[1] // fixed.NOISE_BLOCKS, fixed.NOISE_LEAST_SIDE))
         rows, columns = (size // side for size in depth.shape)
         blocks = depth[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
         pixels = blocks.reshape(-1, side * side)
@@ -84,12 +79,7 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
         residual = inverse - inverse @ linear @ linear.T
         left.append(np.sqrt(np.sum(residual**2, axis=1) / (side * side - 3)))
     found = np.concatenate(left) if left else np.zeros(0)
-    return float(np.quantile(found, NOISE_QUANTILE)) if len(found) >= NOISE_FEWEST else 0.0
-
-
-def _block_side(depth: Float32) -> int:
-    """Side of a block [px]: 1 / `NOISE_BLOCKS` of the width, at least `NOISE_LEAST_SIDE`: neighbours share noise."""
-    return int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
+    return float(np.quantile(found, fixed.NOISE_QUANTILE)) if len(found) >= fixed.NOISE_FEWEST else 0.0
 
 
 def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:
@@ -105,7 +95,7 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
     if has_robot and config.scene.scale == 0:
         return config
     is_found = config.scene.scale == 0
-    scale = depth.median / SCALE_DEPTH if is_found else config.scene.scale
+    scale = depth.median / fixed.SCALE_DEPTH if is_found else config.scene.scale
     scene, occupancy = scaled(config.scene, scale), scaled(config.occupancy, scale)
     values: dict[str, float] = {"scale": scale}
     if is_found and scene.radius_depth == 0:
@@ -113,7 +103,7 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
     ranges: dict[str, float] = {}
     if is_found and config.occupancy.min_range == OccupancyConfig().min_range:
         least = config.occupancy.min_range  # a nearer scene changes neither noise nor what a camera carries
-        ranges["min_range"] = max(least, min(occupancy.min_range, SCALE_NEAREST * depth.nearest))
+        ranges["min_range"] = max(least, min(occupancy.min_range, fixed.SCALE_NEAREST * depth.nearest))
     if is_found and config.occupancy.max_range == OccupancyConfig().max_range:
         ranges["max_range"] = max(occupancy.max_range, depth.farthest)
     return config.derived(scene=scene.derived(**values), occupancy=occupancy.derived(**ranges))

@@ -41,8 +41,7 @@ def _placed(frame: RgbdFrame) -> Float64:
 
 def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
     """Pixels (H, W) in the workspace with valid depth of at least `min_range` [m]."""
-    is_valid = (frame.depth > 0) & (frame.depth >= min_range)
-    return np.asarray(is_valid & workspace.contains(points_world))
+    return np.asarray((frame.depth > 0) & (frame.depth >= min_range) & workspace.contains(points_world))
 
 
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:

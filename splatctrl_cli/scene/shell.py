@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import SCALE_DEPTH, SHELL_ITERATIONS, SHELL_UNMET
+from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.records import Bool, Box, SplatSet
 from splatctrl_cli.scene.buffer import COLOR, SplatBuffer
 from splatctrl_cli.scene.descent import Descent
@@ -58,11 +57,11 @@ class Shell:
     def _begin(self, depth: float, density: SeedDensity | None, num_iterations: int = 0) -> None:
         self._depth, self._density, config = depth, density, self.config
         if density is not None:
-            config = scaled(config, depth / SCALE_DEPTH).derived(radius_depth=depth)
+            config = scaled(config, depth / fixed.SCALE_DEPTH).derived(radius_depth=depth)
             least, most = config.min_radius, config.max_radius  # the user may have set either
             widest = max(least, most, config.radius_per_edge * density.edge)  # else far walls have holes
             config = config.derived(max_radius=widest)
-            self._see_through = scaled(self.occupancy, depth / SCALE_DEPTH).see_through
+            self._see_through = scaled(self.occupancy, depth / fixed.SCALE_DEPTH).see_through
         self._scaled = config
         self._descent = Descent(config, self.buffer, self._seed, self._num_threads)
         self._descent.num_iterations = num_iterations
@@ -79,7 +78,9 @@ class Shell:
             return
         config, is_first = self.config, self._density is None
         self._add(shown)
-        iterations = round(SHELL_ITERATIONS * (config.first_iterations if is_first else config.iterations_per_step))
+        iterations = round(
+            fixed.SHELL_ITERATIONS * (config.first_iterations if is_first else config.iterations_per_step)
+        )
         far = Window(config)
         far.newest = [replace(v, target=replace(v.target, counted=m.astype(np.uint8))) for v, m in shown]
         self._descent.background = background
@@ -96,7 +97,7 @@ class Shell:
         A restart seeds all views and its own splats' places.
         """
         asked = [(view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown]
-        most = SHELL_UNMET * self.config.max_splats
+        most = fixed.SHELL_UNMET * self.config.max_splats
         if self._density is not None and self._fill(_sources(asked), self._density) <= most:
             return
         stands = self.buffer.is_alive.copy()
@@ -107,7 +108,7 @@ class Shell:
         )
         self.buffer.kill(stands)
         depth = float(np.median(np.concatenate([view.target.depth[mask] for view, mask in shown])))
-        sources, config = [*_sources(shown), held], scaled(self.config, depth / SCALE_DEPTH)
+        sources, config = [*_sources(shown), held], scaled(self.config, depth / fixed.SCALE_DEPTH)
         density = density_for(sources, max(int(config.fill * config.max_splats), 1), config, self._num_threads)
         self._begin(depth, density, self._descent.num_iterations)
         self._fill(sources, density)

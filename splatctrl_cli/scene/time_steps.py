@@ -37,8 +37,7 @@ class TimeStep:
 
     def without_depth(self) -> "TimeStep":
         """Return the step as colour cameras would see it."""
-        frames = tuple(replace(frame, depth=np.zeros_like(frame.depth)) for frame in self.frames)
-        return replace(self, frames=frames)
+        return replace(self, frames=tuple(replace(frame, depth=np.zeros_like(frame.depth)) for frame in self.frames))
 
     @property
     def stamp_ns(self) -> int:

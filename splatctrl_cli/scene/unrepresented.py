@@ -10,8 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import BARE_GROUP, OCCUPIED_WITH_SPLATS, SPLATS_ON_SURFACE
+from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Bool, Box, Float32, Label, SplatSet
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -31,8 +30,9 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     centers = occupancy.centers_of(voxels)
     is_missing = SplatTree(others.centers, others.radii, occupancy.num_threads).are_further(centers, reach)
     is_human = occupancy.entity.reshape(-1)[voxels[is_missing]] & Label.HUMAN > 0
-    labels = np.where(is_human, np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
-    return Balls.of_voxels(centers[is_missing], occupancy.config.voxel, labels)
+    return Balls.of_voxels(
+        centers[is_missing], occupancy.config.voxel, np.where(is_human, np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
+    )
 
 
 def confirmed(found: Balls, before: Balls | None) -> Balls:
@@ -47,7 +47,7 @@ def confirmed(found: Balls, before: Balls | None) -> Balls:
     pairs = cKDTree(found.centers).query_pairs(1.01 * 3**0.5 * voxel, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(found), len(found)))
     group = connected_components(graph, directed=False)[1]
-    is_kept = np.bincount(group)[group] >= BARE_GROUP
+    is_kept = np.bincount(group)[group] >= fixed.BARE_GROUP
     if len(before):
         is_kept |= cKDTree(before.centers).query(found.centers)[0] < 0.5 * voxel
     return found.select(is_kept)
@@ -108,7 +108,7 @@ class GridAgreement:
     @property
     def holds(self) -> bool:
         """True if both shares are as large as a reconstruction leaves them; False with nothing to compare."""
-        return self.on_surface >= SPLATS_ON_SURFACE and self.represented >= OCCUPIED_WITH_SPLATS
+        return self.on_surface >= fixed.SPLATS_ON_SURFACE and self.represented >= fixed.OCCUPIED_WITH_SPLATS
 
 
 def agreement_with_grid(

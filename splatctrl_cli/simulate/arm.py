@@ -102,8 +102,7 @@ def slim(shape: Capsule | Block) -> tuple[Capsule | Block, ...]:
         x, y, z = (size - 2 * GAP for size in shape.size)
         return (Block(middle=shape.middle, size=(x, y, z)),)
     start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
-    length = float(np.linalg.norm(end - start))
-    if length < LONG:
+    if float(np.linalg.norm(end - start)) < LONG:
         return (Capsule(start=shape.start, end=shape.end, radius=shape.radius - GAP),)
     low, high = (start + share * (end - start) for share in (BULGE, 1 - BULGE))
     return (
@@ -147,9 +146,12 @@ def link_shape(link: str, shape: Capsule | Block) -> Shape:
     if isinstance(shape, Block):
         return Shape(link=link, kind="box", size=shape.size, T_link_shape=pose_at(shape.middle))
     start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
-    T_link_shape = pose_at((start + end) / 2, frame_along(end - start))
-    size = (shape.radius, float(np.linalg.norm(end - start)))
-    return Shape(link=link, kind="capsule", size=size, T_link_shape=T_link_shape)
+    return Shape(
+        link=link,
+        kind="capsule",
+        size=(shape.radius, float(np.linalg.norm(end - start))),
+        T_link_shape=pose_at((start + end) / 2, frame_along(end - start)),
+    )
 
 
 def arm_urdf(visual: Mapping[str, tuple[Capsule | Block, ...]] = SHAPES) -> str:

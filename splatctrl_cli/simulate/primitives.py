@@ -101,8 +101,9 @@ class Track:
         if after in (0, len(self.stamp_ns)):
             return np.asarray(self.T_world_shape[max(after - 1, 0)])
         first, last = int(self.stamp_ns[after - 1]), int(self.stamp_ns[after])
-        share = (stamp_ns - first) / (last - first)
-        return interpolate_transform(self.T_world_shape[after - 1], self.T_world_shape[after], share)
+        return interpolate_transform(
+            self.T_world_shape[after - 1], self.T_world_shape[after], (stamp_ns - first) / (last - first)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +147,13 @@ def solid(
     name: str, kind: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float | None = None
 ) -> Primitive:
     """A solid, upright or rotated by yaw [rad] about z."""
-    T_world_shape = pose_at(middle, None if yaw is None else turn_about_z(yaw))
-    return Primitive(name=name, kind=kind, size=size, T_world_shape=T_world_shape, texture=texture)
+    return Primitive(
+        name=name,
+        kind=kind,
+        size=size,
+        T_world_shape=pose_at(middle, None if yaw is None else turn_about_z(yaw)),
+        texture=texture,
+    )
 
 
 def box(name: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float = 0.0) -> Primitive:

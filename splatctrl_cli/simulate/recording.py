@@ -95,16 +95,21 @@ class Scene:
         """The scene of the options."""
         motion = tabletop.arm_motion(options.duration_s)
         if options.is_free:
-            walls = tuple(p for p in tabletop.furniture() if p.name != "table")
-            return cls(primitives=walls, temporary=(), motion=motion)
+            return cls(
+                primitives=tuple(p for p in tabletop.furniture() if p.name != "table"), temporary=(), motion=motion
+            )
         span = round(options.duration_s * 1e9)
         third = (START_NS + span // 3, START_NS + 2 * span // 3)
         num_steps = max(round(options.duration_s * options.fps / 3), 1)
         temporary = (
             tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third, options.visitor)]
         )
-        there = (*tabletop.furniture(), *tabletop.things(), *temporary)
-        return cls(primitives=there, temporary=tuple(temporary), motion=motion, has_people=options.with_person)
+        return cls(
+            primitives=(*tabletop.furniture(), *tabletop.things(), *temporary),
+            temporary=tuple(temporary),
+            motion=motion,
+            has_people=options.with_person,
+        )
 
 
 class Recording:
@@ -138,8 +143,9 @@ class Recording:
         """The arm's states, 50 a second."""
         for index in range(int(self.options.duration_s * JOINT_RATE) + 1):
             position, velocity = self._motion.at(index / JOINT_RATE)
-            stamp_ns = self.start_ns + index * 10**9 // JOINT_RATE
-            yield JointState(stamp_ns=stamp_ns, position=position, velocity=velocity)
+            yield JointState(
+                stamp_ns=self.start_ns + index * 10**9 // JOINT_RATE, position=position, velocity=velocity
+            )
 
     def frames(self) -> Iterator[RgbdFrame]:
         """All images in time order, cameras in turn at each stamp."""
@@ -184,8 +190,7 @@ class Recording:
         """world -> camN_link -> camN_optical_frame, and world -> the arm's root link."""
         transforms: list[Transform] = [("world", self.robot.urdf.links[0], self.robot.T_world_base)]
         for camera in self.cameras:
-            T_world_link = camera.T_world_camera @ OPTICAL_FROM_LINK.T
-            transforms.append(("world", f"{camera.name}_link", T_world_link))
+            transforms.append(("world", f"{camera.name}_link", camera.T_world_camera @ OPTICAL_FROM_LINK.T))
             transforms.append((f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK))
         return transforms
 

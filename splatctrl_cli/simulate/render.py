@@ -91,8 +91,7 @@ class Renderer:
         for index, primitive in enumerate(primitives):
             mine = owner == index
             if mine.any():
-                points_world = origin + depth[mine][:, None] * self._directions[mine]
-                color[mine] = shaded(primitive, points_world)
+                color[mine] = shaded(primitive, origin + depth[mine][:, None] * self._directions[mine])
 
     def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> Index:
         """Lower `depth` (K, H, W); index of the nearest primitive, or -1."""

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64, Intrinsics, Stamps
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture, Track, closest_point
 from splatctrl_cli.simulate.render import Camera
@@ -114,12 +115,8 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
 def load_truth(path: Path) -> Truth:
     """Read a truth file. Raises InputError for a missing, another or a damaged one."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give a truth.json") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from None
+    with refuse_faults(f"{path}: not valid JSON", ValueError):
+        document = json.loads(read_text(path, "give a truth.json"))
     is_ours = isinstance(document, dict) and document.get("format") == FORMAT
     if not is_ours or document.get("version") not in VERSIONS:
         raise InputError(

@@ -19,7 +19,7 @@ from splatctrl_cli.field.distance import (
     march,
     normalised,
 )
-from splatctrl_cli.field.health import planar_zero_level
+from splatctrl_cli.field.slabs import planar_zero_level
 from splatctrl_cli.records import DistanceField
 from tests.field.scenes import cloud, plane, queries
 from tests.reference import field as reference

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.field.health import field_health, median_spacing
+from splatctrl_cli.field.slabs import field_health, median_spacing
 from splatctrl_cli.field.unknown import NO_SPLAT, obstacle_spheres
 from splatctrl_cli.records import Label
 from splatctrl_cli.voxels import Balls

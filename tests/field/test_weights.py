@@ -162,6 +162,14 @@ def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
         conjugate_gradients(csr_array(np.array([[1.0, 3.0], [3.0, 1.0]])), np.array([1.0, -0.5]), 1e-9)
 
 
+def test_the_refusal_names_the_residual_that_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    matrix, values, tolerance = csr_array(np.diag([1.0, 1.1, 1.3])), np.array([1.0, -0.5, 2.0]), 1e-9
+    assert conjugate_gradients(matrix, values, tolerance)[2] <= 2e-9
+    monkeypatch.setattr(weights_module, "CG_ITERATIONS", 1)
+    with pytest.raises(NotEvaluableError, match=r"expected a residual of at most 2\.0e-09 after 1 iterations"):
+        conjugate_gradients(matrix, values, tolerance)
+
+
 def test_coinciding_splats_share_their_weight() -> None:
     centers, radii = np.zeros((3, 3)), np.full(3, 0.01)
     for weights in ("rowsum", "voxel", "cg"):

@@ -10,9 +10,8 @@ from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner import birrt
 from splatctrl_cli.planner.birrt import PlanOutcome, plan, shortened
-from splatctrl_cli.planner.configuration_clearance import Clearance, EdgeCheck, OnlyDistance, check_edges
+from splatctrl_cli.planner.configuration_clearance import Clearance, EdgeCheck, OnlyDistance, Solids, check_edges
 from splatctrl_cli.planner.planned import resampled
-from splatctrl_cli.planner.solid_scene import Solids
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, Nowhere, PlanarArm, Plane
 from tests.planner.walls import clearance, closed_ring, one_wall, thin_post

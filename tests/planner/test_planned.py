@@ -14,7 +14,7 @@ from splatctrl_cli.control.replay import ReplayTask, is_at_goal
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.configuration_clearance import Clearance
+from splatctrl_cli.planner.configuration_clearance import Ball, Clearance, Solids
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     NO_POSTURE,
@@ -29,7 +29,6 @@ from splatctrl_cli.planner.planned import (
     resampled,
     timed,
 )
-from splatctrl_cli.planner.solid_scene import Ball, Solids
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
 from tests.planner.walls import one_wall

@@ -4,7 +4,7 @@ from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
+from splatctrl_cli.planner.configuration_clearance import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.simulate.primitives import Primitive, Texture, signed_distance
 
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Solids
+from splatctrl_cli.planner.configuration_clearance import Ball, Clearance, Cuboid, Solids
 from tests.control.fakes import PlanarArm
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.robot.model import RobotModel
 
 
 def interval_bound(first: Float64, last: Float64, motion: Float64, levers: Float64) -> float:
@@ -29,7 +29,7 @@ def velocity_shares(stamps: Stamps, positions: Float64, limit: Float64, window: 
     return found
 
 
-def points_beside(arm: ArmModel, q: Float64, reach: float, step: float) -> list[tuple[Float64, float, str]]:
+def points_beside(arm: RobotModel, q: Float64, reach: float, step: float) -> list[tuple[Float64, float, str]]:
     """Points of a lattice outside of all spheres and within `reach` of a moving one, how far off, and whose link."""
     centers, found = arm.sphere_centers(q), []
     low, high = (centers.min(axis=0) - 0.12) / step, (centers.max(axis=0) + 0.12) / step
@@ -42,6 +42,6 @@ def points_beside(arm: ArmModel, q: Float64, reach: float, step: float) -> list[
     return found
 
 
-def _gaps(arm: ArmModel, q: Float64, point: Float64) -> list[float]:
+def _gaps(arm: RobotModel, q: Float64, point: Float64) -> list[float]:
     spheres = zip(arm.sphere_centers(q), arm.sphere_set.radii, strict=True)
     return [float(np.linalg.norm(point - center) - radius) for center, radius in spheres]

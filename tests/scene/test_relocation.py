@@ -6,7 +6,7 @@ import pytest
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.scene.buffer import SplatBuffer
-from splatctrl_cli.scene.relocation import Misfit, clone_shape, clone_sources, detail_seeds, drawn
+from splatctrl_cli.scene.removal import Misfit, clone_shape, clone_sources, detail_seeds, drawn
 from tests.scene.wall import HEIGHT, INTRINSICS, frame, plain_seeds
 
 CONFIG = SceneConfig()

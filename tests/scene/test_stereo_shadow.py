@@ -5,8 +5,7 @@ import pytest
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.records import Bool, Float32, Intrinsics
-from splatctrl_cli.scene.depth_holes import unanswered_points
-from splatctrl_cli.scene.stereo_shadow import shadowed
+from splatctrl_cli.scene.depth_holes import shadowed, unanswered_points
 from tests.plain import plain_frame
 
 FOCAL, BASELINE = 400.0, 0.05  # [px], [m]

@@ -10,10 +10,10 @@ from splatctrl_cli.config.fixed import ASKED_REACH
 from splatctrl_cli.geometry import back_project
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.robot.surface import RobotSurface
+from splatctrl_cli.scene.depth_holes import explain_unseen
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.self_mask import self_mask
-from splatctrl_cli.scene.unseen import explain_unseen
 from splatctrl_cli.voxels import EvidenceClass, Unseen
 from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame
 

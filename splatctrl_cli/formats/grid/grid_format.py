@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.records import DistanceGrid, Float64, Values
@@ -82,10 +82,8 @@ def header_text(grid: DistanceGrid) -> str:
 
 def parse_header(name: str, text: str) -> dict[str, object]:
     """Parse a header. Raises InputError naming `name` if invalid or of another version."""
-    try:
+    with refuse_faults(f"{name}: header: not JSON", json.JSONDecodeError, remedy="bake it again"):
         parsed = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{name}: header: not JSON: {error}", remedy="bake it again") from None
     if not isinstance(parsed, dict) or parsed.get("version") != VERSION:
         version = parsed.get("version") if isinstance(parsed, dict) else None
         raise InputError(
@@ -99,8 +97,7 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
 
     Raises InputError without sdf, or for an unknown name, dtype or shape.
     """
-    strange = [channel for channel in arrays if channel not in CHANNELS]
-    if strange or "sdf" not in arrays:
+    if not {"sdf"} <= arrays.keys() <= CHANNELS.keys():
         raise InputError(
             f"{name}: expected the channel sdf and any of {', '.join(list(CHANNELS)[1:])}, "
             f"got {', '.join(arrays) or 'none'}",
@@ -205,10 +202,17 @@ def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
 
 
 def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
-    rows = [[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels]
-    facts = {**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)}
-    table = Grid(name="channels", header=("channel", "dtype", "unit"), rows=rows)
-    return Summary(path=str(path), kind=kind, facts=facts, grids=(table,))
+    table = Grid(
+        name="channels",
+        header=("channel", "dtype", "unit"),
+        rows=[[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels],
+    )
+    return Summary(
+        path=str(path),
+        kind=kind,
+        facts={**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)},
+        grids=(table,),
+    )
 
 
 def json_value(text: object) -> object:
@@ -281,8 +285,12 @@ class GridSlabs:
         channels: dict[str, Values] = {
             name: np.lib.format.open_memmap(self.folder / f"{name}.npy", mode="r") for name in self.plan.channels
         }
-        origin = np.array(self.plan.origin, np.float64)
-        return DistanceGrid(origin=origin, voxel=self.plan.voxel, channels=channels, header=dict(header))
+        return DistanceGrid(
+            origin=np.array(self.plan.origin, np.float64),
+            voxel=self.plan.voxel,
+            channels=channels,
+            header=dict(header),
+        )
 
     def _shape(self, name: str, num_layers: int) -> tuple[int, ...]:
         return CHANNELS[name].shape((num_layers, *self.plan.shape[1:]))

@@ -129,8 +129,9 @@ def _head(path: Path, archive: zipfile.ZipFile, members: _Members) -> GridHead:
     if not 0.0 < voxel < np.inf:
         raise InputError(f"{path}: voxel: expected a size above 0 m, got {voxel}", remedy="bake it again")
     layout = {name: (kind.str, size) for name, (kind, size) in members.items() if name not in {*PLACE, "header"}}
-    shape = check_layout(str(path), layout)
-    return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header)
+    return GridHead(
+        origin=origin, voxel=voxel, shape=check_layout(str(path), layout), channels=tuple(layout), header=header
+    )
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Values:

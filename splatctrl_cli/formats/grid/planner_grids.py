@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.arrays import DAMAGE, Pieces, has_arrays, read_arrays, savez
 from splatctrl_cli.formats.grid.grid_format import (
@@ -71,7 +71,7 @@ def describe_curobo(path: Path, head: bytes) -> Summary | None:
     """Summarise a ``field.curobo.npz``. Raises InputError if damaged."""
     if not has_arrays(path, head, {"features", "dims", "voxel_size", "pose", "curobo"}):
         return None
-    try:
+    with refuse_faults(f"{path}: not a readable .npz", *DAMAGE, OSError, TypeError, remedy="the file is damaged"):
         content = read_arrays(
             path, ("curobo", "channel", "shape", "voxel_size", "dims", "pose", "header"), most=1 << 20
         )
@@ -84,8 +84,6 @@ def describe_curobo(path: Path, head: bytes) -> Summary | None:
             "pose_xyz_qwxyz": content["pose"].tolist(),
             **header_facts(json.loads(str(content["header"]))),
         }
-    except (*DAMAGE, OSError, TypeError) as error:
-        raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
     return Summary(path=str(path), kind="cuRobo voxel grid", facts=facts)
 
 
@@ -149,9 +147,14 @@ def describe_moveit(path: Path, head: bytes) -> Summary | None:
         return None
     numbers, start = read_moveit_head(path)
     cells = [int(numbers[f"size_{axis}"] * (1.0 / numbers["resolution"])) for axis in "xyz"]
-    place = covers([numbers[f"origin_{axis}"] for axis in "xyz"], numbers["resolution"], cells)
-    facts = {**place, "packed_bytes": path.stat().st_size - start}
-    return Summary(path=str(path), kind="MoveIt distance field", facts=facts)
+    return Summary(
+        path=str(path),
+        kind="MoveIt distance field",
+        facts={
+            **covers([numbers[f"origin_{axis}"] for axis in "xyz"], numbers["resolution"], cells),
+            "packed_bytes": path.stat().st_size - start,
+        },
+    )
 
 
 ENTRIES = (

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
@@ -102,7 +102,9 @@ def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
     with path.open("rb") as stream:
         if stream.read(8) != MAGIC:
             raise InputError(f"{path}: expected an OpenVDB file, got another", remedy="the file is damaged")
-        try:
+        with refuse_faults(
+            f"{path}: not a readable OpenVDB file", ValueError, struct.error, remedy="the file is damaged"
+        ):
             version, _, _, has_offsets = _unpack(stream, "<3I?")
             if version < 222 or not has_offsets:
                 raise ValueError(f"file version {version}")
@@ -115,8 +117,6 @@ def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
                 stream.seek(start + 4)  # behind the grid's kind of compression
                 grids.append((name.split("\x1e")[0], kind, _metadata(stream)))
                 stream.seek(end)
-        except (ValueError, struct.error) as error:
-            raise InputError(f"{path}: not a readable OpenVDB file: {error}", remedy="the file is damaged") from None
     return grids
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
@@ -111,10 +111,8 @@ def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, dict[str, int]]:
     begin = text.find(b"_", mark) + 1
     if mark < 0 or begin == 0:
         raise InputError(f"{path}: expected raw appended data, got none", remedy=_REMEDY)
-    try:
+    with refuse_faults(f"{path}: not readable XML", ParseError, DefusedXmlException, remedy=_REMEDY):
         root: Any = ElementTree.fromstring(text[:begin] + b"</AppendedData></VTKFile>")
-    except (ParseError, DefusedXmlException) as error:
-        raise InputError(f"{path}: not readable XML: {error}", remedy=_REMEDY) from None
     image, piece = root.find("ImageData"), root.find("ImageData/Piece")
     if {key: root.get(key) for key in _FILE} != _FILE or image is None or piece is None:
         raise InputError(f"{path}: expected a VTKFile of {_FILE}, got {dict(root.attrib)}", remedy=_REMEDY)
@@ -187,8 +185,11 @@ def describe_vti(path: Path, head: bytes) -> Summary | None:
         return summary_of(path, "ParaView image data", read_vti_head(path))
     facts: dict[str, object] = dict(_ATTRIBUTE.findall(image[1]))
     arrays = [dict(_ATTRIBUTE.findall(attributes)) for attributes in re.findall(r"<DataArray\b([^>]*)>", text)]
-    rows = [[a.get("Name", "-"), a.get("type", "-"), a.get("NumberOfComponents", "1")] for a in arrays]
-    grid = Grid(name="arrays", header=("array", "type", "components"), rows=rows)
+    grid = Grid(
+        name="arrays",
+        header=("array", "type", "components"),
+        rows=[[a.get("Name", "-"), a.get("type", "-"), a.get("NumberOfComponents", "1")] for a in arrays],
+    )
     return Summary(path=str(path), kind="ParaView image data", facts=facts, grids=(grid,))
 
 

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_faults
 from splatctrl_cli.files.output import PARTIAL, Parts
 from splatctrl_cli.formats.scene.voxel_file import (
     read_known_occupancy,
@@ -157,10 +157,8 @@ class SceneFolder:
     def run(self) -> dict[str, Any]:
         """``run.json``. Raises InputError if unreadable."""
         file = self.path / "run.json"
-        try:
+        with refuse_faults(f"{file}: cannot be read", OSError, ValueError):
             run = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{file}: cannot be read: {error}") from None
         for name in ("metrics", "inputs", "config"):
             if not isinstance(run, dict) or not isinstance(run.get(name, {}), dict):
                 raise InputError(f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
@@ -184,9 +182,11 @@ class SceneFolder:
         robot.
         """
         metrics = self.run.get("metrics", {})
-        bend = {"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}
-        kept = {name: metrics[name] for name in MADE_FROM if name in metrics}
-        return {"inputs": self.run.get("inputs", {}), **kept, **bend}
+        return {
+            "inputs": self.run.get("inputs", {}),
+            **{name: metrics[name] for name in MADE_FROM if name in metrics},
+            **({"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}),
+        }
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -265,19 +265,19 @@ class SceneFolder:
     def snapshots(self) -> tuple[Snapshot, ...]:
         """Snapshots by time. Raises InputError for a bad table or stamps that do not ascend."""
         path = self._isotropic("snapshots.csv")
-        try:
-            with path.open(encoding="utf-8", newline="") as stream:
-                taken = tuple(
-                    Snapshot(
-                        stamp_ns=int(row["stamp_ns"]),
-                        path=self.path / _inside(row["file"]),
-                        num_splats=int(row["num_splats"]),
-                        parts=self.parts,
-                    )
-                    for row in csv.DictReader(stream)
+        with (
+            refuse_faults(f"{path}: cannot be read", OSError, KeyError, ValueError, TypeError, csv.Error),
+            path.open(encoding="utf-8", newline="") as stream,
+        ):
+            taken = tuple(
+                Snapshot(
+                    stamp_ns=int(row["stamp_ns"]),
+                    path=self.path / _inside(row["file"]),
+                    num_splats=int(row["num_splats"]),
+                    parts=self.parts,
                 )
-        except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
-            raise InputError(f"{path}: cannot be read: {error}") from None
+                for row in csv.DictReader(stream)
+            )
         for before, after in pairwise(taken):
             if after.stamp_ns <= before.stamp_ns:
                 raise InputError(

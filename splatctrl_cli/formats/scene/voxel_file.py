@@ -134,8 +134,9 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
-        names = (*_GRID, *_EVIDENCE, *({"edges"} & header.keys()))
-        arrays = read_arrays(path, names, most=22 * MOST_VOXELS + _MOST_EDGES)
+        arrays = read_arrays(
+            path, (*_GRID, *_EVIDENCE, *({"edges"} & header.keys())), most=22 * MOST_VOXELS + _MOST_EDGES
+        )
         grid = _grid_of(arrays, header)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
         last_seen = _last_seen(arrays["last_seen"], header, len(stamps_ns))

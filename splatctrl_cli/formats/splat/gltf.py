@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import SH_C0, SplatFormat, refuse, unit_quaternions
 from splatctrl_cli.formats.unpacking import read_bytes
@@ -74,10 +74,8 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
         raise InputError(
             f"{path}: expected {length} bytes, got {len(content)}", remedy="copy or write the file again"
         )
-    try:
+    with refuse_faults(f"{path}: its JSON cannot be read", ValueError):
         document = json.loads(content[20 : 20 + json_length])
-    except ValueError as error:
-        raise InputError(f"{path}: its JSON cannot be read: {error}") from None
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a JSON object, got {type(document).__name__}")
     rest = content[20 + json_length :]
@@ -124,8 +122,11 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     }
     if (gaussians.labels != Label.OBJECT).any():
         tables["_LABEL"] = gaussians.labels[:, None].astype(np.float32)
-    attributes = {name: number for number, name in enumerate(tables)}
-    primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: PROPERTIES}}
+    primitive = {
+        "mode": 0,
+        "attributes": {name: number for number, name in enumerate(tables)},
+        "extensions": {EXTENSION: PROPERTIES},
+    }
     document = {
         "asset": {"version": "2.0", "generator": "splatctrl", "extras": {"frame": "world", **comments}},
         "extensionsUsed": [EXTENSION],
@@ -184,8 +185,7 @@ def _primitive(path: Path, document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _gaussians(path: Path, attributes: Mapping[str, int], table: Callable[[int, int], Float32]) -> GaussianSet:
-    required = ("POSITION", ROTATION, SCALE, OPACITY, coefficient_name(0))
-    missing = [name for name in required if name not in attributes]
+    missing = [name for name in ("POSITION", ROTATION, SCALE, OPACITY, coefficient_name(0)) if name not in attributes]
     if missing:
         raise InputError(f"{path}: its Gaussians have no {', '.join(missing)} (they have {', '.join(attributes)})")
     num = 1

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import (
     SH_C0,
@@ -132,8 +132,7 @@ def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
     Raises InputError if truncated, invalid, or not of version 2 to 4.
     """
-    content = read_bytes(path)
-    bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, content)
+    bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, read_bytes(path))
     wide = np.zeros((len(centers), 3, 4), dtype=np.uint8)
     wide[:, :, 1:] = centers.reshape(-1, 3, 3)  # in the upper bytes: the shift back keeps the sign
     constant = ((colors / 255.0 - 0.5) / 0.15)[:, None]
@@ -154,8 +153,11 @@ def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
     """Clip to the format's ranges, without labels."""
     harmonics = np.clip(gaussians.harmonics, *HARMONICS)
     harmonics[:, 0] = np.clip(gaussians.harmonics[:, 0], -127.5 / COLOR_SCALE, 127.5 / COLOR_SCALE)
-    scales = np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32)
-    return replace(without_labels(gaussians), harmonics=harmonics, scales=scales)
+    return replace(
+        without_labels(gaussians),
+        harmonics=harmonics,
+        scales=np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32),
+    )
 
 
 def spz_bound(gaussians: GaussianSet) -> Differences:
@@ -185,8 +187,7 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
         parts = [body[i:j] for i, j in pairwise(np.cumsum([0, *widths]) * num)]
     else:
         raise InputError(f"{path}: no .spz file: expected it to start as gzip or with NGSP, got {start.hex()}")
-    tables = [np.frombuffer(part, np.uint8).reshape(num, w) for part, w in zip(parts, widths, strict=True)]
-    return bits, tables
+    return bits, [np.frombuffer(part, np.uint8).reshape(num, w) for part, w in zip(parts, widths, strict=True)]
 
 
 def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
@@ -211,13 +212,19 @@ def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tu
 
 def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
     """`_parsed` and the attributes, unpacking no more than announced."""
-    try:
-        with gzip.GzipFile(fileobj=BytesIO(content)) as stream:
-            num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
-            expected = num * sum(widths)
-            body = stream.read(expected + 1)
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: no whole .spz file: {error}", remedy="copy or write the file again") from None
+    with (
+        refuse_faults(
+            f"{path}: no whole .spz file",
+            gzip.BadGzipFile,
+            EOFError,
+            zlib.error,
+            remedy="copy or write the file again",
+        ),
+        gzip.GzipFile(fileobj=BytesIO(content)) as stream,
+    ):
+        num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
+        expected = num * sum(widths)
+        body = stream.read(expected + 1)
     if len(body) != expected:
         got = "more" if len(body) > expected else len(body)
         raise InputError(f"{path}: expected {expected} bytes for {num} splats, got {got}")
@@ -238,10 +245,8 @@ def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
     for index, (packed, size) in enumerate(table):
         if size != sizes[index]:
             raise InputError(f"{path}: stream {index}: expected {sizes[index]} bytes unpacked, got {size}")
-        try:
+        with refuse_faults(f"{path}: stream {index}", BadBlockError, remedy="copy or write the file again"):
             parts[index] = unpacked(content[start : start + packed], "zstd", size, size)
-        except BadBlockError as error:
-            raise InputError(f"{path}: stream {index}: {error}", remedy="copy or write the file again") from None
         start += packed
     return parts
 

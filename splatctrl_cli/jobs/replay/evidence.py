@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.sections import VerdictConfig
-from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle, clearance_signals
 from splatctrl_cli.errors import InputError, UsageError
@@ -35,6 +34,7 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
 from splatctrl_cli.simulate.truth import distance_to
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, EventKind, first_intervention
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.verdict import Verdict
@@ -27,6 +26,7 @@ from splatctrl_cli.report.replay_pictures import (
     evidence_picture,
     open_loop_picture,
 )
+from splatctrl_cli.robot.sphere_files import sphere_names
 
 UNITS = {
     **dict.fromkeys(("below-margin", "in-collision", "between-states", "self-collision", "hold", "cannot-act"), "m"),

@@ -13,7 +13,6 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.ranges import POSE, checked_pose
-from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import TwistTrack
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController, class_command
 from splatctrl_cli.control.preconditions import checked_posture
@@ -178,7 +177,7 @@ def twist_track(request: ReplayRequest, model: RobotModel, states_ns: Stamps, co
 
 
 def twist_figures(
-    model: ArmModel,
+    model: RobotModel,
     config: ControlConfig,
     frame: str,
     track: TwistTrack | None,

@@ -7,7 +7,6 @@ from operator import attrgetter
 import numpy as np
 
 from splatctrl_cli.config import Config, fixed
-from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import (
     AuditTrace,
     Between,
@@ -40,6 +39,7 @@ from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
+from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.voxels import EvidenceClass
 
 KINDS = len(EvidenceClass)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.grid.iso_surface import iso_surface
@@ -22,6 +21,7 @@ from splatctrl_cli.recording.capture.capture import ROBOT
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
 from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_of, coarsened
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 MOST_UNKNOWN = 6000  # cubes of space never seen

@@ -27,8 +27,7 @@ from splatctrl_cli.jobs.running.progress import Progress, Wait
 from splatctrl_cli.jobs.score.reference import Reference
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow
-from splatctrl_cli.scene.gaussians import render_gaussians
-from splatctrl_cli.scene.render import Color, Rendering, render
+from splatctrl_cli.scene.render import Color, Rendering, render, render_gaussians
 
 Ranked = tuple[float, ComparisonRow]
 """PSNR [dB] over what was seen, or over all, and the view."""

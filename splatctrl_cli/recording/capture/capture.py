@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, npy_of
 from splatctrl_cli.formats.image_file import decode_file
@@ -100,10 +100,8 @@ def is_capture(path: Path) -> bool:
 def read_capture_header(path: Path) -> dict[str, Any]:
     """Read capture.json. Raises InputError if not ours, or of another version."""
     file = path / "capture.json"
-    try:
+    with refuse_faults(f"{file}: cannot be read", ValueError, OSError, remedy=AGAIN):
         header = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f"{file}: not a splatctrl capture", remedy="expected what `splatctrl ingest` writes")
     if header.get("version") != VERSION:
@@ -134,10 +132,8 @@ class FrameRows:
     def __init__(self, file: Path, cameras: Collection[str]) -> None:
         """Raises InputError for an invalid row, or a file outside the capture."""
         self._file, self._cameras = file, cameras
-        try:
+        with refuse_faults(f"{file}: cannot be read", *_UNREADABLE, remedy=AGAIN):
             self._num = sum(1 for _ in self._read())
-        except _UNREADABLE as error:
-            raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
 
     def __iter__(self) -> Iterator[Mapping[str, str]]:
         """Raises InputError if the file has changed."""

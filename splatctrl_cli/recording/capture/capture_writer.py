@@ -246,9 +246,15 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
         raise InputError(
             f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
         )
-    unit = FLOAT_DEPTH_UNIT if stored.depth_unit is None else stored.depth_unit
     intrinsics = vars(stored.intrinsics)
-    camera = cameras.setdefault(stored.camera, {**intrinsics, "depth_scale": unit, "num_frames": 0})
+    camera = cameras.setdefault(
+        stored.camera,
+        {
+            **intrinsics,
+            "depth_scale": FLOAT_DEPTH_UNIT if stored.depth_unit is None else stored.depth_unit,
+            "num_frames": 0,
+        },
+    )
     if any(camera[name] != value for name, value in intrinsics.items()):
         raise InputError(
             f"{stored.origin}: camera {stored.camera} changes its intrinsics; a capture holds one set of each camera",
@@ -296,8 +302,11 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
         return {}
     found = {"color": color, "depth": depth}
     for kind, place in zip(("color", "depth"), stored.places, strict=False):
-        offset = "" if place.offset < 0 else str(place.offset)
-        found |= {f"{kind}_file": place.file, f"{kind}_offset": offset, f"{kind}_log_time_ns": str(place.log_time_ns)}
+        found |= {
+            f"{kind}_file": place.file,
+            f"{kind}_offset": "" if place.offset < 0 else str(place.offset),
+            f"{kind}_log_time_ns": str(place.log_time_ns),
+        }
     return found
 
 

@@ -103,8 +103,11 @@ class SessionLog(JoinedLog):
     """Logs recorded at the same time, such as cameras and joints, merged by log time."""
 
     def __init__(self, parts: tuple[RawLog, ...]) -> None:
-        path = parts[0].path.with_name("+".join(part.path.name for part in parts))
-        super().__init__(path, parts, " + ".join(dict.fromkeys(part.container for part in parts)))
+        super().__init__(
+            parts[0].path.with_name("+".join(part.path.name for part in parts)),
+            parts,
+            " + ".join(dict.fromkeys(part.container for part in parts)),
+        )
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield the messages of all parts by log time.

@@ -91,8 +91,11 @@ class McapLog:
         self._add(f"/{frame.camera}/color/image_raw/compressed", color, frame.stamp_ns)
         self._add(f"/{frame.camera}/depth/image_raw", self._image(header, "16UC1", millimetres), frame.stamp_ns)
         if frame.human is not None:
-            mask = np.where(frame.human > 0, np.uint8(255), np.uint8(0))
-            self._add(f"/{frame.camera}/people/mask", self._image(header, "mono8", mask), frame.stamp_ns)
+            self._add(
+                f"/{frame.camera}/people/mask",
+                self._image(header, "mono8", np.where(frame.human > 0, np.uint8(255), np.uint8(0))),
+                frame.stamp_ns,
+            )
 
     def _image(self, header: Any, encoding: str, pixels: NDArray[np.unsignedinteger]) -> Any:
         return self._new(

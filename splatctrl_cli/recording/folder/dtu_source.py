@@ -122,20 +122,19 @@ def shrunk(view: DtuView, factor: int) -> DtuView:
     if factor == 1:
         return view
     size = (k.width // factor, k.height // factor)
-    intrinsics = Intrinsics(
-        fx=k.fx / factor,
-        fy=k.fy / factor,
-        cx=(k.cx + 0.5) / factor - 0.5,
-        cy=(k.cy + 0.5) / factor - 0.5,
-        width=size[0],
-        height=size[1],
-    )
     sample = slice(factor // 2, None, factor)
     return DtuView(
         name=view.name,
         color=np.asarray(cv2.resize(view.color, size, interpolation=cv2.INTER_AREA), np.uint8),
         depth=np.ascontiguousarray(view.depth[sample, sample]),
-        intrinsics=intrinsics,
+        intrinsics=Intrinsics(
+            fx=k.fx / factor,
+            fy=k.fy / factor,
+            cx=(k.cx + 0.5) / factor - 0.5,
+            cy=(k.cy + 0.5) / factor - 0.5,
+            width=size[0],
+            height=size[1],
+        ),
         T_world_camera=view.T_world_camera,
         mask=None if view.mask is None else np.ascontiguousarray(view.mask[::factor, ::factor]),
     )

@@ -245,10 +245,12 @@ def _of_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> di
     for key in ("color", "depth", "poses"):
         if not isinstance(camera.get(key), str):
             raise _refused(f"{path}: [[cameras]]: {key} is missing")
-    lens = {key: value for key, value in camera.items() if key not in ("color", "depth", "poses")}
-    frames = {"color": camera["color"], "depth": camera["depth"]}
-    poses = {"format": "matrix-files", **common.get("poses", {}), "file": camera["poses"]}
-    return {**common, "camera": lens, "frames": frames, "poses": poses}
+    return {
+        **common,
+        "camera": {key: value for key, value in camera.items() if key not in ("color", "depth", "poses")},
+        "frames": {"color": camera["color"], "depth": camera["depth"]},
+        "poses": {"format": "matrix-files", **common.get("poses", {}), "file": camera["poses"]},
+    }
 
 
 def _content(path: Path) -> dict[str, Any]:

@@ -163,8 +163,10 @@ class ImageFolderSource(FrameSource):
             if description.poses is not None:
                 files.extend(path for _, path in find_files(description.root, description.poses.file))
             named = {str(path.relative_to(description.root)): path.absolute() for path in files}
-            first = {description.path.name: description.path} if description.path.is_file() else {}
-            found |= {**first, **dict(sorted(named.items()))}
+            found |= {
+                **({description.path.name: description.path} if description.path.is_file() else {}),
+                **dict(sorted(named.items())),
+            }
         return {name: sha256(path) for name, path in found.items()}
 
     def _stored_frame(self, view: View) -> StoredFrame | None:
@@ -260,8 +262,9 @@ class ImageFolderSource(FrameSource):
         if depth is None:
             return None
         if self._description.is_depth_resized:
-            size = (view.lens.width, view.lens.height)
-            depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+            depth = np.asarray(
+                cv2.resize(depth, (view.lens.width, view.lens.height), interpolation=cv2.INTER_NEAREST), np.float32
+            )
         _check_size(view.depth, depth, self._description.depth_camera or view.lens)
         return lens.depth(depth)
 

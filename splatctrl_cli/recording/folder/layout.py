@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.formats.image_file import decode_file, image_head
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
@@ -132,17 +132,20 @@ def paired_by_stamp(
     """Pair files by stamp [ns] within the tolerance; the pose is at colour's stamp."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
     pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
-    views = [
-        ListedView(
-            name=f"{colors[i][0] / 1e9:.6f}",
-            color=colors[i][1],
-            depth=depths[j][1],
-            matrix=pose_at(colors[i][0]),
-            stamp_ns=colors[i][0],
-        )
-        for i, j in pairs
-    ]
-    return Pairs(path=path, views=views, unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)))
+    return Pairs(
+        path=path,
+        views=[
+            ListedView(
+                name=f"{colors[i][0] / 1e9:.6f}",
+                color=colors[i][1],
+                depth=depths[j][1],
+                matrix=pose_at(colors[i][0]),
+                stamp_ns=colors[i][0],
+            )
+            for i, j in pairs
+        ],
+        unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)),
+    )
 
 
 def described(
@@ -256,7 +259,5 @@ def read_pose(path: Path) -> Float64 | None:
 
 def read_json(path: Path) -> Any:
     """Read JSON. Raises InputError if unreadable."""
-    try:
+    with refuse_faults(f"{path}: not readable JSON", ValueError, OSError, remedy=_WHOLE):
         return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise InputError(f"{path}: not readable JSON: {error}", remedy=_WHOLE) from None

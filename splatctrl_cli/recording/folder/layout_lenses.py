@@ -61,17 +61,21 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
     root = _frames(folder)
     assert root is not None
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
-    trajectory = Trajectory(_poses(root / TRAJECTORY))
-    pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, trajectory.at, options)
+    pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, Trajectory(_poses(root / TRAJECTORY)).at, options)
     lenses: list[CameraTable] = []
     pincams = {
         stamp: path
         for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))
         if (stamp := _stamp_ns(path))
     }
-    views = [replace(view, camera=named_lens(lenses, _arkit_lens(pincams, view), str(root))) for view in pairs.views]
     return described(
-        replace(pairs, views=views),
+        replace(
+            pairs,
+            views=[
+                replace(view, camera=named_lens(lenses, _arkit_lens(pincams, view), str(root)))
+                for view in pairs.views
+            ],
+        ),
         root,
         options,
         poses=PosesTable(format="rotation-vectors", file=TRAJECTORY),

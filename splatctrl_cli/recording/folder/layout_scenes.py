@@ -127,17 +127,20 @@ def read_redwood(folder: Path, options: SourceOptions) -> Description:
     pairs = _pairs(list(colors), list(depths))
     poses = read_trajectory_log(trajectory)
     is_by_place = len(poses) == len(pairs)
-    views = [
-        ListedView(
-            name=color,
-            color=colors[color],
-            depth=depths[depth],
-            matrix=poses.get(str(place) if is_by_place else str(_number(color))),
-        )
-        for place, (color, depth) in enumerate(pairs)
-    ]
     return described(
-        Pairs(path=trajectory, views=views, unpaired=(len(colors) - len(pairs), len(depths) - len(pairs))),
+        Pairs(
+            path=trajectory,
+            views=[
+                ListedView(
+                    name=color,
+                    color=colors[color],
+                    depth=depths[depth],
+                    matrix=poses.get(str(place) if is_by_place else str(_number(color))),
+                )
+                for place, (color, depth) in enumerate(pairs)
+            ],
+            unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)),
+        ),
         folder,
         options,
         poses=PosesTable(format="trajectory-log", file=trajectory.relative_to(folder).as_posix()),

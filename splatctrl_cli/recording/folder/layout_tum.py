@@ -177,8 +177,7 @@ def _poses(path: Path) -> list[Float64]:
     if len(values) % 12:
         raise InputError(f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again")
     rows = np.array(values).reshape(-1, 3, 4)
-    bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))
-    return list(np.concatenate([rows, bottom], axis=1))
+    return list(np.concatenate([rows, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))], axis=1))
 
 
 ENTRIES = (

@@ -11,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import POSE_TOLERANCE_NS
 from splatctrl_cli.config.ranges import MAX_PLACE
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.geometry import invert_transform, pose_at, quat_from_rotation, transform_from
 from splatctrl_cli.recording.log.registration import TfTree
 from splatctrl_cli.records import Float64
@@ -116,11 +116,9 @@ def read_rows(path: Path) -> Iterator[tuple[str, list[str], list[float]]]:
 
 def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
     """A transforms.json, and its matrices by file_path."""
-    try:
+    with refuse_faults(f"{path}: not a transforms.json", ValueError, KeyError, TypeError, remedy=_CORRECT):
         content = json.loads(path.read_text(encoding="utf-8"))
         matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a transforms.json: {error}", remedy=_CORRECT) from None
     for name, matrix in matrices.items():
         if matrix.shape != (4, 4):
             raise InputError(f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy=_CORRECT)

@@ -100,10 +100,9 @@ def _camera(
             item[0].topic.name,
         ),
     )
-    name = "/".join(namespace)
     info = info or (depth_info if _is_of_file(color) else "")
     return CameraTopics(
-        name=name,
+        name="/".join(namespace),
         color=color.topic.name,
         depth=depth.topic.name,
         info=info or "",

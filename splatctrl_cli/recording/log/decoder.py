@@ -81,8 +81,7 @@ class MessageDecoder:
             if store is None:
                 return read_foxglove(topic.schema, topic.encoding, topic.definition, message.data)
             read = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
-            data = message.data[:-4] if has_unit(message) else message.data
-            decoded = read(data, topic.schema or topic.type_name)
+            decoded = read(message.data[:-4] if has_unit(message) else message.data, topic.schema or topic.type_name)
             return as_ros(topic.schema, decoded) if topic.schema else decoded
         except Exception as error:  # generated code over foreign bytes: there is no list of what it raises
             raise UndecodableMessageError(

@@ -153,8 +153,7 @@ class TfTree:
 
     def span_ns(self, frame: str) -> tuple[int, int] | None:
         """First and last stamp with all moving edges above `frame` known; None if none moves."""
-        edges = [self._edges[f] for f in self._ancestors(frame)[:-1]]
-        moving = [edge.stamps for edge in edges if not edge.static]
+        moving = [edge.stamps for edge in [self._edges[f] for f in self._ancestors(frame)[:-1]] if not edge.static]
         return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None
 
     def connects(self, target: str, source: str) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_DEPTH
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.spilled_rows import Table, blocks_of, ranges
 from splatctrl_cli.formats.arrays import npy_head, npy_of
 from splatctrl_cli.formats.image_file import JPEG, PNG
@@ -107,12 +107,12 @@ def read_topics(folder: Path, described: Mapping[str, Any], checked: Callable[[s
 
     Raises InputError if damaged.
     """
-    try:
+    with refuse_faults(
+        f"{folder / FOLDER}: cannot be read", KeyError, TypeError, ValueError, OSError, EOFError, remedy=AGAIN
+    ):
         topics = [_topic(entry, checked) for entry in described["topics"]]
         loss = LossReport(**described["loss"]["counts"])
         first_note, chosen = int(described["loss"]["first_note"]), described["chosen"]
-    except (KeyError, TypeError, ValueError, OSError, EOFError) as error:
-        raise InputError(f"{folder / FOLDER}: cannot be read: {error}", remedy=AGAIN) from None
     return JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=chosen)
 
 
@@ -126,13 +126,16 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
         )
         columns = {name: _blocks(checked(f"{place}/{name}.npy")) for name in stream["columns"]}
         streams.append(JointStream(tuple(stream["joints"]), stamps, log_times, columns))
-    topic = Topic(
-        name=entry["topic"],
-        type_name=entry["type"],
-        encoding="cdr",
-        definition="kept" if entry["has_definition"] else "",
+    return TopicSurvey(
+        topic=Topic(
+            name=entry["topic"],
+            type_name=entry["type"],
+            encoding="cdr",
+            definition="kept" if entry["has_definition"] else "",
+        ),
+        count=int(entry["messages"]),
+        joints=JointLog(streams, int(entry["states"])),
     )
-    return TopicSurvey(topic=topic, count=int(entry["messages"]), joints=JointLog(streams, int(entry["states"])))
 
 
 def write_rows(stream: IO[bytes], rows: Table) -> None:
@@ -212,10 +215,8 @@ class StoredFrame:
         )
 
     def _read(self, read: Callable[[], _Image]) -> _Image:
-        try:
+        with refuse_faults(self.origin, UndecodableMessageError, remedy="copy the recording again"):
             return read()
-        except UndecodableMessageError as error:
-            raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
 
 
 class FrameSource:

@@ -237,11 +237,15 @@ class VideoFileLog(RawLog):
             damage.add(f"{self.path.name}: cannot be decoded further: {error}")
 
     def _message(self, frame: Any, stamp_ns: int) -> RawMessage:
-        stamp = SimpleNamespace(sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS)
         return RawMessage(
             topic=self._topic,
             log_time_ns=stamp_ns,
-            data=pack_image(SimpleNamespace(stamp=stamp, frame_id=""), frame.to_ndarray(format="rgb24")),
+            data=pack_image(
+                SimpleNamespace(
+                    stamp=SimpleNamespace(sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS), frame_id=""
+                ),
+                frame.to_ndarray(format="rgb24"),
+            ),
             file=self.path.name,
         )
 

@@ -28,7 +28,7 @@ from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import GaussianSet, Label, RgbdFrame
-from splatctrl_cli.scene.gaussians import render_gaussians
+from splatctrl_cli.scene.render import render_gaussians
 from tests.jobs.score.wall import (
     AWAY,
     FRAMES,
