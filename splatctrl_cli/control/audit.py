@@ -21,15 +21,11 @@ DistanceFunction = Callable[[Float64], Float64]
 
 @dataclass(frozen=True, kw_only=True)
 class BallDistance:
-    """A `DistanceFunction` of balls, centers (N, 3), radii (N,) [m], for surface measurement.
-
-    num_voxels: of the last balls, which are occupied voxels without a splat.
-    """
+    """A `DistanceFunction` of balls, centers (N, 3), radii (N,) [m], for surface measurement."""
 
     of_points: DistanceFunction
     centers: Floats
     radii: Floats
-    num_voxels: int = 0
 
     def __call__(self, points: Float64) -> Float64:
         return self.of_points(points)

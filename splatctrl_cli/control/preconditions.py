@@ -142,8 +142,7 @@ class FixedParts:
         """near [m]: spheres with less first clearance stand near their mount."""
         self._model, self._near = model, near
         self._still = np.flatnonzero(~np.asarray(model.moving_spheres))
-        self._stood = np.zeros((0, 3))  # of the first scene
-        self._new = [self._stood, self._stood]  # arrivals in the scene before the last, and in the last
+        self._stood = self._new = np.zeros((0, 3))  # of the first scene; arrivals in the last one
         names = sphere_names(model.sphere_set)
         self._names = [names[s] for s in self._still]
         self.found: dict[str, tuple[float, float]] = {}
@@ -183,12 +182,10 @@ class FixedParts:
         moved = np.array([np.linalg.norm(self._stood - place, axis=1).min(initial=np.inf) for place in places])
         owner = away[:, near].argmin(axis=0)
         has_come = moved > change[owner]
-        before, self._new = self._new, [self._new[-1], places[has_come]]
-        is_splat = near < len(balls.radii) - balls.num_voxels
+        before, self._new = self._new, places[has_come]
         for number in np.flatnonzero(has_come):
-            scenes = before[-1:] if is_splat[number] else before
-            moves = [np.linalg.norm(scene - places[number], axis=1).min(initial=np.inf) for scene in scenes]
-            has_come[number] = max(moves) <= fixed.MOUNTED_CHANGE
+            last = np.linalg.norm(before - places[number], axis=1).min(initial=np.inf)
+            has_come[number] = last <= fixed.MOUNTED_CHANGE
         for k in np.unique(owner[has_come]).tolist():
             chosen = near[(owner == k) & has_come]
             link = model.sphere_set.links[self._still[k]]

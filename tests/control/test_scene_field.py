@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.audit import BallDistance, DistanceFunction
+from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.control.barriers import PeopleGrown, SceneStep, distance_rate, guarded
 from splatctrl_cli.control.preconditions import FixedParts, check_free, static_violations
 from splatctrl_cli.control.replay import ReplayTask, SceneChange, closed_loop
@@ -216,15 +216,6 @@ def test_what_one_scene_alone_has_is_noise() -> None:
     assert looked(beside(0.1), beside(0.0), beside(0.1), beside(0.0))["base[0]"][1] == pytest.approx(0.1)
     coming = [beside(gap) for gap in (0.1, 0.06, 0.035, 0.01)]
     assert looked(*coming)["base[0]"][1] == pytest.approx(0.03)
-
-
-@pytest.mark.parametrize(("num_scenes", "has_come"), [(1, False), (2, False), (3, True)])
-def test_a_voxel_without_a_splat_has_come_in_its_third_scene(num_scenes: int, has_come: bool) -> None:
-    """Splats fill a gap before."""
-    voxel = beside(0.0)
-    assert isinstance(voxel, BallDistance)
-    least = looked(beside(0.1), *[replace(voxel, num_voxels=1)] * num_scenes)["base[0]"][1]
-    assert least == pytest.approx(0.02 if has_come else 0.1)
 
 
 def test_each_sphere_has_what_is_nearest_to_it() -> None:

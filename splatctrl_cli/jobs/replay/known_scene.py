@@ -241,12 +241,7 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
     )
     barrier = guarded(field_over(spheres, config.field, threads=threads), human, config.control)
     exact = SphereField(spheres, threads=threads)
-    balls = BallDistance(
-        of_points=_distance(exact),
-        centers=chosen.centers,
-        radii=chosen.radii,
-        num_voxels=obstacles.num_unrepresented,
-    )
+    balls = BallDistance(of_points=_distance(exact), centers=chosen.centers, radii=chosen.radii)
     return KnownFields(
         barrier=barrier,
         distances={

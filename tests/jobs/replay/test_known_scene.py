@@ -15,15 +15,15 @@ from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
-from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space, splat_fields
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
-from splatctrl_cli.records import Float64, Label
+from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.self_model import ALWAYS
 from splatctrl_cli.scene.posture import posture_of
-from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, VoxelState
+from splatctrl_cli.voxels import SWEPT, EvidenceClass, VoxelState
 from tests.cli.replay_desk import SECOND
 from tests.jobs.stage import FAR, Stage, decisive, passing
-from tests.plain import plain_grid, plain_splats
+from tests.plain import plain_grid
 from tests.robot.shapes import held_part
 
 
@@ -32,13 +32,6 @@ def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
     assert [at(stamp) for stamp in (150, 249, 250, 10_000)] == [0, 0, 1, 1]
     with pytest.raises(NotEvaluableError, match="no scene is known at stamp 149 ns"):
         at(149)
-
-
-def test_a_scene_knows_how_many_of_its_balls_are_voxels_without_a_splat() -> None:
-    voxels = Balls.of_voxels(np.array([[0.5, 0.0, 0.0], [0.6, 0.0, 0.0]]), 0.02, np.full(2, Label.OBJECT, np.uint8))
-    exact = splat_fields(plain_splats([[0.0, 0.0, 0.0]], 0.01), Config(), 1, voxels).distances["exact"]
-    assert isinstance(exact, BallDistance)
-    assert (len(exact.radii), exact.num_voxels) == (3, 2)
 
 
 @pytest.mark.parametrize(("stamp_ns", "age_s"), [(1 * SECOND, 2.0), (3 * SECOND, 0.0), (7 * SECOND, 4.0)])
