@@ -162,7 +162,7 @@ class SeenVoxels:
 
     last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last step with depth
     through or on the voxel; 0: never, without a reason; the type's largest numbers: the reason (`Unseen`, its lower
-    byte in uint8). edges: of the newest images.
+    byte in uint8). edges: of the newest images. is_free (X, Y, Z): `VoxelState.FREE` now; None if not recorded.
     """
 
     origin: Float64
@@ -170,6 +170,7 @@ class SeenVoxels:
     last_seen: NDArray[np.uint8] | NDArray[np.uint16]
     step_stamps_ns: NDArray[np.int64]
     edges: LostEdges = NO_EDGES
+    is_free: Bool | None = None
 
     def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
         """Return the stamps (Q,) [ns] of the last views, -1 for never, and `EvidenceClass` (Q,).

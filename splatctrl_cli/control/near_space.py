@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, transform_points
-from splatctrl_cli.records import Float64, Index, UInt8
+from splatctrl_cli.records import Bool, Float64, Index, UInt8
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import EvidenceClass
 
@@ -29,13 +29,15 @@ class Seen:
 
     look: points (Q, 3) [m], world -> stamps (Q,) [ns] of the last depth through or on them, -1 never, and
     `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: centre and radius of balls into which a
-    surface may extend past its lost edge. origin (3,), voxel [m]: of the underlying voxels.
+    surface may extend past its lost edge. origin (3,), voxel [m]: of the underlying voxels; is_free (X, Y, Z): as in
+    `SeenVoxels`.
     """
 
     look: Callable[[Float64], tuple[Index, UInt8]]
     edges: Float64 = field(default_factory=lambda: np.empty((0, 4)))
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
     voxel: float = fixed.NEAR_LATTICE
+    is_free: Bool | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, part_clearances
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
+from splatctrl_cli.records import Bool, DistanceField, Float64, Integers, UInt8
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
 
@@ -125,17 +125,17 @@ def sphere_clearance(model: RobotModel, field: DistanceField, q: Float64, chosen
     return index, distance - model.sphere_set.radii[index]
 
 
-WasSeen = Callable[[Float64], Bool]
-"""points (Q, 3) [m], world -> whether (Q,) any camera had seen them before."""
+WasFree = Callable[[Float64], UInt8]
+"""points (Q, 3) [m], world -> 1 (Q,) where their voxel was free in any scene before, else 0."""
 
 
 class FixedParts:
     """`found`: each fixed sphere's clearance [m] in the first scene, and its least, later arrivals included.
 
     A ball has arrived if none of the first scene stood within STATIC_CHANGE of it; near a sphere at its mount, where
-    the map grows, within MOUNTED_CHANGE. It is nearer than the first clearance by as much, and a camera had seen its
-    place before. The last scene had it too: noise is in one scene alone. A link's triangles count where they are
-    farther away.
+    the map grows, within MOUNTED_CHANGE. It is nearer than the first clearance by as much, and its voxel was free in
+    a scene before: else it fills a hole of the map. The last scene had it too: noise is in one scene alone. A link's
+    triangles count where they are farther away.
     """
 
     def __init__(self, model: RobotModel, near: float) -> None:
@@ -147,8 +147,8 @@ class FixedParts:
         self._names = [names[s] for s in self._still]
         self.found: dict[str, tuple[float, float]] = {}
 
-    def look(self, distance_to: DistanceFunction, q: Float64, was_seen: WasSeen | None) -> None:
-        """Add the next scene, at q (J,). was_seen: None if unknown."""
+    def look(self, distance_to: DistanceFunction, q: Float64, was_free: WasFree | None) -> None:
+        """Add the next scene, at q (J,). was_free: None if unknown."""
         if not len(self._still):
             return
         centers = np.ascontiguousarray(self._model.sphere_centers(q)[self._still])
@@ -162,13 +162,13 @@ class FixedParts:
         if isinstance(distance_to, BallDistance):
             if is_first:
                 self._stood = np.asarray(distance_to.centers, np.float64)
-            came = self._came(distance_to, centers, q, was_seen, change)
+            came = self._came(distance_to, centers, q, was_free, change)
         for name, value in zip(self._names, np.where(came < first - change, came, np.inf).tolist(), strict=True):
             before, least = self.found[name]
             self.found[name] = (before, min(least, value))
 
     def _came(
-        self, balls: BallDistance, centers: Float64, q: Float64, was_seen: WasSeen | None, change: Float64
+        self, balls: BallDistance, centers: Float64, q: Float64, was_free: WasFree | None, change: Float64
     ) -> Float64:
         """Clearance (M,) [m] of each sphere from balls that moved by over `change` (M,) [m]; infinite without any."""
         model, least = self._model, np.full(len(centers), np.inf)
@@ -176,9 +176,8 @@ class FixedParts:
         away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii
         near = np.flatnonzero(away.min(axis=0) < fixed.STATIC_REACH)
         places = np.asarray(balls.centers[near], np.float64)
-        if was_seen is not None and len(near):
-            is_new_place = ~was_seen(places)
-            self._stood = np.concatenate([self._stood, places[is_new_place]])
+        if was_free is not None and len(near):
+            self._stood = np.concatenate([self._stood, places[was_free(places) == 0]])
         moved = np.array([np.linalg.norm(self._stood - place, axis=1).min(initial=np.inf) for place in places])
         owner = away[:, near].argmin(axis=0)
         has_come = moved > change[owner]

@@ -20,7 +20,7 @@ from splatctrl_cli.records import Box, Float64, JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import Truth, truth_document
-from splatctrl_cli.voxels import Balls, KnownVoxels
+from splatctrl_cli.voxels import Balls, KnownVoxels, VoxelState
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of, write_field
 from tests.plain import known
 
@@ -90,7 +90,8 @@ class Stage:
         writer = SceneWriter(folder, {"frame": "world"})
         for stamp_ns in self.map_stamps:
             voxels = self._voxels(stamp_ns)
-            writer.snapshot(stamp_ns, self._splats(stamp_ns), voxels, voxels.grid.states(0.3, 0.7))
+            states = np.where(voxels.last_seen > 0, voxels.grid.states(0.3, 0.7), np.uint8(VoxelState.NEVER_SEEN))
+            writer.snapshot(stamp_ns, self._splats(stamp_ns), voxels, states)
         last = self.map_stamps[-1]
         writer.finish(last, self._splats(last), self._voxels(last))
         metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": last}

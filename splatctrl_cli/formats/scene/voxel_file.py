@@ -105,14 +105,18 @@ def read_seen(path: Path) -> SeenVoxels | None:
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
-        arrays = read_arrays(path, ("last_seen", *({"edges"} & header.keys())), most=2 * MOST_VOXELS + _MOST_EDGES)
+        is_snapshot = str(header.get("format")).startswith("splatctrl-voxel-states")
+        names = ("last_seen", *({"edges"} & header.keys()), *(["states"] if is_snapshot else []))
+        arrays = read_arrays(path, names, most=3 * MOST_VOXELS + _MOST_EDGES)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
+        states = _voxels(arrays["states"], "states", np.uint8, header) if is_snapshot else None
         return SeenVoxels(
             origin=np.array(header["origin"], np.float64),
             voxel=float(header["voxel"]),
             last_seen=_last_seen(arrays["last_seen"], header, len(stamps_ns)),
             step_stamps_ns=stamps_ns,
             edges=_edges(arrays),
+            is_free=None if states is None else states == VoxelState.FREE,
         )
 
 

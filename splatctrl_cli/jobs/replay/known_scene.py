@@ -210,7 +210,7 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
 
 def seen_of(voxels: SeenVoxels) -> Seen:
     edges = np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64)
-    return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel)
+    return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel, is_free=voxels.is_free)
 
 
 def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:

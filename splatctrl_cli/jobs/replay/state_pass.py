@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
@@ -16,6 +17,7 @@ from splatctrl_cli.control.audit import (
     between_states,
     clearances,
     moving_clearance,
+    observed_at,
     part_clearances,
 )
 from splatctrl_cli.control.events import (
@@ -29,13 +31,13 @@ from splatctrl_cli.control.events import (
     step_signals,
 )
 from splatctrl_cli.control.limits import MotionLimits
-from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace, Seen
+from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace
 from splatctrl_cli.control.preconditions import FixedParts
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replay.state_store import BLOCK, Figures, StoredAudit, StoredObjects
-from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.records import Bool, Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
@@ -112,7 +114,7 @@ class ReplayRecord:
         self.newer_depth = NewerDepth(scene, config.control.margin - fixed.SLIGHTLY_UNDER, self._clearance_in)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
-        self._seen_before: Seen | None = None  # at the last check of the fixed spheres
+        self._was_free: Bool | None = None  # voxels (X, Y, Z), in any scene before
 
     def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
         """Ranges of at most BLOCK of stamps (T,), with one scene and robot surface each."""
@@ -260,9 +262,13 @@ class ReplayRecord:
         known = self._scene.at(stamp)
         if known is self._last_scene:
             return
-        self._last_scene, before, self._seen_before = known, self._seen_before, self._scene.seen_at(stamp)
-        was_seen = None if before is None else lambda places: before.look(places)[0] >= 0
-        self.fixed_parts.look(known.distances["exact"], part.position[0], was_seen)
+        self._last_scene, before, seen = known, self._was_free, self._scene.seen_at(stamp)
+        was_free = None
+        if seen is not None and seen.is_free is not None:
+            self._was_free = seen.is_free if before is None else before | seen.is_free
+            if before is not None:
+                was_free = partial(observed_at, before.view(np.uint8), seen.origin, seen.voxel)
+        self.fixed_parts.look(known.distances["exact"], part.position[0], was_free)
 
     def _look_around(self, part: AuditTrace) -> None:
         num = len(part.stamp_ns)

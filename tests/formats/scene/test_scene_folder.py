@@ -25,7 +25,7 @@ from splatctrl_cli.formats.scene.voxel_file import (
 )
 from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import Label, SplatSet
-from splatctrl_cli.voxels import SWEPT, EvidenceClass, LostEdges, OccupancyGrid, Unseen
+from splatctrl_cli.voxels import SWEPT, EvidenceClass, LostEdges, OccupancyGrid, Unseen, VoxelState
 from tests.plain import known, plain_grid, plain_splats
 from tests.refused import expect_refusal
 
@@ -145,6 +145,9 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
     assert again.voxel == want.voxel and again.origin.tobytes() == want.origin.tobytes()
     for thresholds in ((0.3, 0.7), (0.01, 0.99)):
         assert (again.states(*thresholds) == states).all()
+    seen = read_seen(tmp_path / "a.npz")
+    assert seen is not None and seen.is_free is not None
+    assert (seen.is_free == (states == VoxelState.FREE)).all()
 
 
 @pytest.mark.parametrize("num_steps", [2, 239, 240, 255, 300])

@@ -1,5 +1,6 @@
 """What a replay may know of the scene at a time, and of space."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,16 +16,22 @@ from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
-from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space, splat_fields
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index, UInt8
 from splatctrl_cli.robot.self_model import ALWAYS
 from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.voxels import SWEPT, EvidenceClass, VoxelState
 from tests.cli.replay_desk import SECOND
+from tests.jobs.replay.broken import beside_the_mount
 from tests.jobs.stage import FAR, Stage, decisive, passing
-from tests.plain import plain_grid
+from tests.plain import plain_grid, plain_splats
 from tests.robot.shapes import held_part
+
+
+def look_free(points: Float64) -> tuple[Index, UInt8]:
+    """All space, seen free at time 0."""
+    return np.zeros(len(points), np.int64), np.zeros(len(points), np.uint8)
 
 
 def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
@@ -55,6 +62,34 @@ def test_space_that_a_camera_saw_or_the_robot_was_in_is_known() -> None:
     assert known_space(grid)(points).tolist() == [1, 1, 0, 0]
 
 
+@pytest.mark.parametrize(("free", "has_come"), [((1, 0, 0, 0), True), ((0, 0, 0, 0), False)])
+def test_an_obstacle_comes_to_a_fixed_link_where_space_was_free_before(free: Sequence[int], has_come: bool) -> None:
+    """Where space never was, a map fills a hole."""
+    model, q = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
+    place, radius = beside_the_mount(model)
+    far = (2.0, 2.0, 2.0)
+    before, after = (splat_fields(plain_splats(centers, radius), Config(), 1) for centers in ([far], [far, place]))
+
+    def seen_at(stamp_ns: int) -> Seen:
+        is_free = np.full((1, 1, 1), bool(free[stamp_ns // SECOND]))
+        return Seen(look=look_free, origin=np.array(place), voxel=0.1, is_free=is_free)
+
+    scene = KnownScene(
+        at=lambda stamp_ns: (before, replace(before), after, replace(after))[stamp_ns // SECOND],
+        observed=None,
+        first_ns=None,
+        cameras=None,
+        digests={},
+        seen_at=seen_at,
+    )
+    record = ReplayRecord(model, scene, config=Config(), max_map_age=9.0, is_continuous=False)
+    for second in range(4):
+        record.measured(np.array([second * SECOND]), q[None], np.zeros((1, 7)))
+    first, least = record.fixed_parts.found["link0[0]"]
+    assert first > 0.1
+    assert least == (pytest.approx(-0.01, abs=0.03) if has_come else first)
+
+
 @pytest.mark.parametrize("is_continuous", [True, False])
 def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_continuous: bool) -> None:
     """A tenth of a second in which the hand sweeps through a lost edge that neither state is near."""
@@ -68,7 +103,7 @@ def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_c
         obstacles=lambda points: (nothing,) * len(points),
     )
     seen = Seen(
-        look=lambda points: (np.zeros(len(points), np.int64), np.zeros(len(points), np.uint8)),
+        look=look_free,
         edges=np.array([[*edge, 1e-3]]),
     )
     scene = KnownScene(
