@@ -36,8 +36,8 @@ class Agreement:
     def holds(self) -> bool:
         """False if median and detour exceed the limit, and the quartile half of it.
 
-        Both sides of a thin object look like one surface. Then a share of the pixels, or a third camera, still
-        agrees; with wrong poses neither does.
+        A thin object looks like one surface from both sides: a share of the pixels, or a third camera, still agrees.
+        With wrong poses, neither does.
         """
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 

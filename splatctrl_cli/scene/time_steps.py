@@ -36,7 +36,7 @@ class TimeStep:
         }
 
     def without_depth(self) -> "TimeStep":
-        """Return the step as colour cameras would see it."""
+        """The step as colour cameras would see it."""
         return replace(self, frames=tuple(replace(frame, depth=np.zeros_like(frame.depth)) for frame in self.frames))
 
     @property
@@ -46,7 +46,6 @@ class TimeStep:
 
     @property
     def has_depth(self) -> bool:
-        """True if any pixel has depth."""
         return any(bool((frame.depth > 0).any()) for frame in self.frames)
 
 
@@ -102,7 +101,7 @@ def time_steps(
     """Group frames of `cameras` by stamp, or without a clock, FRAMES_PER_STEP at a time.
 
     With a clock, a frame with exactly its camera's last depth is skipped, and counted in `repeats` by camera.
-    `observe` gets every record: one pass serves both.
+    `observe` gets every record.
     """
     last_depth: dict[str, Float32] = {}
     frames: list[RgbdFrame] = []
@@ -131,7 +130,7 @@ def time_steps(
 
 
 def planar(frame: RgbdFrame) -> RgbdFrame:
-    """Return the frame with colour by plane, as the optimiser takes it: views then share memory."""
+    """Frame with colour by plane, as the optimiser takes it: views share memory."""
     planes = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0))
     return replace(frame, color=np.moveaxis(planes, 0, 2))
 
