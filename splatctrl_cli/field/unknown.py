@@ -24,7 +24,6 @@ class ObstacleSpheres:
 
     @property
     def num_unrepresented(self) -> int:
-        """Number of balls."""
         return int(np.count_nonzero(self.index == NO_SPLAT))
 
 
@@ -77,7 +76,6 @@ def check_labels(splats: SplatSet) -> None:
 
 
 def label_counts(splats: SplatSet) -> dict[str, int]:
-    """Number of splats by label name."""
     return {label.name.lower(): int(np.count_nonzero(splats.labels == label)) for label in Label}
 
 
@@ -135,7 +133,6 @@ class Cubes:
         )
 
     def planes(self, first: int, last: int) -> "Cubes":
-        """X-planes [first, last)."""
         return replace(
             self,
             is_unknown=self.is_unknown[first:last],
