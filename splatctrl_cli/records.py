@@ -76,9 +76,8 @@ class RgbdFrame:
     """A colour image with registered depth and pose.
 
     color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = no return; T_world_camera (4, 4)
-    float64, of the optical frame (z forward); human (H, W) uint8, nonzero on people, None if not segmented; valid (H,
-    W), False outside the lens's view, None if all valid. Invalid pixels have no colour; their depth is not drawn or
-    scored.
+    float64, of the optical frame (z forward); human (H, W) uint8, nonzero on people, or None; valid (H, W), False
+    outside the lens's view, None if all valid. Invalid pixels have no colour; their depth is not drawn or scored.
     """
 
     stamp_ns: int
@@ -206,8 +205,7 @@ class SplatSet(Columns):
     """Isotropic 3D Gaussians (III-B).
 
     centers (N, 3) float32 [m], world; radii (N,) float32 [m] (sigma); colors (N, 3) float32 in [0, 1]; opacities (N,)
-    float32 in (0, 1); labels (N,) uint8 (`Label`); density (N,) float32, rho of III-D (row sum of the kernel, 0 if
-    not computed).
+    float32 in (0, 1); labels (N,) uint8 (`Label`); density (N,) float32, rho of III-D (0 if not computed).
     """
 
     centers: Float32

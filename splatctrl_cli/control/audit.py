@@ -1,7 +1,7 @@
 """Clearance of logged joint states by each field, their unknown share, and bounds between states.
 
-If sphere s travels at most L_s in between, its distance is never below ``(d_0s + d_1s - L_s) / 2``, d_0s and d_1s at
-the ends. Exact distance is 1-Lipschitz; L_s follows from joint motion and `RobotModel.lever_arms`.
+With d_0s, d_1s at the ends and travel up to L_s, sphere s's distance is at least ``(d_0s + d_1s - L_s) / 2``. Exact
+distance is 1-Lipschitz; L_s follows from joint motion and `RobotModel.lever_arms`.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -121,8 +121,8 @@ def audit(
 ) -> AuditTrace:
     """Clearances of states, by the distances known at their stamps.
 
-    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. The audit of part of the states equals that part
-    of the whole audit, to the bit.
+    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Part of the states gives that part of the audit,
+    to the bit.
     """
     parts: dict[str, list[Clearance]] = {}
     spheres: dict[str, list[Float64]] = {}
@@ -221,8 +221,8 @@ class Reach:
 class Between:
     """Lower bounds (T - 1,) [m] of the clearance within intervals, ends included.
 
-    Where is_met (T - 1,), lower is the clearance of a posture in between, below the margin. is_bounded (T
-    - 1,): False if the states do not determine a bound.
+    Where is_met (T - 1,), lower is the clearance of a posture in between, below the margin. is_bounded (T - 1,):
+    False without a bound.
     """
 
     lower: Float64

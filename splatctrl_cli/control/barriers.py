@@ -181,8 +181,8 @@ def distance_bound(
 ) -> Float64:
     """h (M,), with the braking distance where joints cannot stop at once.
 
-    Only then G (M, J) counts. A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it counts, as
-    other rows share it. rate [m/s]: dd/dt of a changing field.
+    Only then G (M, J) counts. A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it counts.
+    rate [m/s]: dd/dt of a changing field.
     """
     if acceleration is None:
         return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)

@@ -155,9 +155,9 @@ PlanDetour = Callable[[int, Float64, Float64], Detour | None]
 
 @dataclass(frozen=True, kw_only=True)
 class TwistTrack:
-    """N twists (N, 6) [m/s, rad/s] of the controlled frame, linear first.
+    """Twists (N, 6) [m/s, rad/s] of the controlled frame, linear first.
 
-    stamp_ns (N,) increases; axes: the frame whose axes the twists use, which turns with the arm (None: world).
+    stamp_ns (N,) increases; axes: the frame whose axes the twists use (None: world).
     """
 
     stamp_ns: Stamps

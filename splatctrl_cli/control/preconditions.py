@@ -132,9 +132,9 @@ WasSeen = Callable[[Float64], Bool]
 class FixedParts:
     """`found`: each fixed sphere's first clearance [m], and its least, later arrivals included.
 
-    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it (MOUNTED_CHANGE near a sphere at
-    its mount). It is nearer than the first clearance by as much, a camera had seen its place before, and the last
-    scene had it too. A link's triangles count where they are farther away.
+    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it (MOUNTED_CHANGE near a mount). It
+    is nearer than the first clearance by as much, a camera had seen its place before, and the last scene had it too.
+    A link's triangles count where they are farther away.
     """
 
     def __init__(self, model: RobotModel, near: float) -> None:

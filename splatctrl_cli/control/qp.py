@@ -185,8 +185,8 @@ def descend(
 ) -> Choice:
     """The program's solution, relaxed where a slack remains, else the least violation, else standstill.
 
-    The smaller program without slacks is solved first. Its solution stands if no multiplier exceeds its row's slack
-    cost. Programs with slacks are feasible by construction.
+    The program without slacks is solved first. It stands if no multiplier exceeds its row's slack cost. Programs with
+    slacks are always feasible.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver(assemble_hard(costs, *box, barriers))

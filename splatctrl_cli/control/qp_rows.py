@@ -129,8 +129,8 @@ def assemble_printed(
     """Program of III-E as printed, over ``z = (v, x, e)``.
 
     Rows: upper, lower box (2 J), external (M), firm. An external row is ``grad d v >= -(d - epsilon) + e``; other
-    rows have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of III-E, which makes seven
-    joints determined.
+    rows have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of III-E, which determines all
+    seven joints.
     """
     J, M = len(state.q), len(external)
     v, x, e = slice(0, J), slice(J, J + 6), slice(J + 6, J + 6 + M)

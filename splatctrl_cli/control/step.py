@@ -67,8 +67,7 @@ class ControlStep:
     rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf without
     pairs); violated_fixed: violated rows that no joint velocity changes; fixed_distance [m]: their least distance
     (inf without any); interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT residual
-    of the last solution, with its status; num_refused: unusable solutions; by_surface: spheres that count by their
-    link's surface from this step on.
+    of the last solution, with its status; num_refused: unusable solutions; by_surface: as in `step`, from now on.
     """
 
     velocity: Float64
@@ -171,8 +170,8 @@ class QpIkController:
 
         distance_rate: dd/dt [m/s] of the moving spheres' distances, (M,) or one number. guide: the goal's motion
         (None: at rest). last_velocity (J,) [rad/s]: for acceleration and smoothness (None: neither counts).
-        by_surface: spheres that count by their link's surface; one whose row would relax joins them if its surface is
-        farther. Raises InputError for a non-finite q, NotEvaluableError where the field has no distance.
+        by_surface: spheres that count by their link's surface; one whose row would relax joins if that is farther.
+        Raises InputError for a non-finite q, NotEvaluableError where the field has no distance.
         """
         moment = Moment(
             stamp_ns=0,
@@ -263,8 +262,8 @@ class QpIkController:
     def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
         """Rows, the ladder's choice, and True if the later distances keep the promise.
 
-        A sphere that would meet another surface than its row's (a corner, a second splat) adds a row. Then the ladder
-        runs again: cutting planes, at most `config.max_cuts` rounds.
+        A sphere that would meet another surface than its row's adds a row. Then the ladder runs again: cutting
+        planes, at most `config.max_cuts` rounds.
         """
         num_external, max_cuts = len(self._builder.scene.names), self._config.max_cuts
         for num_cuts in range(max_cuts + 1):
@@ -291,8 +290,8 @@ class QpIkController:
         """True for rows (M,) whose `later` distance, a period on, breaks their promise.
 
         A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
-        Beyond the margin `promise_tolerance` applies; within it a hundredth, because misses add up. Rows within their
-        margins may lose ground if the total shortfall shrinks.
+        Beyond the margin `promise_tolerance` applies; within it a hundredth. Rows within their margins may lose
+        ground if the total shortfall shrinks.
         """
         config = self._config
         promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))

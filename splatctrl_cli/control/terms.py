@@ -1,7 +1,6 @@
 """Terms of the QP of III-E over joint velocities; the solver adds them.
 
-A further term is a cost, a function of the state that gives ``(H, c)``, or a `BarrierTerm` with rows
-``G v - s <= h``.
+A further term is a function from state to cost ``(H, c)``, or a `BarrierTerm` with rows ``G v - s <= h``.
 """
 
 from abc import ABC, abstractmethod

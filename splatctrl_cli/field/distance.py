@@ -25,7 +25,7 @@ DEFAULT = FieldConfig()
 class SphereField:
     """Exact distance to a union of spheres, ``min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz.
 
-    Inside, it is minus the depth in the deepest sphere, not the distance to the union's surface.
+    Inside: minus the depth in the deepest sphere.
     """
 
     def __init__(self, spheres: Spheres, *, threads: int = 1) -> None:

@@ -22,8 +22,7 @@ from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 class FieldHealth:
     """Ratios that decide a field's quality, with warnings.
 
-    spacing: median distance to the nearest other splat [m], 0 for a single splat; radius: median [m];
-    planar_zero_level: height [m] where a dense plane's kernel field is zero.
+    spacing [m]: `median_spacing`; radius: median [m]; planar_zero_level [m]: of the kernel field.
     """
 
     spacing: float
@@ -101,7 +100,7 @@ def median_spacing(centers: Floats) -> float:
 
 
 def planar_zero_level(radius: float, length: float) -> float:
-    """Height z [m] over a dense plane of splats where the Matern row-sum field is zero.
+    """Height z [m] over a dense plane where the Matern row-sum field is zero.
 
     The field is ``z - l log(1 + z / l) - r``: the integral of ``e^(-d/l)`` over a plane is
     ``2 pi l (z + l) e^(-z/l)``, the row sum ``2 pi l^2``.

@@ -114,9 +114,8 @@ class Cubes:
     def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
         """Bound the distances in a grid with known and unknown cells.
 
-        Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance
-        minus half a cell. Inside: half a cell minus the distance to the nearest known centre; the depth is at
-        most minus that.
+        Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance minus
+        half a cell. Inside: half a cell minus the distance to the nearest known centre.
         """
         here = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)

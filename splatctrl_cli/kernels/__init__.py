@@ -1,4 +1,4 @@
-"""Compiled kernels: numpy in, numpy out. Imports nothing of ours.
+"""Compiled kernels: numpy in, numpy out.
 
 `native` is the best for this processor; SPLATCTRL_KERNELS=base or v3 forces a plainer one. v3 (AVX2) and v4 (AVX-512)
 give the same bytes.

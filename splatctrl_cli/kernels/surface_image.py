@@ -56,7 +56,7 @@ def render_surface(
     """Cast a ray through every pixel's centre; intrinsics (6,): fx, fy, cx, cy, width, height.
 
     measured (H, W) [m], 0 = none: a point is inside a solid if over `tolerance` + `quadratic` depth^2 [m] behind its
-    front and before its back; triangles contain none. Solids around the camera and triangles that reach behind it do
+    front and before its back; triangles contain none. Solids around the camera and triangles reaching behind it do
     not count.
     """
     shape = (int(intrinsics[5]), int(intrinsics[4]))

@@ -1,4 +1,4 @@
-"""Coverage of a robot's collision surface by its spheres: proven bounds, not samples.
+"""Coverage of a robot's collision surface by its spheres, with proven bounds.
 
 phi(p) = min_i |p - c_i| - r_i is positive exactly outside a union of balls, and is then the distance to it. Each term
 is convex, so over a triangle it is largest at a corner:

@@ -7,8 +7,7 @@ centre c takes the protrusion
     K[c, p] = max_k |v_pk - c| + d(c),
 
 and the best n spheres are a k-centre problem: minimise the largest over p of the least K over centres. Greedy set
-cover at a bisected t gives centres, which alternating assignment and recentring improve; then balls shrink. Each
-patch ends up inside one ball.
+cover at a bisected t gives centres, which alternating assignment and recentring improve; then balls shrink.
 """
 
 from collections.abc import Mapping, Sequence

@@ -35,11 +35,10 @@ KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
 class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
-    kinds (P,) as in `kernels.surface_image`; sizes (P, 3) (half edges; radius and half length; or radius);
-    T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame of triangle_links (F,), as a `mesh` to draw and `trees`
-    by link number to measure. by_spheres: links whose unreadable geometry spheres replace. notes: replaced visual
-    geometry, and why. fixed: links that no joint moves. num_carried: carried boxes, each with its link again at the
-    end of `links`.
+    kinds (P,), sizes (P, 3) as in `kernels.surface_image`; T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame
+    of triangle_links (F,), as a `mesh` to draw and `trees` by link number to measure. by_spheres: links whose
+    unreadable geometry spheres replace. notes: replaced visual geometry, and why. fixed: links that no joint moves.
+    num_carried: carried boxes, each with its link again at the end of `links`.
     """
 
     links: tuple[str, ...]
@@ -231,7 +230,7 @@ class RobotSurface:
         """Signed distances (Q,) [m] of points (Q, 3), negative inside.
 
         Infinite to triangles beyond `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0, any distance on the same
-        side of both bounds. Points `outside` (Q,) of all triangles skip the slow inside test.
+        side of both bounds. Points `outside` (Q,) of all triangles skip the inside test.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)

@@ -1,8 +1,7 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
-Depth surrounds a hole, and an object in it is on its rays. Rays of other cameras and later images clear it. At depth
-edges without depth, the nearer surface may extend. Stereo shadows are no holes. Voxels near the robot that no camera
-ever saw get a reason.
+An object in a hole is on its rays, which rays of other cameras and later images clear. At depth edges without depth,
+the nearer surface may extend. Voxels near the robot that no camera ever saw get a reason.
 """
 
 from collections.abc import Iterator, Sequence

@@ -411,7 +411,7 @@ class SceneFitter:
     ) -> Bool:
         """Points (K,) that a `lasting` pixel (H, W) shows, or not near unmoved links.
 
-        Stereo gives pixels outside an outline the link's depth in some frames: splats there would float.
+        Stereo gives pixels outside an outline the link's depth in some frames.
         """
         if robot is None:
             return np.ones(len(points), bool)

@@ -99,8 +99,8 @@ def room_for(
 ) -> tuple[Bool, Seeds]:
     """Slots (M,) of at most `num` splats to evict, and the seeds in order of service.
 
-    Only object splats go: redundant ones that show least, then those far from the robot's path, for seeds near it.
-    shown (M,): how much slots show; tolerance [m]: of `redundant`.
+    Only object splats go: redundant ones that show least, then, for seeds near the robot's path, far ones. shown
+    (M,): how much slots show; tolerance [m]: of `redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
@@ -155,7 +155,7 @@ def redundant(
 def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
     """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
-    Each is at least EVICT_NEARER farther from the path than its seed: surfaces do not alternate.
+    Each is at least EVICT_NEARER farther from the path than its seed.
     """
     to_splat = distance_to_box(centers, path)
     farthest = np.argsort(-to_splat, kind="stable")[:num_wanted]

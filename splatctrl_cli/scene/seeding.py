@@ -47,9 +47,9 @@ def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, mi
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
     """M_add (H, W): pixels to seed, eq. 5 with a term for holes.
 
-    A mappable pixel is seeded if it is a hole (opacity below `hole_opacity`). So is one closer than the map by more
-    than lambda_MDE times the median depth error. The median is over explained mappable pixels; the threshold has a
-    floor and a ceiling. The map's depth is normalised by opacity.
+    Holes are mappable pixels with opacity below `hole_opacity`. Others are seeded if closer than the map by more than
+    lambda_MDE times the median depth error. The median is over explained mappable pixels; the threshold has a floor
+    and a ceiling. The map's depth is normalised by opacity.
     """
     is_hole = rendering.opacity < config.hole_opacity
     error = rendering.normalised_depth() - frame.depth

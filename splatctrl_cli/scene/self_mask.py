@@ -72,7 +72,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     in as many pixels as the tolerance spans. So is a point this near to a triangle, or inside. Points inside balls
     and carried boxes are robot. Other depth is object, if `_judge` agrees.
 
-    The image is widened by 1 / `MASK_BORDER`: an outline just outside fattens edges inside.
+    The image is widened by 1 / `MASK_BORDER`.
     """
     k, border = frame.intrinsics, frame.intrinsics.width // MASK_BORDER
     lens = replace(k, cx=k.cx + border, cy=k.cy + border, width=k.width + 2 * border, height=k.height + 2 * border)
@@ -312,7 +312,7 @@ class LinkResidual:
     """The residual of one link over several masks.
 
     median [m]: of measured minus rendered depth over num_pixels, None without any; num_inside: as in `SelfMask`;
-    reach [m]: the least `SelfMask.reach` of masks that show the link.
+    reach [m]: the least `SelfMask.reach`.
     """
 
     median: float | None

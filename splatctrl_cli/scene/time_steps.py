@@ -55,9 +55,8 @@ class AuditRow:
 
     Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames at their last iteration, None if none shows
     the workspace. dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface.
-    unrepresented: occupied voxels without a splat. without_depth: frames without any depth; blind: their cameras.
-    self_mask: by link, measured minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link,
-    unexplained points inside.
+    unrepresented: voxels. without_depth: frames; blind: their cameras. self_mask: by link, measured minus rendered
+    depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link, unexplained points inside.
     """
 
     stamp_ns: int

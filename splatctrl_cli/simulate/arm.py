@@ -1,8 +1,7 @@
 """The simulated arm: the Franka Emika Panda's joints in primitive shapes, and its motion.
 
-Joints follow the published (modified) Denavit-Hartenberg table (d1 = 0.333, d3 = 0.316, a4 = 0.0825, a5 = -0.0825, d5
-= 0.384, a7 = 0.088, flange 0.107 m), and published limits. The shapes are ours: capsules (a cylinder and two spheres)
-and boxes.
+Joints follow the modified Denavit-Hartenberg table (d1 = 0.333, d3 = 0.316, a4 = 0.0825, a5 = -0.0825, d5 = 0.384, a7
+= 0.088, flange 0.107 m), and published limits. The shapes are ours: capsules (a cylinder and two spheres) and boxes.
 """
 
 from collections.abc import Iterator, Mapping
@@ -94,7 +93,7 @@ SHAPES: dict[str, tuple[Capsule | Block, ...]] = {
 
 
 def slim(shape: Capsule | Block) -> tuple[Capsule | Block, ...]:
-    """Visual shapes inside a collision shape, as real parts lie inside convex hulls.
+    """Visual shapes inside a collision shape.
 
     Over the collision surface, the visual one is 3 mm (median) and 27 mm (95 %) away, at most 30 mm.
     """

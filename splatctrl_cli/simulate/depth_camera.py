@@ -89,7 +89,7 @@ def _fattened(disparity: Float64, reach: np.ndarray) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthNoise:
-    """Errors of a depth camera, like a D435 with depth registered to colour.
+    """Errors of a depth camera like a D435, registered to colour.
 
     spread [m]: sigma at 1 m, growing with depth squared. step [m]: quantisation at 1 m. patch [px]: matching window,
     over which errors agree. dropout: share of pixels lost, in patch-sized blobs. edge [m]: depth step that loses both

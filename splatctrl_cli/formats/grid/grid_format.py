@@ -155,7 +155,7 @@ def x_fastest(values: Values) -> Iterator[Values]:
 
 @dataclass(frozen=True, kw_only=True)
 class GridFormat:
-    """A file format, listed in its module's ``ENTRIES``, for the program and its docs.
+    """A file format, in its module's ``ENTRIES``.
 
     `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
     `describe`: from a path and its first bytes; None for another kind. `needs`: one of these channels.

@@ -7,7 +7,7 @@ fastest; the grid is placed by its middle's pose, ``x y z qw qx qy qz``. Values 
 
 The kernel truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the
 pose is half a voxel below our cells' middle. A sphere takes its centre's cell. The first three and last two cells of
-an axis, and the outside, are free. (0.7.0 to 0.7.4 count cells otherwise, and add half a voxel to values.)
+an axis, and the outside, are free. (0.7.0 to 0.7.4 differ.)
 
 MoveIt's distance field reads occupied cells: moveit_core, distance_field/src/propagation_distance_field.cpp
 (`readFromStream`; the same in MoveIt 1 and 2) and voxel_grid.h. Seven lines of text precede a zlib stream of bits: x

@@ -124,7 +124,7 @@ def _angles(a: Float32, b: Float32) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class SplatFormat:
-    """A splat file format, in its module's ``ENTRIES``, for the program and its docs.
+    """A splat file format, in its module's ``ENTRIES``.
 
     `held`: the representable part of a set; `bound`: the largest rounding; `check` raises UsageError without its
     library. `docs`: rows in docs/artefacts.md, an empty line between: suffix | what it is | what it rounds to | what

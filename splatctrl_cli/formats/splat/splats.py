@@ -118,7 +118,7 @@ def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None
 def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
-    Ignores other properties; a missing label is 0 (object), a missing density 0 (not computed). Raises InputError if
+    Ignores other properties; a missing label is 0 (object), as is a density (not computed). Raises InputError if
     truncated, anisotropic, invalid or without a `REQUIRED` property.
     """
     ply = read_table(path, "vertex", REQUIRED)

@@ -48,7 +48,7 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Wanted results in (X, Y, Z) cells or (Q,) points [m].
+    """Results in (X, Y, Z) cells or (Q,) points [m].
 
     bound: exact distance minus margin; entry: nearest sphere's; kernels: exact where undefined; counts: by kernel,
     cells where it is undefined, or exceeds the exact distance by more than `resolution`.
