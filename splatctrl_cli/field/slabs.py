@@ -1,4 +1,4 @@
-"""Bakes of a grid, whole or in slabs of x-planes, and their header with the splats' health."""
+"""Bakes of a grid, whole or in slabs of x-planes, with headers and health."""
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass

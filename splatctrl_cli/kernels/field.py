@@ -83,7 +83,7 @@ class LogSumExp:
 def nearest(
     spheres: Clusters, radii: Offsets, points: Float32, *, threads: int = 0
 ) -> tuple[Float32, Float32, Int32]:
-    """``min_i |x - p_i| - r_i`` (Q,), its gradient (Q, 3), 0 at a centre, its entry (Q,)."""
+    """``min_i |x - p_i| - r_i`` (Q,), its gradient (Q, 3), 0 at a centre, and entry (Q,)."""
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     entry = np.empty(len(points), np.int32)
     native.field_nearest(*spheres, *radii, points, num_threads(threads), score, gradient, entry)

@@ -1,4 +1,4 @@
-"""Scenes of solids, clearance of many postures, its loss over motions, and proofs of free edges.
+"""Scenes of solids, clearance of many postures and motions, and proofs of free edges.
 
 B postures, J joints; R rows: moving spheres, then pairs of spheres.
 """

@@ -1,4 +1,4 @@
-"""The robot's self-model: parts that move with its links beyond the URDF, as grids and surfaces."""
+"""The robot's self-model: parts that move with its links beyond the URDF."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

@@ -53,7 +53,7 @@ class Contradicted:
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
     def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Points (K, 3) [m], world, half a voxel apart on rays of its blocks, up to `until` or `through`.
+        """Points (K, 3) [m], world, half a voxel apart on its rays up to `until` or `through`.
 
         is_blank: from blocks without depth, or with it.
         """

@@ -71,7 +71,7 @@ class OccupancyMap:
         self.step_stamps_ns.append(min(frame.stamp_ns for frame in frames))
 
     def integrate(self, frame: RgbdFrame) -> None:
-        """Add one depth image: voxels are free along its rays, hit at their ends, and both last seen now."""
+        """Add one depth image: voxels are free along its rays, hit at their ends."""
         integrate_depth(
             self._packed,
             self.log_odds,
@@ -225,7 +225,7 @@ class OccupancyMap:
         return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32), is_observed
 
     def occupied_voxels(self) -> NDArray[np.intp]:
-        """Flat indices (K,) of voxels hit more than once, as one may be noise, except the robot's."""
+        """Flat indices (K,) of voxels hit more than once, except the robot's."""
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
         voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))

@@ -48,7 +48,7 @@ CAUSES = (
 
 
 def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) -> list[Agreement]:
-    """Agreement of camera pairs with enough common pixels, at one moment or of a still scene.
+    """Agreement of camera pairs with enough common pixels, at once or of a still scene.
 
     Views of one camera are paired, too. Depth counts from `min_range` to `max_range` [m].
     """

@@ -322,7 +322,7 @@ class LinkResidual:
 
     @property
     def sign(self) -> int:
-        """1 if the robot is measured behind its rendered surface, -1 before it, 0 at it or unknown."""
+        """1 if the robot is measured behind its rendered surface, -1 before it, else 0."""
         return 0 if self.median is None else int(np.sign(self.median))
 
 
