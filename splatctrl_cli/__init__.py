@@ -1,6 +1,6 @@
 """SplatCtrl: camera recordings of robots as splats, distance fields and replayed controllers.
 
-`splatctrl_cli.api` has the public names, imported on first use.
+`splatctrl_cli.api` has the public names.
 """
 
 from importlib import import_module

@@ -1,6 +1,6 @@
 """Parts for custom programs: robot, scene, fields, planner, controller, simulation.
 
-Jobs and requests are in `splatctrl_cli.api`; these names may change with a minor version.
+These names may change with a minor version.
 """
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed

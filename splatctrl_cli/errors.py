@@ -12,7 +12,7 @@ DAMAGE = "part of the recording is damaged and left out"
 
 
 def did_you_mean(word: str, known: Iterable[str], otherwise: str, *, prefix: str = "", cutoff: float = 0.6) -> str:
-    """Return a remedy with the nearest known word after a prefix, else `otherwise`."""
+    """A remedy with the nearest known word after a prefix, else `otherwise`."""
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=cutoff)
     return f"did you mean {prefix}{near[0]}?" if near else otherwise
 
@@ -56,7 +56,7 @@ class NotEvaluableError(SplatCtrlError):
 
 
 class WriteError(SplatCtrlError):
-    """Writing failed, e.g. the disk is full (exit code 6)."""
+    """Writing failed, e.g. on a full disk (exit code 6)."""
 
     exit_code = 6
 

@@ -10,7 +10,7 @@ from splatctrl_cli.records import Float64, Intrinsics
 
 
 def invert_transform(T: Float64) -> Float64:
-    """Return the inverse of a rigid transform."""
+    """Inverse of a rigid transform."""
     inverse = np.eye(4)
     inverse[:3, :3] = T[:3, :3].T
     inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
@@ -18,14 +18,14 @@ def invert_transform(T: Float64) -> Float64:
 
 
 def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
-    """Return points (..., 3) moved by T."""
+    """Points (..., 3) moved by T."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3], dtype=np.float64)
 
 
 def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
-    """Return the rotation of a finite, nonzero quaternion.
+    """Rotation of a finite, nonzero quaternion.
 
-    Scaling by a power of two first rounds nothing: squares of a tiny one would underflow.
+    Scaling by a power of two rounds nothing; squares of a tiny one would underflow.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     quat = np.ldexp(quat, -np.frexp(np.abs(quat).max())[1])
@@ -40,7 +40,7 @@ def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
 
 
 def quat_from_rotation(R: Float64) -> Float64:
-    """Return a rotation's unit quaternion with w >= 0."""
+    """A rotation's unit quaternion with w >= 0."""
     K = np.array(
         [
             [R[0, 0] - R[1, 1] - R[2, 2], 0, 0, 0],
@@ -54,7 +54,7 @@ def quat_from_rotation(R: Float64) -> Float64:
 
 
 def pose_at(position: ArrayLike, R: ArrayLike | None = None) -> Float64:
-    """Return T of a position and a rotation (default: none)."""
+    """T of a position and a rotation (default: none)."""
     T = np.eye(4)
     T[:3, 3] = position
     if R is not None:
@@ -63,20 +63,20 @@ def pose_at(position: ArrayLike, R: ArrayLike | None = None) -> Float64:
 
 
 def compare_poses(T_world_a: Float64, T_world_b: Float64) -> tuple[float, float]:
-    """Return the distance [m] and angle [degrees] between two poses."""
+    """Distance [m] and angle [degrees] between two poses."""
     T = invert_transform(T_world_a) @ T_world_b
     cosine = np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)
     return float(np.linalg.norm(T[:3, 3])), float(np.degrees(np.arccos(cosine)))
 
 
 def turn_about_z(angle: float) -> Float64:
-    """Return the rotation by an angle [rad] about z."""
+    """Rotation by an angle [rad] about z."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def frame_along(axis: Float64) -> Float64:
-    """Return a rotation with z along `axis` (3,)."""
+    """A rotation with z along `axis` (3,)."""
     z = axis / np.linalg.norm(axis)
     x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -84,20 +84,20 @@ def frame_along(axis: Float64) -> Float64:
 
 
 def face_normals(corners: Float64) -> Float64:
-    """Return the normals (F, 3) of triangles (F, 3, 3), times twice their area.
+    """Normals (F, 3) of triangles (F, 3, 3), times twice their area.
 
-    They point outward if corners run counter-clockwise seen from outside.
+    Outward if corners run counter-clockwise seen from outside.
     """
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def transform_from(position: ArrayLike, quat_xyzw: ArrayLike) -> Float64:
-    """Return T of a position and a quaternion."""
+    """T of a position and a quaternion."""
     return pose_at(position, rotation_from_quat(quat_xyzw))
 
 
 def interpolate_transform(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
-    """Return T at `fraction` in [0, 1]: linear position, slerp rotation."""
+    """T at `fraction` in [0, 1]: linear position, slerp rotation."""
     quat_a, quat_b = quat_from_rotation(T_a[:3, :3]), quat_from_rotation(T_b[:3, :3])
     cosine = float(quat_a @ quat_b)
     if cosine < 0:
@@ -111,7 +111,7 @@ def interpolate_transform(T_a: Float64, T_b: Float64, fraction: float) -> Float6
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float64:
-    """Return T_world_camera (z forward, y down) at `eye`, towards `target`."""
+    """T_world_camera (z forward, y down) at `eye`, towards `target`."""
     eye_world = np.asarray(eye, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - eye_world
     forward /= np.linalg.norm(forward)
@@ -121,14 +121,14 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 
 def strided_lens(lens: Intrinsics, stride: int) -> Intrinsics:
-    """Return the camera of every `stride`-th pixel: pixel (0, 0) stays."""
+    """Camera of every `stride`-th pixel: pixel (0, 0) stays."""
     fx, fy, cx, cy = (value / stride for value in (lens.fx, lens.fy, lens.cx, lens.cy))
     width, height = -(-lens.width // stride), -(-lens.height // stride)
     return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
 
 def project(intrinsics: Intrinsics, points_camera: NDArray[np.floating]) -> Float64:
-    """Return pixels (..., 2) of camera-frame points (..., 3) with z > 0."""
+    """Pixels (..., 2) of camera-frame points (..., 3) with z > 0."""
     z = points_camera[..., 2]
     u = intrinsics.fx * points_camera[..., 0] / z + intrinsics.cx
     v = intrinsics.fy * points_camera[..., 1] / z + intrinsics.cy
@@ -136,7 +136,7 @@ def project(intrinsics: Intrinsics, points_camera: NDArray[np.floating]) -> Floa
 
 
 def back_project(intrinsics: Intrinsics, depth: NDArray[np.floating]) -> Float64:
-    """Return camera-frame points (H, W, 3) of depth (H, W) [m]."""
+    """Camera-frame points (H, W, 3) of depth (H, W) [m]."""
     v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
     return back_project_pixels(intrinsics, u, v, depth)
 
@@ -144,7 +144,7 @@ def back_project(intrinsics: Intrinsics, depth: NDArray[np.floating]) -> Float64
 def back_project_pixels(
     intrinsics: Intrinsics, u: NDArray[np.intp], v: NDArray[np.intp], depth: NDArray[np.floating]
 ) -> Float64:
-    """Return camera-frame points (..., 3) of pixels; columns u and rows v broadcast to depth (...) [m]."""
+    """Camera-frame points (..., 3) of pixels; u, v broadcast to depth (...) [m]."""
     x = (u - intrinsics.cx) / intrinsics.fx * depth
     y = (v - intrinsics.cy) / intrinsics.fy * depth
     return np.stack([x, y, depth], axis=-1).astype(np.float64)

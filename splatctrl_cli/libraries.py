@@ -1,7 +1,4 @@
-"""Modules found by name: lazy libraries, extras, and registry entries of rooms.
-
-Lazy ones take most of a second to load.
-"""
+"""Modules found by name: lazy libraries, extras, and registry entries of rooms."""
 
 from importlib import import_module
 from importlib.util import find_spec
@@ -14,7 +11,7 @@ from splatctrl_cli.errors import UsageError
 
 
 class _LoadedLate(ModuleType):
-    """A lazy library; a name may be a submodule."""
+    """A lazy library or submodule."""
 
     def __getattr__(self, name: str) -> object:
         library = import_module(self.__name__)
@@ -42,7 +39,7 @@ def is_installed(module: str) -> bool:
 
 
 def of_extra(module: str, extra: str, what: str) -> Any:
-    """Return a library that reads `what`. Raises UsageError if its extra is not installed."""
+    """A library that reads `what`. Raises UsageError if its extra is not installed."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -58,7 +55,7 @@ Entry = TypeVar("Entry")  # of a registry; lists and trials start with the lowes
 
 
 def entries_of(room: str, kind: type[Entry]) -> tuple[Entry, ...]:
-    """Return the entries of type `kind` in the ``ENTRIES`` of a room's modules, in order."""
+    """Entries of type `kind` in the ``ENTRIES`` of a room's modules, in order."""
     modules = [import_module(f"{room}.{found.name}") for found in iter_modules(import_module(room).__path__)]
     found = [entry for module in modules for entry in getattr(module, "ENTRIES", ()) if isinstance(entry, kind)]
     return tuple(sorted(found, key=attrgetter("order")))

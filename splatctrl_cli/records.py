@@ -42,7 +42,7 @@ class FloatRows(Protocol):
         """T."""
 
     def __getitem__(self, which: Any, /) -> Any:
-        """Return a row, or rows of a slice or an index."""
+        """A row, or rows of a slice or an index."""
 
     def __iter__(self) -> Iterator[Any]:
         """Yield the rows."""
@@ -76,9 +76,8 @@ class RgbdFrame:
     """A colour image with registered depth and pose.
 
     color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = no return; T_world_camera (4, 4)
-    float64, of the optical frame (z forward); human (H, W) uint8, nonzero on people, None if not segmented; valid (H,
-    W), False outside the lens's view, None if all valid. Invalid pixels have no colour; their depth, of another lens,
-    is not drawn or scored.
+    float64, of the optical frame (z forward); human (H, W) uint8, nonzero on people, or None; valid (H, W), False
+    outside the lens's view, None if all valid. Invalid pixels have no colour; their depth is not drawn or scored.
     """
 
     stamp_ns: int
@@ -113,7 +112,7 @@ Item = TypeVar("Item")
 
 
 def spread(items: Sequence[Item], most: int) -> list[Item]:
-    """Return at most `most` items, in order, evenly spread."""
+    """At most `most` items, in order, evenly spread."""
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))]
 
 
@@ -126,11 +125,10 @@ def by_stamp(*streams: Iterable[Item]) -> Iterator[Item]:
 class LossReport:
     """Losses of an input: `damaged` sets exit code 3, the rest is only counted.
 
-    duplicate_images: images of a stamp that their topic had before; dropped_images: images missing from a topic of
-    steady rate; invalid_depth: pixels with NaN, infinite, negative or 65535 counts, read as no return;
+    duplicate_images: images of a stamp that their topic had before; dropped_images: missing from a topic of steady
+    rate; invalid_depth: pixels with NaN, infinite, negative or 65535 counts, read as no return;
     differentiated_velocities: states with a velocity from positions; unsorted_states, duplicate_states: stamps that
-    go back or repeat; conflicting_states: duplicates with other positions than the kept one; state_gaps: times
-    without states.
+    go back or repeat; conflicting_states: duplicates with other positions; state_gaps: times without states.
     """
 
     unpaired_color: int = 0
@@ -149,13 +147,13 @@ class LossReport:
     notes: list[str] = field(default_factory=list)
 
     def plus(self, other: "LossReport", notes: list[str], sign: int = 1) -> "LossReport":
-        """Return the sum of both counts (sign -1: the difference), with these notes."""
+        """Sum of both counts (sign -1: the difference), with these notes."""
         names = [column.name for column in fields(self) if column.name != "notes"]
         return LossReport(**{name: getattr(self, name) + sign * getattr(other, name) for name in names}, notes=notes)
 
 
 class RecordSource(Protocol):
-    """A recorded dataset as records in time order (log, capture, image folder)."""
+    """A recorded dataset as records in time order."""
 
     @property
     def name(self) -> str:
@@ -181,7 +179,7 @@ class RecordSource(Protocol):
         """Yield records by stamp; joint states precede frames of the same stamp."""
 
     def digests(self) -> dict[str, str]:
-        """Return sha256 of every input file, by name."""
+        """Sha256 of every input file, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +196,7 @@ class Columns:
         return replace(self, **{name: np.concatenate(arrays) for name, arrays in parts.items()})
 
     def select(self, which: Bool | NDArray[np.integer]) -> Self:
-        """Return the items of a mask (N,) or an index (K,)."""
+        """Items of a mask (N,) or an index (K,)."""
         return replace(self, **{column.name: getattr(self, column.name)[which] for column in fields(self)})
 
 
@@ -207,8 +205,7 @@ class SplatSet(Columns):
     """Isotropic 3D Gaussians (III-B).
 
     centers (N, 3) float32 [m], world; radii (N,) float32 [m] (sigma); colors (N, 3) float32 in [0, 1]; opacities (N,)
-    float32 in (0, 1); labels (N,) uint8 (`Label`); density (N,) float32, rho of III-D (row sum of the kernel, 0 if
-    not computed).
+    float32 in (0, 1); labels (N,) uint8 (`Label`); density (N,) float32, rho of III-D (0 if not computed).
     """
 
     centers: Float32
@@ -246,7 +243,7 @@ class PointCloud(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """Axis-aligned box, lower (3,) and upper (3,) float64 [m], world."""
+    """Axis-aligned box: lower, upper (3,) float64 [m], world."""
 
     lower: Float64
     upper: Float64
@@ -285,7 +282,7 @@ class DistanceField(Protocol):
     """Signed distance to the scene, positive outside."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return distance (Q,) [m] at points (Q, 3) [m], world, and its own gradient (Q, 3).
+        """Distance (Q,) [m] at points (Q, 3) [m], world, and its own gradient (Q, 3).
 
         The gradient is not normalised.
         """
@@ -296,8 +293,8 @@ class DistanceGrid:
     """A baked field; cell (i, j, k) is centred at ``origin + voxel * (i, j, k)``, world [m].
 
     channels: `sdf` (X, Y, Z) float32 [m]; `hard` (X, Y, Z) float32 [m], exact distance to the spheres; `gpdf` (X, Y,
-    Z) float32 [m]; `gradient` (X, Y, Z, 3) float32; `observed` (X, Y, Z) uint8 (0 never seen, 1 free, 2 occupied, 3
-    uncertain, 4 never seen but swept by the robot). header: sign, frame, units, kernel, length scale, digests.
+    Z) float32 [m]; `gradient` (X, Y, Z, 3) float32; `observed` (X, Y, Z) uint8 (`VoxelState`). header: sign, frame,
+    units, kernel, length scale, digests.
     """
 
     origin: Float64

@@ -72,7 +72,7 @@ class OccupancyGrid:
     entity: UInt8
 
     def states(self, free_below: float, occupied_above: float) -> UInt8:
-        """Return `VoxelState` (X, Y, Z) by thresholds of occupancy."""
+        """`VoxelState` (X, Y, Z) by thresholds of occupancy."""
         low, high = (float(np.log(p / (1.0 - p))) for p in (free_below, occupied_above))
         states = np.full(self.log_odds.shape, np.uint8(VoxelState.UNCERTAIN))
         states[self.log_odds < low] = VoxelState.FREE
@@ -117,11 +117,11 @@ class Balls:
 
     @classmethod
     def of_voxels(cls, centers: Float32, voxel: float, labels: UInt8) -> "Balls":
-        """Return the balls around voxels of edge `voxel` [m] at centers (K, 3)."""
+        """Balls around voxels of edge `voxel` [m] at centers (K, 3)."""
         return cls(centers=centers, radius=0.5 * 3**0.5 * voxel, labels=labels)
 
     def select(self, which: Bool) -> "Balls":
-        """Return the balls of a mask (K,)."""
+        """Balls of a mask (K,)."""
         return Balls(centers=self.centers[which], radius=self.radius, labels=self.labels[which])
 
     @property
@@ -142,14 +142,14 @@ class LostEdges:
 
     @classmethod
     def joined(cls, parts: Sequence["LostEdges"]) -> "LostEdges":
-        """Return all balls of the parts; no parts give no balls."""
+        """All balls of the parts, perhaps none."""
         return cls(
             centers=np.concatenate([np.zeros((0, 3), np.float32), *(part.centers for part in parts)]),
             radii=np.concatenate([np.zeros(0, np.float32), *(part.radii for part in parts)]),
         )
 
     def select(self, which: Bool) -> "LostEdges":
-        """Return the balls of a mask (K,)."""
+        """Balls of a mask (K,)."""
         return LostEdges(centers=self.centers[which], radii=self.radii[which])
 
 
@@ -161,8 +161,8 @@ class SeenVoxels:
     """Last view of each voxel, centred at `origin` + index times `voxel` [m].
 
     last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last step with depth
-    through or on the voxel; 0: never, without a reason; the type's largest numbers: the reason (`Unseen`, its lower
-    byte in uint8). edges: of the newest images. is_free (X, Y, Z): `VoxelState.FREE` now; None if not recorded.
+    through or on the voxel; 0: never; the type's largest numbers: the reason (`Unseen`, its lower byte in uint8).
+    edges: of the newest images. is_free (X, Y, Z): `VoxelState.FREE` now; None if not recorded.
     """
 
     origin: Float64
@@ -173,9 +173,9 @@ class SeenVoxels:
     is_free: Bool | None = None
 
     def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
-        """Return the stamps (Q,) [ns] of the last views, -1 for never, and `EvidenceClass` (Q,).
+        """Stamps (Q,) [ns] of the last views, -1 for never, and `EvidenceClass` (Q,).
 
-        points (Q, 3) [m], world. The class is `FREE` for every voxel that was ever seen, however long ago.
+        points (Q, 3) [m], world. The class is `FREE` for every voxel ever seen.
         """
         cell = np.floor((points - self.origin) / self.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
@@ -215,7 +215,6 @@ class KnownVoxels:
 
     @property
     def seen(self) -> SeenVoxels:
-        """Times of the voxels' last views."""
         grid = self.grid
         return SeenVoxels(
             origin=grid.origin,

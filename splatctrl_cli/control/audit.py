@@ -1,8 +1,7 @@
-"""Clearance of logged joint states by each field, their share of unknown space, and bounds between two states.
+"""Clearance of logged joint states by each field, their unknown share, and bounds between states.
 
-If sphere s travels at most L_s in between, its distance is never below ``(d_0s + d_1s - L_s) / 2``, d_0s and d_1s at
-the ends, because exact distance is 1-Lipschitz. L_s follows from joint motion and `RobotModel.lever_arms`. Bounds
-come from both ends, and are refined where too low.
+With d_0s, d_1s at the ends and travel up to L_s, sphere s's distance is at least ``(d_0s + d_1s - L_s) / 2``. Exact
+distance is 1-Lipschitz; L_s follows from joint motion and `RobotModel.lever_arms`.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +20,7 @@ DistanceFunction = Callable[[Float64], Float64]
 
 @dataclass(frozen=True, kw_only=True)
 class BallDistance:
-    """A `DistanceFunction` of balls, centers (N, 3), radii (N,) [m], for surface measurement."""
+    """A `DistanceFunction` of balls, centers (N, 3), radii (N,) [m]."""
 
     of_points: DistanceFunction
     centers: Floats
@@ -42,9 +41,9 @@ CHUNK = 256  # states per query
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
-    """distance (T,) [m] of the nearest moving part, NaN if unknown; sphere (T,): the index of its sphere.
+    """distance (T,) [m] of the nearest moving part, NaN if unknown; sphere (T,): its index.
 
-    For self-collision, distance is that of the nearest pair, and sphere is the pair's index, -1 without pairs.
+    For self-collision: of the nearest pair, and its index, -1 without pairs.
     """
 
     distance: Float64
@@ -57,8 +56,7 @@ class AuditTrace:
 
     stamp_ns (T,); position (T, J) [rad]; clearance by field; limit_margin (T,) [rad]: to the nearest position limit,
     negative outside, at limit_joint (T,); self_clearance (T,) [m] (inf without pairs) at self_pair (T,);
-    unknown_share (T,) of sphere centres in never-seen space (NaN if not measured); of_spheres: clearances (T, M) [m]
-    by field, if kept.
+    unknown_share (T,) of sphere centres (NaN if not measured); of_spheres: clearances (T, M) [m] by field, if kept.
     """
 
     stamp_ns: Stamps
@@ -75,7 +73,7 @@ class AuditTrace:
 def part_clearances(
     model: RobotModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Float64, Bool]:
-    """Return the moving parts' clearances (T, M) [m] at postures (T, J), and which (M,) are of link surfaces.
+    """Moving parts' clearances (T, M) [m] at postures (T, J); True (M,) for link surfaces.
 
     A link's triangles decide if the scene is of balls: the link's nearest sphere has their clearance. Each other
     sphere has the larger of that and its own less `sphere_deficit`. centers (T, S, 3) [m]: of all spheres, if known.
@@ -102,7 +100,7 @@ def part_clearances(
 def moving_clearance(
     model: RobotModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Clearance, Float64]:
-    """Return the least of `part_clearances` (T,), and all (T, M) [m]."""
+    """Least of `part_clearances` (T,), and all (T, M) [m]."""
     distance, _ = part_clearances(model, positions, distance_to, centers)
     moving = np.flatnonzero(model.moving_spheres)
     nearest = np.argmin(distance, axis=1)
@@ -117,10 +115,10 @@ def audit(
     *,
     observed: Observed | None = None,
 ) -> AuditTrace:
-    """Return clearances of states, by the distances known at their stamps.
+    """Clearances of states, by the distances known at their stamps.
 
-    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. The audit of some states of one scene equals that
-    part of the audit of all, to the bit.
+    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Part of the states gives that part of the audit,
+    to the bit.
     """
     parts: dict[str, list[Clearance]] = {}
     spheres: dict[str, list[Float64]] = {}
@@ -148,7 +146,7 @@ def audit(
 
 
 def observed_at(seen: UInt8, origin: Float64, voxel: float, points: Float64) -> UInt8:
-    """Return the value (Q,) of the voxel of `seen` (X, Y, Z) nearest to each point; 0 (never seen) outside."""
+    """Value (Q,) of the voxel of `seen` (X, Y, Z) at each point; 0 (never seen) outside."""
     cell = np.floor((points - origin) / voxel + 0.5).astype(np.int64)
     is_inside = np.all((cell >= 0) & (cell < seen.shape), axis=1)
     found = np.zeros(len(points), dtype=np.uint8)
@@ -157,7 +155,7 @@ def observed_at(seen: UInt8, origin: Float64, voxel: float, points: Float64) -> 
 
 
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
-    """Yield ranges of at most CHUNK consecutive states in one scene; hold at most two scenes."""
+    """Yield ranges of at most CHUNK successive states in one scene; hold two scenes or fewer."""
     first, before = 0, distances_at(int(stamps[0]))
     for index, stamp in enumerate(stamps[1:], start=1):
         known = distances_at(int(stamp))
@@ -205,7 +203,6 @@ class Reach:
 
     @classmethod
     def of(cls, model: RobotModel) -> "Reach":
-        """Return the reach of a model's moving spheres."""
         moving = np.flatnonzero(model.moving_spheres)
         deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)[moving]), 0.0)
         return cls(
@@ -220,8 +217,8 @@ class Reach:
 class Between:
     """Lower bounds (T - 1,) [m] of the clearance within intervals, ends included.
 
-    Where is_met (T - 1,), lower is a witness: the clearance of a posture in between, below the margin. is_bounded (T
-    - 1,): False if the states do not determine a bound.
+    Where is_met (T - 1,), lower is the clearance of a posture in between, below the margin. is_bounded (T - 1,):
+    False without a bound.
     """
 
     lower: Float64
@@ -241,11 +238,11 @@ def between_states(
     margin: float,
     longest: float,
 ) -> Between:
-    """Return bounds between states (T, J) at stamps (T,) [ns] in one scene.
+    """Bounds between states (T, J) at stamps (T,) [ns] in one scene.
 
     at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm is
-    assumed to move straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may
-    have gone anywhere within its velocity limits: bounded only where that stays above the margin [m].
+    assumed to move straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may go
+    anywhere within its velocity limits: bounded only where that stays above the margin [m].
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))
@@ -284,10 +281,10 @@ def _refined(
     distance_to: DistanceFunction,
     margin: float,
 ) -> tuple[Float64, Bool]:
-    """Halve K straight motions until each piece's bound reaches the margin, or the piece is short.
+    """Halve K straight motions until each piece is short, or its bound reaches the margin.
 
-    Return the least bound (K,), and is_met (K,): a posture on the way is below the margin, and the least clearance of
-    such postures replaces the bound.
+    Return the least bound (K,), and is_met (K,): a posture on the way is below the margin, and its least clearance
+    replaces the bound.
     """
     least, is_met = np.full(len(q_first), np.inf), np.zeros(len(q_first), dtype=np.bool_)
     owner = np.arange(len(q_first))
@@ -319,6 +316,6 @@ def _refined(
 
 
 def clearances(model: RobotModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
-    """Return moving spheres' clearances (T, M) [m], less their uncovered surface."""
+    """Moving spheres' clearances (T, M) [m], less their uncovered surface."""
     each, is_surface = part_clearances(model, positions, distance_to)
     return np.asarray(each - np.where(is_surface, 0.0, reach.radii - model.sphere_set.radii[reach.moving]))

@@ -1,4 +1,4 @@
-"""Barrier rows of III-E: moving spheres against the scene, and pairs of spheres; larger people, and rates dd/dt."""
+"""Barrier rows of III-E: moving spheres against the scene, pairs of spheres, people; rates dd/dt."""
 
 from collections.abc import Callable
 from copy import copy
@@ -41,16 +41,15 @@ class SceneRows(BarrierTerm):
         self._links = np.array(model.sphere_set.links)[self._moving]
 
     def in_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
-        """Return the rows in another field, of `balls` (None: links' surfaces do not count)."""
+        """Rows in another field, of `balls` (None: links' surfaces do not count)."""
         other = copy(self)
         other._field, other._balls = field, balls
         return other
 
     def by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
-        """Return distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
+        """Distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
 
-        Where that gap is larger, rows G (M, J) become its rows, in place. They keep `config.margin` from the surface,
-        wherever the sphere moves.
+        Where that gap is larger, rows G (M, J) become its rows, in place.
         """
         if self._balls is None or not chosen.any():
             return distance
@@ -65,7 +64,7 @@ class SceneRows(BarrierTerm):
         return distance
 
     def rows(self, state: State) -> Barrier:
-        """Return the rows; gradient and distance come from one query of one function."""
+        """Rows, by one query of distance and gradient."""
         centers, jacobians = state.spheres
         distance, gradient = self._queried(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
@@ -74,10 +73,10 @@ class SceneRows(BarrierTerm):
         return self._barrier(self._moving, G, h, distance)
 
     def cut(self, state: State, velocity: Float64, chosen: Integers, distance: Float64) -> Barrier:
-        """Return rows of `chosen` spheres against their nearest surfaces after a period of `velocity` (J,).
+        """Rows of `chosen` spheres against their nearest surfaces after a period of `velocity` (J,).
 
-        The distance to such a surface is linearised at that later place. This is conservative for a surface that is
-        convex seen from there, such as a ball. At the state it counts as at least `distance` (M,), the present one.
+        The distance to such a surface is linearised there: conservative for a surface convex as seen from there, such
+        as a ball. At the state it counts as at least the present `distance` (M,).
         """
         period = self._config.period
         q = state.q + period * velocity
@@ -91,7 +90,7 @@ class SceneRows(BarrierTerm):
         return self._barrier(chosen, G, h, now)
 
     def distances(self, centers: Float64) -> Float64:
-        """Return distances (M,) [m]; NaN where unknown, which breaks a row's promise."""
+        """Distances (M,) [m]; NaN where unknown, which breaks a row's promise."""
         return self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii
 
     def _barrier(self, index: Integers, G: Float64, h: Float64, distance: Float64) -> Barrier:
@@ -127,9 +126,9 @@ class SelfRows(BarrierTerm):
         self.names = tuple(f"{names[a]}~{names[b]}" for a, b in self._pairs)
 
     def rows(self, state: State) -> Barrier:
-        """Return the rows.
+        """Rows of the pairs.
 
-        Where joints stop at once, G is zero for pairs too slow to use up h: no velocity of the box makes them bind.
+        Where joints stop at once, G is zero for pairs too slow to use up h.
         """
         centers, jacobians = state.spheres
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
@@ -164,10 +163,9 @@ class SelfRows(BarrierTerm):
 
 
 def scene_margin(model: RobotModel, config: ControlConfig) -> Float64:
-    """Return spheres' scene margins (S,) [m]: epsilon, plus deficits if `config.coverage` is "margin".
+    """Spheres' scene margins (S,) [m]: epsilon, plus deficits if `config.coverage` is "margin".
 
-    The surface is within that deficit of a sphere, so by the triangle inequality it keeps epsilon for any 1-Lipschitz
-    distance.
+    By the triangle inequality, the surface then keeps epsilon for any 1-Lipschitz distance.
     """
     deficit = np.asarray(model.sphere_deficit) if config.coverage == MARGIN else np.zeros(len(model.moving_spheres))
     return config.margin + deficit
@@ -181,10 +179,10 @@ def distance_bound(
     G: Float64,
     rate: float | Float64 = 0.0,
 ) -> Float64:
-    """Return h (M,), with the braking distance where joints cannot stop at once.
+    """h (M,), with the braking distance where joints cannot stop at once.
 
-    Only then G (M, J) counts. A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it counts,
-    because it changes on the way and other rows share it. rate [m/s]: dd/dt of a field that changes with time.
+    Only then G (M, J) counts. A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it counts.
+    rate [m/s]: dd/dt of a changing field.
     """
     if acceleration is None:
         return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)
@@ -193,32 +191,32 @@ def distance_bound(
 
 
 def external_gradient(gradient: Float64, jacobians: Float64) -> Float64:
-    """Return ``dd/dq`` (M, J): gradient (M, 3), not normalised, times Jacobians (M, 3, J)."""
+    """``dd/dq`` (M, J): gradient (M, 3), not normalised, times Jacobians (M, 3, J)."""
     return np.asarray(np.matmul(gradient[:, None, :], jacobians)[:, 0, :])
 
 
 def pair_gradient(direction: Float64, jacobians: Float64, pairs: Integers) -> Float64:
-    """Return ``dd/dq`` (P, J) of sphere pairs; jacobians (S, 3, J)."""
+    """``dd/dq`` (P, J) of sphere pairs; jacobians (S, 3, J)."""
     return np.asarray(np.matmul(direction[:, None, :], jacobians[pairs[:, 0]] - jacobians[pairs[:, 1]])[:, 0, :])
 
 
 def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, rate: float | Float64 = 0.0) -> Float64:
-    """Return h (M,): ``alpha (d - epsilon) + dd/dt`` [m/s]; rate: dd/dt of a field that changes with time."""
+    """h (M,): ``alpha (d - epsilon) + dd/dt`` [m/s]; rate: dd/dt of a changing field."""
     return np.asarray(gain * (distance - margin) + rate)
 
 
 def fastest_approach(G: Float64, lowest: Float64, highest: Float64) -> Float64:
-    """Return the largest G v (M,) [m/s] over the box of joint velocities."""
+    """Largest G v (M,) [m/s] over the box of joint velocities."""
     return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1))
 
 
 def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> Bool:
-    """True for rows (M,) that some velocity of the box violates; to drop the others changes no solution."""
+    """True for rows (M,) that some velocity of the box violates; others change no solution."""
     return np.asarray(fastest_approach(G, lowest, highest) > h)
 
 
 def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Float64:
-    """Return upper bounds (S,) [m/s] on the spheres' speeds over the box; jacobians (S, 3, J)."""
+    """Upper bounds (S,) [m/s] on the spheres' speeds over the box; jacobians (S, 3, J)."""
     speed = np.abs(jacobians) @ np.maximum(np.abs(lowest), np.abs(highest))
     return np.asarray(np.sqrt(np.einsum("si,si->s", speed, speed)))
 
@@ -242,10 +240,9 @@ SceneStepAt = Callable[[int], SceneStep | None]
 
 
 def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
-    """Return dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
+    """dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
 
-    Clipped to [-limit, 0], so a row is only ever tightened; missing distances give 0. The past rate holds until the
-    next scene.
+    Clipped to [-limit, 0]; missing distances give 0. The past rate holds until the next scene.
     """
     if step is None:
         return 0.0
@@ -256,7 +253,7 @@ def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> floa
 def rate_of(
     config: ControlConfig, model: RobotModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
 ) -> float | Float64:
-    """Return the configured dd/dt of the moving spheres at a posture (J,) and stamp."""
+    """Configured dd/dt of the moving spheres at a posture (J,) and stamp."""
     step = None if scene_step_at is None or config.distance_rate == "none" else scene_step_at(stamp_ns)
     if step is None:
         return 0.0
@@ -267,8 +264,7 @@ def rate_of(
 class PeopleGrown:
     """min(scene, people - extra): a field in which people extend `extra` [m] farther.
 
-    At epsilon or more, the scene is at least epsilon away, and people epsilon + extra. Distance and gradient are the
-    smaller one's.
+    Distance and gradient are the smaller one's.
     """
 
     def __init__(self, scene: DistanceField, people: DistanceField, extra: float) -> None:
@@ -285,7 +281,7 @@ class PeopleGrown:
 
 
 def guarded(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
-    """Return the field from which a controller keeps `config.margin`.
+    """Field from which a controller keeps `config.margin`.
 
     People count as nearer by `config.human_margin` less the margin.
     """

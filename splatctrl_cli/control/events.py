@@ -56,7 +56,7 @@ SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures with shown events,
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """Nearest obstacle: distance [m] of its surface to a point, place (3,) [m], world.
+    """Nearest obstacle: distance [m] of its surface to a point; place (3,) [m], world.
 
     splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: of a grid; name: of others.
     """
@@ -81,10 +81,10 @@ class Obstacle:
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """An interval of consecutive states with its worst value.
+    """An interval of successive states with its worst value.
 
-    names: in order of appearance, at most MAX_NAMES of num_names; source: the field, or empty; state: index of the
-    worst state; worst_name, obstacle: at that state.
+    names: in order, at most MAX_NAMES of num_names; source: the field, or empty; state: index of the worst state;
+    worst_name, obstacle: there.
     """
 
     kind: EventKind
@@ -114,7 +114,6 @@ class OneEach:
         return [self.names[int(self.index[i])]]
 
     def over(self, first: int, end: int) -> Sequence[str]:
-        """Return each name of these states once, in order."""
         found, at = np.unique(self.index[first:end], return_index=True)
         return [self.names[int(i)] for i in found[np.argsort(at)]]
 
@@ -134,20 +133,19 @@ class Signal:
     source: str = ""
 
     def names_over(self, first: int, end: int) -> Iterable[str]:
-        """Return the names at these states, in order."""
         if isinstance(self.names_at, OneEach):
             return self.names_at.over(first, end)
         return (name for i in range(first, end) for name in self.names_at(i))
 
 
 def runs_of(is_on: Bool) -> list[tuple[int, int]]:
-    """Return first and one past the last index of each run of true values (T,)."""
+    """First and one past the last index of each run of true values (T,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_on, [False]]).astype(np.int8)))
     return [(int(first), int(end)) for first, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def events_of(stamp_ns: Stamps, signals: Iterable[Signal]) -> tuple[Event, ...]:
-    """Return the intervals of all signals (T,), by start."""
+    """Intervals of all signals (T,), by start."""
     fold = EventFold()
     fold.add(stamp_ns, signals)
     return fold.events()
@@ -158,7 +156,7 @@ Near = Callable[[EventKind, str, int], Obstacle | None]
 
 
 class EventFold:
-    """Intervals of signals in blocks of states; an interval may cross blocks."""
+    """Intervals of signals in blocks of states; an interval may span blocks."""
 
     def __init__(self) -> None:
         self._num, self._start_ns = 0, 0
@@ -168,7 +166,7 @@ class EventFold:
     def add(self, stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> None:
         """Add a block of stamps (T,) and signals (T,), in the same order each time.
 
-        near: gives the obstacle of each worst value here.
+        near: the obstacle of a worst value.
         """
         if not self._num:
             self._start_ns = int(stamp_ns[0])
@@ -188,14 +186,14 @@ class EventFold:
         self._num += len(stamp_ns)
 
     def events(self) -> tuple[Event, ...]:
-        """Return all intervals so far, by start; an open one ends with the last state."""
+        """All intervals so far, by start; an open one ends with the last state."""
         events = sorted([*self._closed, *self._open.items()], key=lambda e: (e[1].first_ns, -e[1].last_ns, e[0]))
         return tuple(replace(event, names=event.names[:MAX_NAMES]) for _, event in events)
 
     def _grown(
         self, before: Event | None, stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None
     ) -> Event:
-        """Return `before` (None: a new event) with the states [first, end) of this block."""
+        """`before` (None: a new event) with the states [first, end) of this block."""
         values = signal.value[first:end]
         at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
         worst = float(signal.value[at])
@@ -219,17 +217,14 @@ class EventFold:
 
 
 def first_intervention(events: Sequence[Event]) -> Event | None:
-    """Return the earliest event in which the controller deviated from its request."""
+    """Earliest event in which the controller deviated from its request."""
     return next((event for event in events if event.kind in INTERVENTIONS), None)
 
 
 def audit_signals(
     audit: AuditTrace, margin: float, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str] = ()
 ) -> list[Signal]:
-    """Return signals of T audited states: clearance, limits, known space.
-
-    pairs: names of possible self-collisions.
-    """
+    """Signals of T audited states: clearance, limits, known space."""
     signals = []
     for source, clearance in audit.clearance.items():
         signals += clearance_signals(source, clearance.distance, clearance.sphere, margin, spheres)
@@ -259,7 +254,7 @@ def audit_signals(
 def clearance_signals(
     source: str, distance: Float64, sphere: Index, margin: float, spheres: Sequence[str]
 ) -> list[Signal]:
-    """Return signals below the margin and in contact, by the nearest sphere's clearance (T,) [m]."""
+    """Signals below the margin and in contact, by the nearest sphere's clearance (T,) [m]."""
     names = OneEach(names=spheres, index=sphere)
     return [
         _low(kind, distance < bound, distance, names, source)
@@ -268,7 +263,7 @@ def clearance_signals(
 
 
 def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
-    """Return signals of joint velocity and acceleration above their limits."""
+    """Signals of joint velocity and acceleration above their limits."""
     return [
         Signal(kind=kind, is_on=value > 1, value=value, names_at=OneEach(names=joints, index=joint))
         for kind, value, joint in (
@@ -279,7 +274,7 @@ def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
 
 
 def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[Signal]:
-    """Return signals between states: clearance bound (T,) [m] below the margin, unbounded time (T,) [s]."""
+    """Signals between states: clearance bound (T,) [m] below the margin, unbounded time (T,) [s]."""
     is_low = lower < margin
     return [
         _low(EventKind.BETWEEN_STATES, is_low, lower, _nobody),
@@ -288,12 +283,12 @@ def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[
 
 
 def stale_signal(age_s: Float64, max_age_s: float) -> Signal:
-    """Return the signal of a stale scene; age_s (T,) [s], NaN for an unstamped scene."""
+    """Signal of a stale scene; age_s (T,) [s], NaN for an unstamped scene."""
     return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s), names_at=_nobody)
 
 
 def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
-    """Return signals of the controller's steps at T states; None: no step."""
+    """Signals of the controller's steps at T states; None: no step."""
 
     def relaxed(i: int) -> Sequence[str]:
         return [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)]

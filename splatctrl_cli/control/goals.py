@@ -27,7 +27,7 @@ class Guide:
 
 
 def rotation_vector(R: Float64) -> Float64:
-    """Return the logarithm (3,) [rad] of a rotation (3, 3): axis times angle in [0, pi]."""
+    """Logarithm (3,) [rad] of a rotation (3, 3): axis times angle in [0, pi]."""
     quat_xyzw = quat_from_rotation(R)
     half_sine = float(np.linalg.norm(quat_xyzw[:3]))
     if half_sine == 0.0:
@@ -36,13 +36,13 @@ def rotation_vector(R: Float64) -> Float64:
 
 
 def pose_error(T_world_frame: Float64, T_world_goal: Float64) -> Float64:
-    """Return the twist (6,) [m, rad], world, that reaches the goal in one second."""
+    """Twist (6,) [m, rad], world, that reaches the goal in one second."""
     rotation = rotation_vector(T_world_goal[:3, :3] @ T_world_frame[:3, :3].T)
     return np.concatenate([T_world_goal[:3, 3] - T_world_frame[:3, 3], rotation])
 
 
 def reference_velocity(error: Float64, *, gain: float, max_linear: float, max_angular: float) -> Float64:
-    """Return gain times the pose error (6,) [m/s, rad/s], each part capped in norm."""
+    """Gain times the pose error (6,) [m/s, rad/s], each part capped in norm."""
     velocity = gain * error
     return np.concatenate([_capped(velocity[:3], max_linear), _capped(velocity[3:], max_angular)])
 
@@ -62,11 +62,10 @@ class LoggedMotion:
 
     @property
     def last_ns(self) -> int:
-        """Stamp of the last state."""
         return int(self.stamp_ns[-1])
 
     def at(self, stamp_ns: int) -> tuple[Float64, Float64]:
-        """Return position and velocity (J,) at a stamp, linear between states.
+        """Position and velocity (J,) at a stamp, linear between states.
 
         Before all states it is the first; after all, the last, at rest.
         """
@@ -83,13 +82,13 @@ class LoggedMotion:
         return position, velocity
 
     def goal_at(self, model: RobotModel, frame: str, stamp_ns: int) -> tuple[Float64, Guide]:
-        """Return a frame's logged pose (4, 4) and motion at a stamp."""
+        """A frame's logged pose (4, 4) and motion at a stamp."""
         position, velocity = self.at(stamp_ns)
         return guided_goal(model, frame, position, velocity)
 
 
 def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
-    """Return a frame's pose (4, 4) and motion at a posture and velocity (J,)."""
+    """A frame's pose (4, 4) and motion at a posture and velocity (J,)."""
     return model.frame_pose(position, frame), Guide(
         twist=model.frame_jacobian(position, frame) @ velocity, posture=position, velocity=velocity
     )
@@ -113,7 +112,7 @@ class TimedPath:
         return float(self.start_time[-1])
 
     def at(self, time: Floats | float) -> tuple[Float64, Float64]:
-        """Return position and velocity (K, J) at times (K,) [s]; at rest outside the path."""
+        """Position and velocity (K, J) at times (K,) [s]; at rest outside the path."""
         clock = np.clip(np.atleast_1d(np.asarray(time, dtype=np.float64)), 0.0, self.duration)
         edge = np.clip(np.searchsorted(self.start_time, clock, side="right") - 1, 0, len(self.top_speed) - 1)
         speed, gain = self.top_speed[edge], self.acceleration[edge]
@@ -137,11 +136,10 @@ class Detour:
 
     @property
     def is_over(self) -> bool:
-        """True at the path's end."""
         return self.clock >= self.path.duration
 
     def goal(self, model: RobotModel, frame: str) -> tuple[Float64, Guide]:
-        """Return a frame's pose (4, 4) and motion at the clock's time."""
+        """`guided_goal` at the clock's time."""
         position, velocity = self.path.at(self.clock)
         return guided_goal(model, frame, position[0], velocity[0])
 
@@ -157,9 +155,9 @@ PlanDetour = Callable[[int, Float64, Float64], Detour | None]
 
 @dataclass(frozen=True, kw_only=True)
 class TwistTrack:
-    """N twists (N, 6) [m/s, rad/s] of the controlled frame, linear first.
+    """Twists (N, 6) [m/s, rad/s] of the controlled frame, linear first.
 
-    stamp_ns (N,) increases; axes: the frame whose axes the twists use, which turns with the arm (None: world).
+    stamp_ns (N,) increases; axes: the frame whose axes the twists use (None: world).
     """
 
     stamp_ns: Stamps
@@ -167,7 +165,7 @@ class TwistTrack:
     axes: str | None = None
 
     def at(self, stamp_ns: int, timeout: float) -> Float64:
-        """Return the newest twist (6,) up to a stamp [ns]; zero if none or older than `timeout` [s]."""
+        """Newest twist (6,) up to a stamp [ns]; zero if none or older than `timeout` [s]."""
         index = int(np.searchsorted(self.stamp_ns, stamp_ns, side="right")) - 1
         if index < 0 or (stamp_ns - self.stamp_ns[index]) * 1e-9 > timeout:
             return np.zeros(6)
@@ -180,7 +178,7 @@ class TwistTrack:
         return np.asarray((index >= 0) & (age <= timeout))
 
     def asked(self, model: RobotModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
-        """Return a stamp's twist (6,) in world axes at q (J,), not capped."""
+        """A stamp's twist (6,) in world axes at q (J,), not capped."""
         twist = self.at(stamp_ns, timeout)
         if self.axes is None:
             return twist
@@ -188,7 +186,7 @@ class TwistTrack:
         return np.concatenate([R @ twist[:3], R @ twist[3:]])
 
     def reference(self, model: RobotModel, config: ControlConfig, q: Float64, stamp_ns: int) -> Float64:
-        """Return the twist (6,), world, each part capped in norm."""
+        """`asked`, each part capped in norm."""
         return reference_velocity(
             self.asked(model, q, stamp_ns, config.twist_timeout),
             gain=1.0,
@@ -199,7 +197,7 @@ class TwistTrack:
     def goal_at(
         self, model: RobotModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
     ) -> tuple[Float64, Guide]:
-        """Return the frame's own pose (4, 4), moving with the twist, without a posture."""
+        """Frame's own pose (4, 4), moving with the twist, without a posture."""
         return model.frame_pose(q, frame), Guide(
             twist=self.reference(model, config, q, stamp_ns), posture=q, velocity=np.zeros(len(q))
         )

@@ -42,7 +42,7 @@ class VelocityLimits:
     upper: Float64
 
     def at(self, q: Float64) -> tuple[Float64, Float64]:
-        """Return lowest and highest velocity (J,), (J,) [rad/s]; zero lies between."""
+        """Lowest and highest velocity (J,), (J,) [rad/s]; zero lies between."""
         return -self._towards(q - self.lower), self._towards(self.upper - q)
 
     def _towards(self, room: Float64) -> Float64:
@@ -51,7 +51,7 @@ class VelocityLimits:
 
 
 def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
-    """Return the limits of the FR3's joints, matched by the ends of their names.
+    """Limits of the FR3's joints, matched by the ends of their names.
 
     Raises UsageError for other names or duplicates.
     """
@@ -68,15 +68,15 @@ def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
 
 
 def braking_speed(room: Float64, gain: float, deceleration: Float64, period: float) -> Float64:
-    """Return the highest speed (M,) into room (M,) that never requires harder braking later.
+    """Highest speed (M,) into room (M,) that never requires harder braking later.
 
-    Up to ``v = a / alpha`` the linear bound ``alpha r`` itself needs at most the deceleration a (M,), inf without a
-    limit. Faster, the room must hold the way to that speed at a, and one period more:
+    Up to ``v = a / alpha`` the linear bound ``alpha r`` needs at most the deceleration a (M,), inf without a limit.
+    Faster, the room must hold the way to that speed at a, and one period more:
 
         r(v) = a / alpha^2 + (v^2 - a^2 / alpha^2) / (2 a) + (v - a / alpha) dt,
 
-    which is continuous at a / alpha. Along it ``r(v - a dt) <= r(v) - v dt``: after a step at v, the room left allows
-    v - a dt. Never above ``alpha r``, so that bound's guarantee holds; equal to it where r < 0.
+    continuous at a / alpha. Along it ``r(v - a dt) <= r(v) - v dt``: after a step at v, the room left allows v - a
+    dt. Never above ``alpha r``; equal to it where r < 0.
     """
     linear = gain * room
     knee = deceleration / gain
@@ -107,9 +107,9 @@ class JointLimits:
 
     @classmethod
     def of(cls, model: RobotModel, config: ControlConfig) -> "JointLimits":
-        """Return an arm's configured limits.
+        """An arm's configured limits.
 
-        Raises UsageError for a wrong number of accelerations, or for other joints than an FR3's with its limits.
+        Raises UsageError for a wrong number of accelerations, or FR3 limits for other joints.
         """
         return cls(
             lower=model.lower,
@@ -122,11 +122,10 @@ class JointLimits:
         )
 
     def box(self, q: Float64, last_velocity: Float64 | None = None) -> tuple[Float64, Float64]:
-        """Return lowest and highest joint velocity (J,), (J,) [rad/s] at q.
+        """Lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
-        Without last_velocity no acceleration counts. An acceleration in conflict with velocity and position yields to
-        the nearest velocity within those, so the box is never empty. From a state that this box led to it never
-        yields, unless by_position is stricter.
+        Without last_velocity no acceleration counts. An acceleration in conflict with velocity and position yields:
+        the box is never empty. From a state that this box led to it never yields, unless by_position is stricter.
         """
         lowest, highest = velocity_box(
             q, self.lower, self.upper, self.velocity, self.gain, acceleration=self.acceleration, period=self.period
@@ -140,7 +139,7 @@ class JointLimits:
         return (np.clip(last_velocity - change, lowest, highest), np.clip(last_velocity + change, lowest, highest))
 
     def rest(self, last_velocity: Float64 | None) -> Float64:
-        """Return standstill (J,) [rad/s]: zero, or the nearest that the acceleration allows."""
+        """Standstill (J,) [rad/s]: zero, or the nearest that the acceleration allows."""
         if self.acceleration is None or last_velocity is None:
             return np.zeros(len(self.lower))
         change = self.acceleration * self.period
@@ -157,11 +156,11 @@ def velocity_box(
     acceleration: Float64 | None = None,
     period: float = 0.0,
 ) -> tuple[Float64, Float64]:
-    """Return lowest and highest joint velocity (J,), (J,) [rad/s] at q.
+    """Lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
     III-E: ``v <= alpha (q_max - q)``, ``v >= -alpha (q - q_min)``, ``|v| <= v_max``, alpha the gain [1/s]; with an
-    acceleration (J,) [rad/s^2], `braking_speed` of that room. Clipping into the velocity range keeps the box
-    non-empty for q outside its limits: there it demands the way back, at the velocity limit when far.
+    acceleration (J,) [rad/s^2], `braking_speed` of that room. For q outside its limits, the box demands the way back,
+    at most at the velocity limit.
     """
     above, below = upper - q, q - lower
     if acceleration is None:
@@ -175,7 +174,7 @@ def velocity_box(
 
 
 def box_rows(lowest: Float64, highest: Float64) -> Rows:
-    """Return the box as rows ``G v <= h``: J upper, then J lower."""
+    """Box as rows ``G v <= h``: J upper, then J lower."""
     identity = np.eye(len(lowest))
     return np.vstack([identity, -identity]), np.concatenate([highest, -lowest])
 
@@ -196,7 +195,7 @@ def _acceleration(value: float | tuple[float, ...], joints: Sequence[str]) -> Fl
 class Strain:
     """Largest velocity (T,) as a share of its joint's limit, at joint (T,); likewise acceleration.
 
-    Acceleration is 0 without a limit.
+    Acceleration: 0 without a limit.
     """
 
     velocity: Float64
@@ -219,7 +218,7 @@ class MotionLimits:
         self._positions: Float64 = np.zeros((0, len(velocity_limit)))
 
     def add(self, stamps: Stamps, positions: Float64) -> Strain:
-        """Return the strain of the next states: stamps (T,) [ns], positions (T, J)."""
+        """Strain of the next states: stamps (T,) [ns], positions (T, J)."""
         num = len(stamps)
         all_stamps = np.concatenate([self._stamps, stamps])
         everything = np.concatenate([self._positions, positions])

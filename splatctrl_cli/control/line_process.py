@@ -1,4 +1,4 @@
-"""An external process that answers line by line, with named faults and bounded time and memory."""
+"""An external process that answers line by line, with named faults and bounded resources."""
 
 import os
 import selectors
@@ -15,8 +15,6 @@ TAIL = 4096  # bytes of stderr to keep
 
 
 class Fault(StrEnum):
-    """Fault of a controller."""
-
     LATE = "late"
     HUNG = "hung"
     OUT_OF_TIME = "out of time"
@@ -59,7 +57,10 @@ class LineProcess:
             self._selector.register(number, selectors.EVENT_READ)
 
     def exchange(self, line: bytes, limit: float) -> bytes:
-        """Send a line and return the next one. Raises Misbehaved without a line within `limit` [s], or at the end."""
+        """Send a line and return the next one.
+
+        Raises Misbehaved without a line within `limit` [s], or at the end.
+        """
         deadline = time.monotonic() + limit
         if not self._unsent:
             self._selector.register(self._stdin, selectors.EVENT_WRITE)
@@ -76,7 +77,7 @@ class LineProcess:
         return answer
 
     def last_words(self) -> str:
-        """Return the last stderr line to append to a sentence, or nothing."""
+        """Last stderr line to append to a sentence, or nothing."""
         lines = [line.strip() for line in self._tail.decode("utf-8", "replace").splitlines() if line.strip()]
         return f": {shown(lines[-1])}" if lines else ""
 
@@ -91,7 +92,7 @@ class LineProcess:
         self._kill()
 
     def _has_left(self, seconds: float) -> bool:
-        """True if it ends by itself in time. It is not reaped, so its number stays reserved."""
+        """True if it ends by itself in time. It is not reaped: its number stays reserved."""
         deadline, how = time.monotonic() + seconds, os.WEXITED | os.WNOWAIT | os.WNOHANG
         while self._process.returncode is None and os.waitid(os.P_PID, self._process.pid, how) is None:
             if time.monotonic() > deadline:
@@ -144,6 +145,6 @@ class LineProcess:
 
 
 def shown(text: str) -> str:
-    """Return a program's words: short, on one line, without terminal controls."""
+    """A program's words: short, on one line, without terminal controls."""
     printable = "".join(c if c.isprintable() else "?" for c in text[:120])
     return f"{printable} ..." if len(text) > 120 else printable

@@ -1,7 +1,6 @@
 """Camera evidence near a moving arm: each point within the margin has one class.
 
-The arm's inside is never seen. The points form a lattice outside the robot, near its moving links' triangles, else
-spheres.
+The points form a lattice outside the robot, near its moving links' triangles, else spheres.
 """
 
 from collections.abc import Callable
@@ -29,8 +28,7 @@ class Seen:
 
     look: points (Q, 3) [m], world -> stamps (Q,) [ns] of the last depth through or on them, -1 never, and
     `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: centre and radius of balls into which a
-    surface may extend past its lost edge. origin (3,), voxel [m]: of the underlying voxels; is_free (X, Y, Z): as in
-    `SeenVoxels`.
+    surface may extend. origin (3,), voxel [m]: of the voxels; is_free (X, Y, Z): as in `SeenVoxels`.
     """
 
     look: Callable[[Float64], tuple[Index, UInt8]]
@@ -48,8 +46,8 @@ class Account:
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
     unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place;
     blind_to_surface [m]: likewise, about spheres with almost only such points (`NEAR_BLIND`). Infinite and NaN
-    without any. age [s]: quantile `NEAR_FRESH_SHARE` of seen points' ages; ahead [s]: from the state to the latest
-    view. NaN without views.
+    without any. age [s]: quantile `NEAR_FRESH_SHARE` of seen points' ages; ahead [s]: to the latest view. NaN without
+    views.
     """
 
     shares: Float64
@@ -80,7 +78,7 @@ class NearSpace:
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres at the last evaluation
 
     def due(self, stamps: Index, centers: Float64) -> dict[int, bool]:
-        """Return indices of states to evaluate; True if their ages count.
+        """Indices of states to evaluate; True if their ages count.
 
         A state is due once a sphere has moved by `NEAR_MOVED`, and (True) every `NEAR_EVERY_NS`. stamps (T,) [ns]
         never go back; centers (T, S, 3).
@@ -100,7 +98,7 @@ class NearSpace:
         return bool(np.sum((centers - self._looked) ** 2, axis=1).max(initial=0.0) >= fixed.NEAR_MOVED**2)
 
     def on_the_way(self, first: Float64, last: Float64) -> Float64:
-        """Return postures (K, J) in between, so dense that no sphere moves by `NEAR_MOVED`."""
+        """Postures (K, J) in between, so dense that no sphere moves by `NEAR_MOVED`."""
         begin, end = self._model.sphere_centers_batch(np.stack([first, last]))[:, self._moving]
         num = int(np.ceil(np.linalg.norm(end - begin, axis=1).max(initial=0.0) / fixed.NEAR_MOVED))
         return np.asarray(first + (last - first) * (np.arange(1, num) / max(num, 1))[:, None])
@@ -108,7 +106,7 @@ class NearSpace:
     def look(
         self, stamp_ns: int, q: Float64, known: Seen, distance: Callable[[Float64], Float64] | None = None
     ) -> Account:
-        """Return the evidence at posture q (J,); distance: to the map's surfaces."""
+        """Evidence at posture q (J,); distance: to the map's surfaces."""
         centers, voxels = self._model.sphere_centers(q), fixed.NEAR_LATTICE / known.voxel
         # A multiple or a part of a voxel.
         step = float(known.voxel * np.ceil(voxels - 1e-6) / np.ceil(1 / voxels - 1e-6))

@@ -34,8 +34,8 @@ class OpenLoopTask:
 class OpenLoopTrace:
     """T states: the controller's step, and the room that the logged velocity left.
 
-    Both are None where the field has no distance; the step is None also after the commander's end. logged, commanded
-    (T, J) [rad/s]; commanded is NaN without a step.
+    Both are None where the field has no distance; the step also after the commander's end. logged, commanded (T, J)
+    [rad/s]; commanded: NaN without a step.
     """
 
     logged: Float64
@@ -62,8 +62,7 @@ def open_loop(
 ) -> OpenLoopTrace:
     """Ask the commander at every logged state, in the field known then; nothing is integrated.
 
-    For the logged motion, command and logged velocity differ only where a row shapes it: the intervention.
-    has_distance (T,): False skips a state. scene_step_at as in `closed_loop`.
+    has_distance (T,): False skips a state. scene_step_at: as in `closed_loop`.
     """
     field = field_at(int(motion.stamp_ns[0]))
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
@@ -100,7 +99,7 @@ def open_loop(
 def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:
     """True if a row (of a kind) shapes the command.
 
-    Without a kind also any fallback or scaling counts. False for external controllers, whose reasons are unknown.
+    Without a kind, any fallback or scaling counts, too. False for external controllers.
     """
     if step is None or step.rung is Rung.OUTSIDE:
         return False

@@ -1,7 +1,4 @@
-"""External controllers: processes that answer JSON lines (docs/controllers.md).
-
-`user_controller.serve` serves a Python class in the same way.
-"""
+"""External controllers: processes that answer JSON lines (docs/controllers.md)."""
 
 import json
 import math
@@ -45,10 +42,10 @@ class Failure:
 
 
 class Program(LineProcess):
-    """A controller process with the lines of docs/controllers.md."""
+    """A controller process (docs/controllers.md)."""
 
     def __init__(self, name: str, command: Sequence[str], start: Document, step_limit: float) -> None:
-        """Start it with `start`. Raises InputError if it cannot start or is no controller."""
+        """Start it with the line `start`. Raises InputError if it cannot or is no controller."""
         self._step_limit, self._seconds, self._num = step_limit, 0.0, 0
         self.spent = 0.0  # [s] on the last step
         try:
@@ -75,7 +72,7 @@ class Program(LineProcess):
     def velocity(
         self, question: Document, rows: Callable[[], list[Document]], limits: Mapping[str, float]
     ) -> Float64:
-        """Return the answer (J,) [rad/s], sending rows on request. Raises Misbehaved.
+        """Answer (J,) [rad/s], sending rows on request. Raises Misbehaved.
 
         limits (J) [rad/s]: by joint.
         """
@@ -106,9 +103,9 @@ class Program(LineProcess):
 
 
 class OutsideController(Commander, AbstractContextManager["OutsideController"]):
-    """The `Commander` of a user's controller, or of two copies that must agree to the bit.
+    """The `Commander` of a user's controller, or of two that agree to the bit.
 
-    num_answers, seconds, slowest: count of answers, total and longest time [s].
+    num_answers; seconds, slowest: total and longest time [s].
     """
 
     def __init__(

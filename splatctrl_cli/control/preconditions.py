@@ -47,7 +47,7 @@ def check_coverage(model: RobotModel, config: ControlConfig) -> None:
 
 
 def checked_posture(model: RobotModel, q: Float64, *, what: str = "joint positions") -> Float64:
-    """Return q as (J,) float64. Raises InputError for another size or a non-finite value."""
+    """q as (J,) float64. Raises InputError for another size or a non-finite value."""
     posture = np.asarray(q, dtype=np.float64)
     if posture.shape != (len(model.joint_names),):
         names = ", ".join(model.joint_names)
@@ -74,7 +74,7 @@ def check_within_limits(model: RobotModel, q: Float64, tolerance: float, what: s
 def check_free(
     model: RobotModel, field: DistanceField, q: Float64, distance_to: DistanceFunction | None = None
 ) -> None:
-    """Raise NotEvaluableError for a start q (J,) in collision, naming the deepest sphere.
+    """Raise NotEvaluableError for a start q (J,) in collision.
 
     distance_to: exact distance, by which link surfaces decide (`part_clearances`).
     """
@@ -106,7 +106,7 @@ def check_goal(model: RobotModel, T_world_goal: Float64) -> None:
 def static_violations(
     model: RobotModel, field: DistanceField, q: Float64, margin: float | Float64
 ) -> tuple[StaticViolation, ...]:
-    """Return fixed spheres within the margin [m], one or (S,): mounting, not control."""
+    """Fixed spheres within the margin [m], one or (S,): mounting, not control."""
     if np.all(model.moving_spheres):
         return ()
     still, distance = sphere_clearance(model, field, q, ~np.asarray(model.moving_spheres))
@@ -119,7 +119,7 @@ def static_violations(
 
 
 def sphere_clearance(model: RobotModel, field: DistanceField, q: Float64, chosen: Bool) -> tuple[Integers, Float64]:
-    """Return indices (M,) of chosen spheres and their surfaces' distances (M,) [m] at q (J,)."""
+    """Indices (M,) of chosen spheres and their surfaces' distances (M,) [m] at q (J,)."""
     index = np.flatnonzero(chosen)
     distance = field.query(np.ascontiguousarray(model.sphere_centers(q)[index]))[0]
     return index, distance - model.sphere_set.radii[index]
@@ -130,12 +130,11 @@ WasFree = Callable[[Float64], UInt8]
 
 
 class FixedParts:
-    """`found`: each fixed sphere's clearance [m] in the first scene, and its least, later arrivals included.
+    """`found`: each fixed sphere's first clearance [m], and its least, later arrivals included.
 
-    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it; near a sphere at its mount, where
-    the map grows, within MOUNTED_CHANGE. It is nearer than the first clearance by as much, and its voxel was free in
-    a scene before: else it fills a hole of the map. The last scene had it too: noise is in one scene alone. A link's
-    triangles count where they are farther away.
+    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it (MOUNTED_CHANGE near a mount). It
+    is nearer than the first clearance by as much, and the last scene had it too. Its voxel was free in a scene
+    before: else it fills a hole of the map. A link's triangles count where they are farther away.
     """
 
     def __init__(self, model: RobotModel, near: float) -> None:
@@ -148,7 +147,7 @@ class FixedParts:
         self.found: dict[str, tuple[float, float]] = {}
 
     def look(self, distance_to: DistanceFunction, q: Float64, was_free: WasFree | None) -> None:
-        """Add the next scene, at q (J,). was_free: None if unknown."""
+        """Add the next scene, at q (J,); was_free: None if unknown."""
         if not len(self._still):
             return
         centers = np.ascontiguousarray(self._model.sphere_centers(q)[self._still])

@@ -43,7 +43,7 @@ class Residuals:
 
 @dataclass(frozen=True, kw_only=True)
 class QpSolution:
-    """z (V,), row multipliers (M,) >= 0, the solver's status, and residuals that we computed."""
+    """z (V,), row multipliers (M,) >= 0, the solver's status, and our residuals."""
 
     z: Float64
     multipliers: Float64
@@ -57,7 +57,7 @@ QpSolver = Callable[[QuadraticProgram], QpSolution]
 
 
 def residuals(program: QuadraticProgram, z: Float64, multipliers: Float64) -> Residuals:
-    """Return a candidate's KKT residuals; infinite if it is not finite."""
+    """A candidate's KKT residuals; infinite if it is not finite."""
     if not (np.all(np.isfinite(z)) and np.all(np.isfinite(multipliers))):
         return Residuals(primal=np.inf, dual=np.inf, gap=np.inf)
     Hz, Gy = program.H @ z, program.G.T @ multipliers
@@ -112,7 +112,7 @@ DAQP_STATUS: Mapping[int, str] = {
 
 
 def solve_daqp(program: QuadraticProgram) -> QpSolution:
-    """Solve by DAQP, a dual active-set method: exact to rounding at this size, several times faster."""
+    """Solve by DAQP, a dual active-set method: exact to rounding, several times faster."""
     if not is_finite(program):
         return unsolved(len(program.c), len(program.h), "NotFinite")
     arrays = (np.ascontiguousarray(a) for a in (program.H, program.c, program.G, program.h))
@@ -135,7 +135,6 @@ def is_finite(program: QuadraticProgram) -> bool:
 
 
 def unsolved(num_variables: int, num_rows: int, status: str) -> QpSolution:
-    """Return an unsolved solution with its reason."""
     return QpSolution(
         z=np.full(num_variables, np.nan),
         multipliers=np.full(num_rows, np.nan),
@@ -160,7 +159,7 @@ class Choice:
     """The ladder's answer.
 
     velocity (J,); slack (M,) of barrier rows; multipliers of the box (2 J,) and barrier rows (M,); solution: the
-    last one computed; num_refused: how many solutions with slacks were not usable.
+    last one computed; num_refused: unusable solutions with slacks.
     """
 
     velocity: Float64
@@ -173,7 +172,7 @@ class Choice:
 
 
 def is_usable(solution: QpSolution, max_residual: float) -> bool:
-    """True for a solution reported solved whose residuals, computed by us, check."""
+    """True for a solution reported solved whose residuals check."""
     return solution.is_solved and solution.residuals.worst <= max_residual
 
 
@@ -184,10 +183,10 @@ def descend(
     barriers: Sequence[Barrier],
     config: ControlConfig,
 ) -> Choice:
-    """Return the program's solution, relaxed where a slack remains, else the least violation, else standstill.
+    """The program's solution, relaxed where a slack remains, else the least violation, else standstill.
 
-    The far smaller program without slacks is solved first. Its solution stands if no multiplier exceeds its row's
-    slack cost. Programs with slacks are feasible by construction, so the lower rungs are for failing solvers.
+    The program without slacks is solved first. It stands if no multiplier exceeds its row's slack cost. Programs with
+    slacks are always feasible.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver(assemble_hard(costs, *box, barriers))
@@ -221,7 +220,7 @@ def descend(
 
 
 def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: int) -> Choice:
-    """Return a standstill: no solution is usable."""
+    """A standstill: no solution is usable."""
     return Choice(
         velocity=np.zeros(num_joints),
         rung=Rung.HOLD,
@@ -236,10 +235,10 @@ def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: i
 def assemble_hard(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program over v alone, which may be infeasible.
+    """Program over v alone, which may be infeasible.
 
-    Rows: upper, lower box (2 J), barriers (M). If no barrier's multiplier exceeds its slack cost, its solution is
-    that of `assemble`: an L1 penalty above the multipliers is exact.
+    Rows: upper, lower box (2 J), barriers (M). If no barrier's multiplier exceeds its slack cost, it solves
+    `assemble`, too: an L1 penalty above the multipliers is exact.
     """
     H, c = summed(costs)
     G, h = box_rows(lowest, highest)
@@ -252,10 +251,9 @@ def assemble_hard(
 def assemble(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program over ``z = (v, s)``, always feasible.
+    """Program over ``z = (v, s)``, always feasible.
 
-    Rows: upper, lower box (2 J), barriers (M), slack signs (M). The box is not empty and every barrier row has its
-    own slack.
+    Rows: upper, lower box (2 J), barriers (M), slack signs (M).
     """
     J, M = len(lowest), sum(len(barrier) for barrier in barriers)
     H, c = np.zeros((J + M, J + M)), np.zeros(J + M)

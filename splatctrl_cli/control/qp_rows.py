@@ -1,8 +1,7 @@
 """Rows of all terms at a configuration, those the program needs, and III-E as printed.
 
 ``min over (v, x, e) (u - x)' Q (u - x) + (x - J v)' R (x - J v) + e' S e`` with x the end-effector velocity, e one
-slack per external row, of either sign, and ``x - J v`` the paper's delta_x. The controller otherwise solves a reduced
-program.
+slack per external row, of either sign, and ``x - J v`` the paper's delta_x.
 """
 
 from collections.abc import Sequence
@@ -25,9 +24,9 @@ from splatctrl_cli.robot.model import RobotModel
 class Rows:
     """Rows at one configuration (M, one barrier per term), and those the QP needs.
 
-    First come the moving spheres, then the pairs. margin (M,) [m]; is_fixed: no joint velocity changes it; in_qp: not
-    fixed, and some velocity of the box violates it; cuts: further QP rows (`RowBuilder.cut`), whose index is
-    the row that each belongs to.
+    First the moving spheres, then the pairs. margin (M,) [m]; is_fixed: no joint velocity changes it; in_qp: not
+    fixed, and some velocity of the box violates it; cuts: further QP rows (`RowBuilder.cut`), each with the index of
+    its row.
     """
 
     barriers: tuple[Barrier, ...]
@@ -59,7 +58,7 @@ class Rows:
         return rows if self.cuts is None else (*rows, self.cuts)
 
     def spread(self, values: Float64) -> Float64:
-        """Return the QP rows' values as (M,), zero elsewhere; a row has the largest of its own and its cuts'."""
+        """The QP rows' values as (M,), zero elsewhere, each the largest with its cuts."""
         everywhere, num_rows = np.zeros(len(self.in_qp)), int(self.in_qp.sum())
         everywhere[self.in_qp] = values[:num_rows]
         if self.cuts is not None:
@@ -68,7 +67,7 @@ class Rows:
 
 
 class RowBuilder:
-    """Builds an arm's rows in a distance field; names, kinds (M,): of the rows; scene: the rows against the scene."""
+    """Builds an arm's rows in a distance field; names, kinds (M,); scene: rows against it."""
 
     def __init__(
         self,
@@ -78,7 +77,7 @@ class RowBuilder:
         acceleration: Float64 | None = None,
         further: Sequence[BarrierTerm] = (),
     ) -> None:
-        """acceleration (J,) [rad/s^2]: of braking; None: joints stop at once."""
+        """acceleration: as for `SceneRows`."""
         self._model, self._acceleration = model, acceleration
         self.scene = SceneRows(model, config, field, acceleration)
         self._others: tuple[BarrierTerm, ...] = (SelfRows(model, config, acceleration), *further)
@@ -91,32 +90,31 @@ class RowBuilder:
         return (self.scene, *self._others)
 
     def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
-        """Return the rows in another field; see `SceneRows.in_field`."""
+        """Rows in another field; see `SceneRows.in_field`."""
         other = copy(self)
         other.scene = self.scene.in_field(field, balls)
         return other
 
     def at(self, state: State) -> Rows:
-        """Return every row at a state."""
         barriers = tuple(term.rows(state) for term in self._terms)
         is_fixed = np.concatenate([is_immovable(b.G, self._model.velocity_limit) for b in barriers])
         binds = np.concatenate([can_bind(b.G, b.h, *state.box) for b in barriers])
         return Rows(barriers=barriers, margin=self._margin, is_fixed=is_fixed, in_qp=binds & ~is_fixed)
 
     def cut(self, rows: Rows, state: State, velocity: Float64, chosen: Integers) -> Rows:
-        """Return the rows with a cut per `chosen` scene row (`SceneRows.cut`)."""
+        """Rows with a cut per `chosen` scene row (`SceneRows.cut`)."""
         cut = self.scene.cut(state, velocity, chosen, rows.external.distance)
         return replace(rows, cuts=cut if rows.cuts is None else rows.cuts.joined(cut))
 
     def room(self, state: State, velocity: Float64) -> Float64:
-        """Return ``h - G v`` (M,) [m/s] of every row for a velocity (J,)."""
+        """``h - G v`` (M,) [m/s] of every row for a velocity (J,)."""
         if self._acceleration is None:
             return np.concatenate([term.room(state, velocity) for term in self._terms])
         rows = [term.rows(state) for term in self._terms]
         return np.concatenate([b.h for b in rows]) - np.concatenate([b.G for b in rows]) @ velocity
 
     def distances(self, q: Float64, by_surface: Bool = NO_SPHERE) -> Float64:
-        """Return every row's distance (M,) [m] at q; by_surface as in `State`."""
+        """Every row's distance (M,) [m] at q; by_surface as in `State`."""
         centers = self._model.sphere_centers(q)
         scene = self.scene.by_surfaces(q, self.scene.distances(centers), by_surface)
         return np.concatenate([scene, *(term.distances(centers) for term in self._others)])
@@ -128,11 +126,11 @@ PRINTED = "printed"
 def assemble_printed(
     state: State, weights: tuple[Float64, Float64], posture: Cost, external: Barrier, firm: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program of III-E as printed, over ``z = (v, x, e)``.
+    """Program of III-E as printed, over ``z = (v, x, e)``.
 
-    Rows: upper, lower box (2 J), external (M), firm. An external row is ``grad d v >= -(d - epsilon) + e``; rows of
-    self-collision and further terms have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of
-    III-E, without which seven joints on six dimensions are undetermined.
+    Rows: upper, lower box (2 J), external (M), firm. An external row is ``grad d v >= -(d - epsilon) + e``; other
+    rows have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of III-E, which determines all
+    seven joints.
     """
     J, M = len(state.q), len(external)
     v, x, e = slice(0, J), slice(J, J + 6), slice(J + 6, J + 6 + M)
@@ -157,9 +155,9 @@ def assemble_printed(
 def solve_printed(
     solver: QpSolver, state: State, posture: Cost, barriers: Sequence[Barrier], config: ControlConfig
 ) -> Choice:
-    """Return the printed program's answer if solved and checked, else standstill.
+    """The printed program's answer if solved and checked, else standstill.
 
-    The paper has no second rung. slack is ``-e``; a row may also demand more than it needs, at a cost.
+    The paper has no second rung. slack is ``-e``; a row may also demand more than it needs.
     """
     external, *firm = barriers
     J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)

@@ -49,9 +49,9 @@ class Waypoint:
 class ReplayTask:
     """Start (J,) [rad] at a stamp [ns] and goal pose (4, 4) of a frame.
 
-    home (J,) [rad]: posture to lean to where the task leaves the arm free (None: the model's `middle`). via: poses to
-    reach first, in order. follow: the goal is each time's logged pose, until the log ends. twists: velocity to
-    reach instead, until end_ns. anchors: every anchor_period [s] the arm is put back into the logged posture.
+    home (J,) [rad]: posture to lean to (None: the model's `middle`). via: poses to reach first, in order. follow: the
+    goal is each time's logged pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: the
+    arm is put back into the logged posture every anchor_period [s].
     """
 
     start: Float64
@@ -76,10 +76,7 @@ class ReplayTask:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneChange:
-    """A newer scene: least clearance [m] of the unmoved arm before and after.
-
-    A recorded obstacle appears where the logged arm was not; an arm elsewhere may be in its place.
-    """
+    """A newer scene: least clearance [m] of the unmoved arm before and after."""
 
     stamp_ns: int
     before: float
@@ -87,7 +84,7 @@ class SceneChange:
 
     @property
     def is_hit(self) -> bool:
-        """True if the arm is in collision in the newer scene only, which no controller can prevent."""
+        """True if the arm is in collision in the newer scene only."""
         return self.after < 0 <= self.before
 
 
@@ -95,8 +92,8 @@ class SceneChange:
 class ReplayTrace:
     """T steps with stamp_ns (T,) and position (T, J) [rad] before each.
 
-    anchored: steps before which the arm was put back into the logged posture; num_reached: goals; detours: steps
-    after which a planned detour began; by_surface: spheres that finally counted by their link's surface.
+    anchored: steps before which the arm was put back; num_reached: goals; detours: steps after which a planned detour
+    began; by_surface: spheres that finally counted by their link's surface.
     """
 
     stamp_ns: Stamps
@@ -169,8 +166,8 @@ def closed_loop(
 
     field_at: field known at a stamp [ns], one object per scene; scene_step_at: for `config.distance_rate`;
     plan_detour: way out of a stall, `config.max_detours` times; record: None for memory; distance_to: for
-    `check_free`; balls_at: balls of a stamp's field, None where links' surfaces do not count. Raises InputError for a
-    start outside the limits or an unreachable goal, NotEvaluableError for a start in collision or outside the field.
+    `check_free`; balls_at: of a stamp's field, None where links' surfaces do not count. Raises InputError for a start
+    outside the limits or an unreachable goal, NotEvaluableError for a start in collision or outside the field.
     """
     field = field_at(task.stamp_ns)
     q = checked_posture(model, task.start, what="start")
@@ -252,7 +249,7 @@ class _Course:
         self.num_steps = max(round(left / config.period), 1)
 
     def anchor(self, index: int, stamp_ns: int) -> tuple[Float64, Float64] | None:
-        """Return the logged position and velocity (J,) at every anchor period but the first, while the log lasts."""
+        """Logged position and velocity (J,) at each later anchor period, until the log ends."""
         task = self._task
         if task.anchors is None or index == 0 or task.anchor_period <= 0:
             return None
@@ -313,7 +310,7 @@ class _Course:
 def divergence(
     model: RobotModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
 ) -> tuple[Float64, Float64, Float64]:
-    """Return distances of T postures (T, J) from those logged at their stamps.
+    """Distances of T postures (T, J) from those logged at their stamps.
 
     Joint norm [rad], frame position [m] and rotation [rad], each (T,); NaN after the log's end.
     """

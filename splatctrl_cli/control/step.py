@@ -48,7 +48,7 @@ class Intervention:
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityMargin:
-    """Room that a joint velocity leaves; negative where it breaks the named row.
+    """Room of a joint velocity; negative where it breaks the named row.
 
     barrier: least ``h - G v`` [m/s]; limit: least distance to the limits' box [rad/s].
     """
@@ -63,12 +63,11 @@ class VelocityMargin:
 class ControlStep:
     """The controller's decision at one configuration.
 
-    velocity (J,) [rad/s], already scaled by `scale` (1 unless the next distance broke a row's promise); pose_error
-    (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf
-    without pairs); violated_fixed: violated rows that no joint velocity changes; fixed_distance [m]: their least
-    distance (inf without any); interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT
-    residual of the last solution; status: the solver's word for it; num_refused: unusable solutions; by_surface:
-    spheres that count by their link's surface from this step on.
+    velocity (J,) [rad/s], scaled by `scale` (1 unless the next distance broke a row's promise); pose_error (6,) [m,
+    rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf without
+    pairs); violated_fixed: violated rows that no joint velocity changes; fixed_distance [m]: their least distance
+    (inf without any); interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT residual
+    of the last solution, with its status; num_refused: unusable solutions; by_surface: as in `step`, from now on.
     """
 
     velocity: Float64
@@ -119,10 +118,7 @@ class View:
 
 
 class QpIkController:
-    """Drives a frame to a goal pose under a distance field's barrier rows (III-E).
-
-    row_names, row_kinds (M,): of all rows.
-    """
+    """Drives a frame to a goal pose under a distance field's barrier rows (III-E)."""
 
     def __init__(
         self,
@@ -155,7 +151,7 @@ class QpIkController:
         self._reach_weight = eliminated_weight(*configured_weights(config))
 
     def with_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
-        """Return the controller on a newer field; see `SceneRows.in_field`."""
+        """Controller on a newer field; see `SceneRows.in_field`."""
         other = copy(self)
         other._builder = self._builder.with_field(field, balls)
         return other
@@ -170,12 +166,12 @@ class QpIkController:
         last_velocity: Float64 | None = None,
         by_surface: Collection[str] = (),
     ) -> ControlStep:
-        """Return the joint velocity at q (J,) [rad] towards a goal pose (4, 4).
+        """Joint velocity at q (J,) [rad] towards a goal pose (4, 4).
 
         distance_rate: dd/dt [m/s] of the moving spheres' distances, (M,) or one number. guide: the goal's motion
         (None: at rest). last_velocity (J,) [rad/s]: for acceleration and smoothness (None: neither counts).
-        by_surface: spheres that count by their link's surface; one whose row would relax joins them if its surface is
-        farther. Raises InputError for a q that is not finite, NotEvaluableError where the field has no distance.
+        by_surface: spheres that count by their link's surface; one whose row would relax joins if that is farther.
+        Raises InputError for a non-finite q, NotEvaluableError where the field has no distance.
         """
         moment = Moment(
             stamp_ns=0,
@@ -189,7 +185,7 @@ class QpIkController:
         return self.decide(self.view(moment))
 
     def decide(self, view: View) -> ControlStep:
-        """Return the step of a view. Raises as `step`."""
+        """Step of a view. Raises as `step`."""
         config, error, state, rows = self._config, view.error, view.state, view.rows
         rest = self._limits.rest(state.last_velocity)
         costs = [cost(state) for cost in self._costs]
@@ -205,7 +201,7 @@ class QpIkController:
         return replace(self._reported(error, rows, choice, rest, scale), by_surface=self._named(state.by_surface))
 
     def view(self, moment: Moment) -> View:
-        """Return a step's input at a moment. Raises as `step`."""
+        """A step's input at a moment. Raises as `step`."""
         q = checked_posture(self._model, moment.q)
         error = pose_error(self._model.frame_pose(q, self._frame), moment.T_world_goal)
         state = State(
@@ -222,7 +218,7 @@ class QpIkController:
         return View(error=error, state=state, rows=self._builder.at(state))
 
     def given(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
-        """Return an external velocity (J,) [rad/s] as a step; slack is its row violation.
+        """An external velocity (J,) [rad/s] as a step; slack is its row violation.
 
         None: the arm stops, with the reason in `status`.
         """
@@ -239,7 +235,7 @@ class QpIkController:
         return self._reported(view.error, rows, choice, rest, 1.0)
 
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
-        """Return the room that any joint velocity (J,) [rad/s] leaves at q (J,).
+        """Room that any joint velocity (J,) [rad/s] leaves at q (J,).
 
         Acceleration does not count. Raises as `step`.
         """
@@ -264,10 +260,10 @@ class QpIkController:
         return reference if guide is None else reference + guide.twist
 
     def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
-        """Return rows, the ladder's choice, and True if the later distances keep the promise.
+        """Rows, the ladder's choice, and True if the later distances keep the promise.
 
-        A sphere that would meet another surface than its row's (a corner, a second splat) adds a row. Then the ladder
-        runs again: cutting planes, at most `config.max_cuts` rounds.
+        A sphere that would meet another surface than its row's adds a row. Then the ladder runs again: cutting
+        planes, at most `config.max_cuts` rounds.
         """
         num_external, max_cuts = len(self._builder.scene.names), self._config.max_cuts
         for num_cuts in range(max_cuts + 1):
@@ -294,9 +290,8 @@ class QpIkController:
         """True for rows (M,) whose `later` distance, a period on, breaks their promise.
 
         A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
-        Beyond the margin `promise_tolerance` applies; within it a hundredth, because misses add up. Rows within their
-        margins may lose ground if the total shortfall shrinks: between several surfaces there may be no other way
-        out.
+        Beyond the margin `promise_tolerance` applies; within it a hundredth. Rows within their margins may lose
+        ground if the total shortfall shrinks.
         """
         config = self._config
         promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
@@ -310,7 +305,7 @@ class QpIkController:
         return np.asarray(broken)
 
     def _kept_scale(self, state: State, choice: Choice, rows: Rows, rest: Float64) -> float:
-        """Return the largest of STEP_SCALES that keeps the promises, else 0."""
+        """Largest of STEP_SCALES that keeps the promises, else 0."""
         if choice.rung is Rung.HOLD:
             return 0.0
         for scale in fixed.STEP_SCALES:
@@ -368,7 +363,7 @@ class Commander:
         return False
 
     def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
-        """Return the step at a moment; `controller` is ours in the current scene."""
+        """Step at a moment; `controller` is ours in the current scene."""
         return controller.decide(controller.view(moment))
 
 

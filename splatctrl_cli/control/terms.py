@@ -1,7 +1,6 @@
 """Terms of the QP of III-E over joint velocities; the solver adds them.
 
-A further term for `QpIkController` is a cost, a function of the state that gives ``(H, c)``, or a `BarrierTerm` with
-rows ``G v - s <= h``.
+A further term is a function from state to cost ``(H, c)``, or a `BarrierTerm` with rows ``G v - s <= h``.
 """
 
 from abc import ABC, abstractmethod
@@ -27,9 +26,9 @@ NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # among the moving spheres
 class State:
     """A step's state, as terms see it.
 
-    q (J,) [rad]; box: allowed velocities (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s]: for `frame` to reach;
-    guide: the goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate: dd/dt [m/s]
-    of the moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
+    q (J,) [rad]; box: allowed velocities (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s] of `frame`; guide: the
+    goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate: dd/dt [m/s] of the
+    moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
     """
 
     model: RobotModel
@@ -60,7 +59,7 @@ CostTerm = Callable[[State], Cost]
 def lean_home(state: State, *, home: Float64, gain: float, weight: float) -> Cost:
     """Home bias of III-E, which makes a redundant arm's QP strictly convex.
 
-    It leads to home (J,) [rad], or to the guide's posture, added to that posture's motion.
+    It leads to home (J,) [rad], or to the guide's posture and motion.
     """
     if state.guide is None:
         return stray_cost(gain * (home - state.q), weight)
@@ -75,20 +74,19 @@ def change_little(state: State, *, weight: float) -> Cost:
 
 
 def standard_costs(config: ControlConfig, home: Float64) -> tuple[CostTerm, ...]:
-    """Return the optional costs of III-E."""
     lean = partial(lean_home, home=home, gain=config.posture_gain, weight=config.posture_weight)
     smooth = partial(change_little, weight=config.smoothness_weight)
     return (lean, smooth) if config.smoothness_weight > 0 else (lean,)
 
 
 def configured_weights(config: ControlConfig) -> tuple[Float64, Float64]:
-    """Return the diagonals (6,) of Q and R."""
+    """Diagonals (6,) of Q and R."""
     Q = np.repeat([config.weight_linear, config.weight_angular], 3)
     return Q, config.weight_kinematics * Q
 
 
 def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float64:
-    """Return III-E's weight (6,) after elimination of end-effector velocity and slack.
+    """III-E's weight (6,) after elimination of end-effector velocity and slack.
 
     ``min over d of (e - d)' Q (e - d) + d' R d`` is ``e' W e`` with ``W = (Q^-1 + R^-1)^-1``; Q, R diagonal (6,).
     """
@@ -96,7 +94,7 @@ def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float
 
 
 def reach_cost(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost:
-    """Return the cost ``(u - J v)' W (u - J v)`` of missing velocity u: the first two terms of III-E.
+    """Cost ``(u - J v)' W (u - J v)`` of missing velocity u: first two terms of III-E.
 
     jacobian (6, J); u (6,) [m/s, rad/s], world; weight (6,): diagonal of W.
     """
@@ -105,12 +103,11 @@ def reach_cost(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost:
 
 
 def stray_cost(velocity: Float64, weight: float) -> Cost:
-    """Return the cost ``weight |v - velocity|^2`` of leaving a joint velocity (J,) [rad/s]."""
+    """Cost ``weight |v - velocity|^2`` of leaving a joint velocity (J,) [rad/s]."""
     return 2.0 * weight * np.eye(len(velocity)), -2.0 * weight * velocity
 
 
 def summed(costs: Sequence[Cost]) -> Cost:
-    """Return all costs as one."""
     H, c = np.zeros_like(costs[0][0]), np.zeros_like(costs[0][1])
     for cost_H, cost_c in costs:
         H += cost_H
@@ -131,8 +128,8 @@ class Barrier:
     """M barrier rows ``G v - s <= h``, with ``G = -dd/dq`` (M, J).
 
     ``h = alpha (d - epsilon) + dd/dt`` (M,), less where joints cannot stop at once (`barriers.distance_bound`);
-    distance d (M,) [m]; index (M,): place among names (spheres, or pairs).
-    Slack costs ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
+    distance d (M,) [m]; index (M,): among names (spheres, or pairs). Slack costs ``slack_cost * s + slack_weight *
+    s^2`` per row [s in m/s].
     """
 
     index: Integers
@@ -146,7 +143,7 @@ class Barrier:
         return len(self.h)
 
     def select(self, rows: Bool) -> "Barrier":
-        """Return the rows of a mask (M,)."""
+        """Rows of a mask (M,)."""
         return replace(self, index=self.index[rows], G=self.G[rows], h=self.h[rows], distance=self.distance[rows])
 
     def joined(self, other: "Barrier") -> "Barrier":
@@ -161,9 +158,9 @@ class Barrier:
 
 
 class BarrierTerm(ABC):
-    """A term of M rows that bound the velocity; `names` describe them.
+    """M named rows that bound the velocity.
 
-    A term that is not about a distance defines `rows` alone. Its infinite distance exempts it from step checks.
+    A term without a distance defines `rows` alone: infinite distance exempts it from step checks.
     """
 
     kind = RowKind.LIMIT
@@ -171,18 +168,18 @@ class BarrierTerm(ABC):
 
     @cached_property
     def margin(self) -> Float64:
-        """Margins of the rows (M,) [m]."""
+        """Margins (M,) [m]."""
         return np.zeros(len(self.names))
 
     @abstractmethod
     def rows(self, state: State) -> Barrier:
-        """Return every row, in the order of the names."""
+        """Every row, in the order of the names."""
 
     def room(self, state: State, velocity: Float64) -> Float64:
-        """Return ``h - G v`` (M,) [m/s] of a velocity (J,)."""
+        """``h - G v`` (M,) [m/s] of a velocity (J,)."""
         rows = self.rows(state)
         return np.asarray(rows.h - rows.G @ velocity)
 
     def distances(self, centers: Float64) -> Float64:
-        """Return distances (M,) [m] for sphere centers (S, 3), NaN if unknown."""
+        """Distances (M,) [m] for sphere centers (S, 3), NaN if unknown."""
         return np.full(len(self.names), np.inf)

@@ -1,7 +1,4 @@
-"""Python controllers: their input, and the process that serves them (docs/controllers.md).
-
-It speaks the same lines as a program in any language.
-"""
+"""Python controllers: their input, and the process that serves them (docs/controllers.md)."""
 
 import json
 import os
@@ -25,9 +22,9 @@ PROTOCOL = 1
 class ControllerStart:
     """A controller's initial input.
 
-    joints (J,): names, in the order of all vectors; lower, upper, home to lean to (J,) [rad]; velocity_limit (J,)
-    [rad/s]; acceleration_limit (J,) [rad/s^2] (None: no limit); frame to drive; period [s] of a velocity; margin [m]
-    to the scene.
+    joints (J,): names, in the order of all vectors; lower, upper, home (J,) [rad]; velocity_limit (J,) [rad/s];
+    acceleration_limit (J,) [rad/s^2] (None: no limit); frame to drive; period [s] of a velocity; margin [m] to the
+    scene.
     """
 
     joints: tuple[str, ...]
@@ -73,9 +70,8 @@ class ControllerInput:
     """A controller's input at a step, in world.
 
     q (J,) [rad]; dq (J,) [rad/s]; goal, pose (4, 4) of goal and frame; error (6,) [m, rad]: twist from frame to goal
-    in a second, linear first; jacobian (6, J) of the frame. A goal that moves or has a posture has
-    goal_twist (6,) [m/s, rad/s], goal_posture (J,) [rad] to lean to, and goal_velocity (J,) [rad/s] of that posture;
-    all three are None for a pose alone.
+    in a second, linear first; jacobian (6, J) of the frame. goal_twist (6,) [m/s, rad/s], goal_posture (J,) [rad] and
+    its goal_velocity (J,) [rad/s] are None for a pose alone.
     """
 
     stamp_ns: int
@@ -91,7 +87,7 @@ class ControllerInput:
     ask_rows: Callable[[], Sequence[ClearanceRow]] = field(repr=False)
 
     def rows(self) -> Sequence[ClearanceRow]:
-        """Return our controller's rows: moving spheres, and pairs that an allowed velocity could violate."""
+        """Our controller's rows: moving spheres, and pairs that an allowed velocity could violate."""
         return self.ask_rows()
 
 
@@ -99,11 +95,11 @@ class Controller(Protocol):
     """A user's class, constructed with a `ControllerStart`."""
 
     def step(self, now: ControllerInput) -> Sequence[float] | Float64:
-        """Return the joint velocities (J,) [rad/s] for a period."""
+        """Joint velocities (J,) [rad/s] for a period."""
 
 
 def serve(target: str) -> None:
-    """Answer lines on stdin with the class ``module:Class`` until they end; its prints go to stderr."""
+    """Answer lines on stdin with the class ``module:Class``; its prints go to stderr."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     questions = os.fdopen(os.dup(0), encoding="utf-8")
     os.dup2(2, 1)
@@ -137,7 +133,7 @@ def serve(target: str) -> None:
 
 
 def class_named(target: str) -> Callable[[ControllerStart], Controller]:
-    """Return the class ``module:Class``, from the current folder too. Exits with a sentence if missing."""
+    """Class ``module:Class``, from the current folder too. Exits with a sentence if missing."""
     module_name, _, name = target.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:

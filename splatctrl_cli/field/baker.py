@@ -29,9 +29,8 @@ T = TypeVar("T", bound=np.generic)
 class Baker:
     """Channels of a field over splats at the cells of `layout`.
 
-    The cut into planes and the thread count change no bit. counts: ``se_without_value``, cells with exact distance
-    instead of the kernel's; ``se_over_estimates``, those where it exceeds the exact one by more than
-    `RESOLUTION`; likewise for gpdf.
+    Planes and threads change no bit. counts: ``se_without_value``, cells with exact distance instead of the kernel's;
+    ``se_over_estimates``, cells where it exceeds the exact one by more than `RESOLUTION`; likewise gpdf.
     """
 
     def __init__(
@@ -69,7 +68,6 @@ class Baker:
         self.on_device = None if device is None else device_field(self.spheres, self.kernels, config, device)
 
     def close(self) -> None:
-        """Free a card's memory."""
         if self.on_device is not None:
             self.on_device.close()
 

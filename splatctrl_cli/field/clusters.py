@@ -1,6 +1,6 @@
 """Splats of a field as spheres, checked and clustered once.
 
-A space-filling curve sorts points into clusters of 16, and these into groups of 16, each with a box.
+A space-filling curve sorts points into clusters of 16, and these into groups of 16, with boxes.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,7 @@ _GROUPS = 8  # their number is a multiple of this
 class Spheres:
     """N spheres, their centres as C clusters, relative to an anchor; radii (N,) [m].
 
-    float32 then keeps 0.1 um within a metre or two. anchor (3,) [m], world; source (16 C,): sphere of each entry;
-    is_point (16 C,): 0 if spare.
+    anchor (3,) [m], world; source (16 C,): sphere of each entry; is_point (16 C,): 0 if spare.
     """
 
     anchor: Float64
@@ -34,9 +33,9 @@ class Spheres:
     def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
         """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
 
-        Anchor and curve follow `frame`, by default the centres' box. With one frame, centres of two sets keep order
-        and coordinates to the bit. Raises NotEvaluableError without any, InputError for a wrong shape, a value not
-        finite, or a negative radius.
+        Anchor and curve follow `frame`, by default the centres' box: with one frame, centres of two sets keep order
+        and coordinates. Raises NotEvaluableError without any, InputError for a wrong shape, a non-finite value, or a
+        negative radius.
         """
         points, radius_array = _checked(centers, radii)
         lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
@@ -57,11 +56,10 @@ class Spheres:
 
     @property
     def num_points(self) -> int:
-        """N."""
         return int(np.count_nonzero(self.is_point))
 
     def relative(self, points_world: Floats) -> Float32:
-        """Return world points (Q, 3) relative to the anchor."""
+        """World points (Q, 3) relative to the anchor."""
         return np.ascontiguousarray(points_world - self.anchor, dtype=np.float32)
 
     def laid_out(self, values: Floats, *, spare: float) -> Float64:
@@ -102,7 +100,7 @@ def _padded(count: int, multiple: int) -> int:
 
 
 def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> Index:
-    """Places (N,) along a Hilbert curve, whose neighbours are near in space.
+    """Places (N,) along a Hilbert curve.
 
     Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004).
     """
@@ -129,7 +127,7 @@ def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> Index:
 
 
 def checked_points(points: Floats) -> Float64:
-    """Return points as float64. Raises InputError unless (Q, 3) and finite."""
+    """Points as float64. Raises InputError unless (Q, 3) and finite."""
     array = shaped_points(points)
     if not np.isfinite(array).all():
         raise not_finite(array)
@@ -137,7 +135,7 @@ def checked_points(points: Floats) -> Float64:
 
 
 def shaped_points(points: Floats) -> Float64:
-    """Return points as float64. Raises InputError unless (Q, 3)."""
+    """Points as float64. Raises InputError unless (Q, 3)."""
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"query points: expected shape (Q, 3), got {array.shape}")
@@ -145,7 +143,7 @@ def shaped_points(points: Floats) -> Float64:
 
 
 def not_finite(points: Float64) -> InputError:
-    """Error that names the first point (Q, 3) that is not finite."""
+    """Error that names the first non-finite point (Q, 3)."""
     i = int(np.argmax(~np.isfinite(points).all(axis=1)))
     return InputError(f"query point {i}: expected finite coordinates, got {points[i].tolist()}")
 

@@ -1,4 +1,4 @@
-"""Distance fields over splats, on the processor or a card: exact, kernel, and the smaller. Positive outside."""
+"""Distance fields over splats, on the processor or a card; positive outside."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -23,9 +23,9 @@ DEFAULT = FieldConfig()
 
 
 class SphereField:
-    """Exact distance to a union of spheres, ``hard(x) = min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz.
+    """Exact distance to a union of spheres, ``min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz.
 
-    Inside, it is minus the depth in the deepest sphere, not the distance to the union's surface.
+    Inside: minus the depth in the deepest sphere.
     """
 
     def __init__(self, spheres: Spheres, *, threads: int = 1) -> None:
@@ -59,7 +59,7 @@ class LogSumExpField(ABC):
 
     @abstractmethod
     def terms(self) -> LogSumExp:
-        """Return its terms, laid out for the kernels."""
+        """Its terms, laid out for the kernels."""
 
     @abstractmethod
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
@@ -72,7 +72,7 @@ class LogSumExpField(ABC):
         bake(self.spheres.clusters, terms, span, distance, gradient, threads=threads)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Distance and gradient as in `query_raw`, or the exact ones where those are undefined."""
+        """Distance and gradient as in `query_raw`, or the exact ones where undefined."""
         distance, gradient = self.query_raw(points)
         has_none = np.isnan(distance)
         if has_none.any():
@@ -85,8 +85,8 @@ class GpdfField(LogSumExpField):
     """The paper's field (eq. 7 to 10, 12, 15): a GP with a Matern-1/2 kernel, in the log domain.
 
     ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, shifted by the largest exponent: finite for every l and
-    mix of radii. Eq. 12 as printed, shifted by the nearest centre, overflows for r / l > 88 in float32. It is
-    undefined where weights of either sign (cg) give no positive sum.
+    mix of radii. (Eq. 12 as printed overflows for r / l > 88 in float32.) It is undefined where weights of either
+    sign (cg) give no positive sum.
     """
 
     kernel_type = Matern12
@@ -196,8 +196,7 @@ class SeField(LogSumExpField):
 class SafeField:
     """The smaller of the exact distance and a kernel field, where that is defined.
 
-    Row-sum lumping over-estimates the clearance to a sparse object before a dense one; the minimum never exceeds the
-    exact distance.
+    Row-sum lumping over-estimates the clearance to a sparse object before a dense one.
     """
 
     def __init__(self, exact: DistanceField, kernel: LogSumExpField) -> None:
@@ -238,8 +237,7 @@ def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Di
 class March:
     """Result of a march from Q points.
 
-    hit (Q, 3) [m]: points reached; rest (Q,) [m]: what the field reads there; distance (Q,) [m]: length walked plus
-    rest.
+    hit (Q, 3) [m]: points reached; rest (Q,) [m]: the field there; distance (Q,) [m]: length walked plus rest.
     """
 
     distance: Float64
@@ -250,10 +248,9 @@ class March:
 def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps: int = fixed.MARCH_STEPS) -> March:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
-    Each of the `steps` goes against the local gradient: with a fixed direction, a walk can pass an object by. It is
-    as long as the field reads, at most the `exact` distance, and so crosses no sphere. The Matern field's zero level
-    stands before the spheres (`slabs.planar_zero_level`). Points at or behind it stay. Raises UsageError for less
-    than one step.
+    Each of the `steps` goes against the local gradient, as far as the field reads, at most the `exact` distance: it
+    crosses no sphere. The Matern field's zero level stands before the spheres (`slabs.planar_zero_level`). Points at
+    or behind it stay. Raises UsageError for less than one step.
     """
     if steps < 1:
         raise UsageError(f"marching: expected at least 1 step, got {steps}")
@@ -307,7 +304,6 @@ class OnDevice:
         return self.field.query(checked_points(points), self.spheres.anchor, wanted)
 
     def close(self) -> None:
-        """Free the device's memory."""
         self.field.close()
 
 

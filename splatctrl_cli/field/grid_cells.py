@@ -24,7 +24,7 @@ Shape = tuple[int, int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class GridLayout:
-    """Cells of `voxel` [m], centred at ``origin + voxel (i, j, k)``, world [m]."""
+    """Cells of `voxel` [m], centred at ``origin + voxel (i, j, k)``, world."""
 
     origin: Float64
     voxel: float
@@ -53,7 +53,6 @@ class GridLayout:
 
     @property
     def num_cells(self) -> int:
-        """X Y Z."""
         return self.shape[0] * self.shape[1] * self.shape[2]
 
 
@@ -68,8 +67,8 @@ def check_loss(voxel: float, max_loss: float) -> None:
     """Raise UsageError if cells of `voxel` [m] may lose more than max_loss [m] of distance.
 
     The certified distance is ``max_c (hard(c) - |x - c|)`` over eight centres c around x. One is within half a
-    diagonal, and hard is 1-Lipschitz, ``hard(c) >= hard(x) - |x - c|``: the loss is at most a diagonal, ``sqrt(3)
-    voxel``, as between eight balls around the centres. Interpolation errs by at most half of that.
+    diagonal, and ``hard(c) >= hard(x) - |x - c|``: the loss is at most a diagonal, ``sqrt(3) voxel``. Interpolation
+    errs by at most half of that.
     """
     loss = LOSS * voxel
     if loss > max_loss:
@@ -143,9 +142,8 @@ def observed_planes(
 class GridField:
     """Trilinear interpolation between cell centres.
 
-    Outside their box it reads the value at the box's nearest point minus the distance to it. This lower bound shows
-    a robot outside less clearance, never more. Next to a NaN cell (policy ``nan``), this and the certified distance
-    are NaN.
+    Outside their box it reads the value at the box's nearest point minus the distance to it, a lower bound. Next to a
+    NaN cell (policy ``nan``), this and the certified distance are NaN.
     """
 
     def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
@@ -172,8 +170,8 @@ class GridField:
     def certified(self, points: Float64) -> Float64:
         """Lower bound (Q,) [m] of the exact distance to splats, not to objects.
 
-        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz. It holds for
-        obstacle cells, too. NaN where `query` is. Raises InputError without the channel bound.
+        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding. It holds for obstacle cells, too.
+        NaN where `query` is. Raises InputError without the channel bound.
         """
         if self._bound is None:
             raise InputError("distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")

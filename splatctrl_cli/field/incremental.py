@@ -22,7 +22,6 @@ class Changes:
 
     @property
     def num_baked(self) -> int:
-        """Number of blocks to bake."""
         return self.num_blocks if self.mask is None else int(np.count_nonzero(self.mask))
 
 
@@ -30,7 +29,7 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
     """Blocks where bakes of `before` and `after` can differ by a bit.
 
     Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
-    culling bounds. Weights are compared too, as neighbours' weights change; `observed` is not.
+    culling bounds, or where weights differ.
     """
     shape = tuple(-(-cells // BLOCK) for cells in new.layout.shape)
     num_blocks = int(np.prod(shape))
@@ -99,7 +98,7 @@ def _changed(
 def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.void]:
     """Splats as bytes (N,), in cluster order.
 
-    A rank separates splats of one centre: their order can decide the last bit.
+    A rank separates splats of one centre.
     """
     order = baker.spheres.source[baker.spheres.is_point.view(np.bool_)]
     centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0

@@ -20,7 +20,7 @@ from splatctrl_cli.records import Float32, Float64
 class CalibratedProbability:
     """``Phi((mean - clearance) / sigma)``, with the field's measured error [m].
 
-    mean: what it reads too much on average; sigma: the standard deviation.
+    mean: its average excess; sigma: the standard deviation.
     """
 
     sigma: float
@@ -39,7 +39,7 @@ class CalibratedProbability:
         return self.of(sdf.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:
-        """Return its meaning and numbers, for a header."""
+        """Its meaning and numbers, for a header."""
         return {"meaning": "Phi((mean - sdf) / sigma)", "sigma": self.sigma, "mean": self.mean}
 
 
@@ -106,7 +106,7 @@ class PaperProbability:
 def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
     """Eq. 14 of an occupancy o > 0 with variance ``(1 - explained) / 9``.
 
-    In logarithms, as 1 - Phi loses small values. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, not zero.
+    In logarithms. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, not zero.
     """
     deviation = np.sqrt(np.maximum(1.0 - explained, fixed.LEAST_VARIANCE) / fixed.VARIANCE_DIVISOR)
     return np.asarray(np.exp(log_ndtr((occupancy - 1.0) / deviation) - log_ndtr(occupancy / deviation)))

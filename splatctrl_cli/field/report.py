@@ -22,7 +22,7 @@ NUM_BINS = 41  # about 0 to 2; the last one includes longer ones
 class GradientLengths:
     """Gradient lengths: 1 for a distance (Eikonal equation), less where a kernel field is flat.
 
-    histogram: bin k counts lengths within half a `bin_width` of k times that, the last bin also longer ones;
+    histogram: bin k counts lengths within half a `bin_width` of k times that, the last also longer ones;
     share_near_one: within 0.05 of 1.
     """
 
@@ -66,12 +66,12 @@ class GridStatistics:
         return None if self.observed is None else self.observed["never_seen"] / self.num_cells
 
     def as_dict(self) -> dict[str, object]:
-        """Return plain values, as in ``field.json``."""
+        """Plain values, as in ``field.json``."""
         return {**asdict(self), "never_seen_share": self.never_seen_share}
 
 
 def grid_statistics(grid: DistanceGrid) -> GridStatistics:
-    """Statistics of a grid, by a few planes, as channels may be memory maps."""
+    """Statistics of a grid, a few planes at a time: channels may be memory maps."""
     sums, most = dict[str, Any](), dict[str, float]()
     for part in _parts(grid):
         counted, largest = _measured(part)

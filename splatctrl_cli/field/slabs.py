@@ -1,4 +1,4 @@
-"""Bakes of a grid, whole or in slabs of x-planes, and their header with the splats' health."""
+"""Bakes of a grid, whole or in slabs of x-planes, with headers and health."""
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass
@@ -22,8 +22,7 @@ from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 class FieldHealth:
     """Ratios that decide a field's quality, with warnings.
 
-    spacing: median distance to the nearest other splat [m], 0 for a single splat; radius: median [m];
-    planar_zero_level: height [m] where a dense plane's kernel field is zero.
+    spacing [m]: `median_spacing`; radius: median [m]; planar_zero_level [m]: of the kernel field.
     """
 
     spacing: float
@@ -93,7 +92,7 @@ def _set_warnings(centers: Floats, radii: Floats, length: float, *, has_kernel: 
 
 
 def median_spacing(centers: Floats) -> float:
-    """Median distance from a splat (N, 3) [m] to the nearest other one; 0 for fewer than two."""
+    """Median distance from a splat (N, 3) [m] to the nearest other; 0 for fewer than two."""
     if len(centers) < 2:
         return 0.0
     points = np.asarray(centers, dtype=np.float64)
@@ -101,10 +100,10 @@ def median_spacing(centers: Floats) -> float:
 
 
 def planar_zero_level(radius: float, length: float) -> float:
-    """Height z [m] over a dense plane of splats where the Matern row-sum field is zero.
+    """Height z [m] over a dense plane where the Matern row-sum field is zero.
 
-    The field is ``z - l log(1 + z / l) - r``. (The integral of ``e^(-d/l)`` over a plane is ``2 pi l (z + l)
-    e^(-z/l)``, the row sum ``2 pi l^2``.) Newton's method starts above, where it is convex.
+    The field is ``z - l log(1 + z / l) - r``: the integral of ``e^(-d/l)`` over a plane is
+    ``2 pi l (z + l) e^(-z/l)``, the row sum ``2 pi l^2``.
     """
     z = radius + length * (1.0 + np.sqrt(2.0 * radius / length))
     for _ in range(50):
@@ -191,7 +190,6 @@ class Kept:
 
 
 def bytes_per_cell(channels: Collection[str]) -> int:
-    """Bytes of the channels."""
     kinds = [CHANNELS[name] for name in channels if name in CHANNELS]
     return sum(np.dtype(kind.dtype).itemsize * kind.components for kind in kinds)
 
@@ -221,7 +219,7 @@ class UnknownSpace:
     bound are of the nearer of splats and cubes. Cells that only the robot swept are known
     (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
 
-    num_never_seen and num_changed count the cells treated so far.
+    num_never_seen, num_changed: cells so far.
     """
 
     def __init__(
@@ -262,7 +260,7 @@ class UnknownSpace:
         return treated
 
     def header(self) -> dict[str, object]:
-        """Return its changes of a header."""
+        """Its changes of a header."""
         return {
             **({"bound": BOUND} if self.policy == "obstacle" else {}),
             "unknown": self.policy,
@@ -300,7 +298,7 @@ def bake(
 
     channels: of `CHANNELS`, with sdf. Culling is exact for hard; with row sums, a kernel field is too large by at
     most ``config.truncation``. Bytes do not depend on threads. Raises UsageError for a bad or too large box,
-    NotEvaluableError without splats, InputError for splats not finite.
+    NotEvaluableError without splats, InputError for non-finite ones.
     """
     chosen = field_splats(splats, labels)
     layout = GridLayout.over(box, config.voxel)

@@ -24,7 +24,6 @@ class ObstacleSpheres:
 
     @property
     def num_unrepresented(self) -> int:
-        """Number of balls."""
         return int(np.count_nonzero(self.index == NO_SPLAT))
 
 
@@ -77,7 +76,6 @@ def check_labels(splats: SplatSet) -> None:
 
 
 def label_counts(splats: SplatSet) -> dict[str, int]:
-    """Number of splats by label name."""
     return {label.name.lower(): int(np.count_nonzero(splats.labels == label)) for label in Label}
 
 
@@ -116,9 +114,8 @@ class Cubes:
     def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
         """Bound the distances in a grid with known and unknown cells.
 
-        Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance
-        minus half a cell. Inside: half a cell minus the distance to the nearest known centre; the depth is at
-        most minus that.
+        Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance minus
+        half a cell. Inside: half a cell minus the distance to the nearest known centre.
         """
         here = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
@@ -135,7 +132,6 @@ class Cubes:
         )
 
     def planes(self, first: int, last: int) -> "Cubes":
-        """X-planes [first, last)."""
         return replace(
             self,
             is_unknown=self.is_unknown[first:last],

@@ -35,8 +35,8 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
     """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
     Each centre spreads one unit over eight nodes (trilinear), these are convolved, and it reads them back. Its own
-    term becomes k(0) = 1. Spreading and reading blur by h^2 / 3 per axis (h: node spacing); convolving with ``2 k -
-    (mean of k at the six neighbours)`` undoes it to second order. Raises UsageError for more than `MAX_BLOCKS`
+    term becomes k(0) = 1. Spreading and reading blur by h^2 / 3 per axis (h: node spacing); convolving with
+    ``2 k - (mean of k at the six neighbours)`` undoes it to second order. Raises UsageError for over `MAX_BLOCKS`
     blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
@@ -63,7 +63,7 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
 
 
 def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
-    """Return each block's first node (3,), centres in reach, centres inside."""
+    """Each block's first node (3,), centres in reach, centres inside."""
     inner = NODES - 2 * reach - 1  # cells whose nodes no mass from beyond the block reaches
     blocks, which = np.unique(cells // inner, axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
@@ -136,12 +136,11 @@ def solve_process(
 ) -> tuple[Float64, Float64, int, float]:
     """``(K(P, P) + noise I)^-1 y`` (eq. 8, 12) for centres (N, 3) [m], y = exp(log_values) (N,).
 
-    It is ``scaled exp(log_scale)`` (N,); with the number of iterations, and the largest residual, relative to its
-    group's largest y.
+    It is ``scaled exp(log_scale)`` (N,); with the iterations, and the largest residual relative to its group's
+    largest y.
 
-    The kernel is cut off at 8 l. Groups that it does not join are scaled by their largest y, as Matern's ``e^(r /
-    l)`` overflows. Raises UsageError for too little memory or too wide a spread of y, NotEvaluableError without
-    convergence.
+    The kernel is cut off at 8 l. Groups that it does not join are scaled by their largest y. Raises UsageError for
+    too little memory or too wide a spread of y, NotEvaluableError without convergence.
     """
     matrix = _kernel_matrix(centers, length, kernel, noise)
     num_groups, group = connected_components(matrix, directed=False)
@@ -163,8 +162,7 @@ def solve_process(
 def conjugate_gradients(matrix: "csr_array", values: Float64, tolerance: float) -> tuple[Float64, int, float]:
     """x (N,) with ``max |A x - y| <= 2 tolerance``, the iterations, and that residual.
 
-    A unit diagonal needs no preconditioner. Raises NotEvaluableError if A is not positive definite or after
-    `CG_ITERATIONS`.
+    Raises NotEvaluableError if A is not positive definite or after `CG_ITERATIONS`.
     """
     accepted = 2.0 * tolerance  # of the true residual; the recurrence drifts from it
     x = np.zeros(len(values))
@@ -228,7 +226,7 @@ class Matern12:
 
 @dataclass(frozen=True)
 class SquaredExponential:
-    """``k(d) = exp(-d^2 / (2 l^2))``, the paper's Gaussian kernel: its inverse is ``r(o) = sqrt(-2 l^2 log o)``."""
+    """``k(d) = exp(-d^2 / (2 l^2))``, the paper's Gaussian kernel; inverse: ``r(o) = sqrt(-2 l^2 log o)``."""
 
     length: float
 
@@ -242,7 +240,7 @@ Kernel = Matern12 | SquaredExponential
 
 
 def share_of_loss(length: float, tolerance: float) -> float:
-    """Share of Matern's sum whose loss raises the distance by t [m], ``1 - exp(-t / l)``; at most 0.01."""
+    """Share of Matern's sum whose loss raises the distance by t [m]: ``1 - exp(-t / l)`` <= 0.01."""
     return min(-float(np.expm1(-tolerance / length)), KERNEL_MAX_SHARE)
 
 
@@ -280,7 +278,7 @@ def row_sum_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
 
 
 def voxel_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """Return `row_sum_weights` from a voxel grid (III-D)."""
+    """`row_sum_weights` from a voxel grid (III-D)."""
     return _lumped(np.log(voxel_row_sums(_centers(spheres), kernel.length, kernel.value)), noise)
 
 

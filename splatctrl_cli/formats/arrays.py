@@ -1,8 +1,7 @@
 """Arrays in ``.npz`` without timestamps (same arrays, same bytes), read within a size limit.
 
-Ten megabytes of ``.npz`` can hide ten gigabytes of zeros. NPZ, HDF5 and Parquet (extra `tables`: h5py, pyarrow) are
-read in blocks of rows. HDF5 names arrays by path (``observations/qpos``), Parquet by column; equal lists make an
-array (T, K).
+NPZ, HDF5 and Parquet (extra `tables`: h5py, pyarrow) are read in blocks of rows. HDF5 names arrays by path
+(``observations/qpos``), Parquet by column; equal lists make an array (T, K).
 """
 
 import tokenize
@@ -33,7 +32,7 @@ DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a 
 
 @dataclass(frozen=True, kw_only=True)
 class Pieces:
-    """An array made while it is written: `make` yields its values in C order."""
+    """An array made during writing: `make` yields its values in C order."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -60,8 +59,8 @@ def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) 
 def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, Values]:
     """Read the arrays `names` (default: all) of a ``.npz``, at most `most` bytes together.
 
-    Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or another size than
-    announced, and `DAMAGE`.
+    Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or another size, and
+    `DAMAGE`.
     """
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
         chosen = (
@@ -87,10 +86,7 @@ def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
 
 
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read a ``.npy`` header: shape, is_by_columns and dtype. Raises ValueError if there is none.
-
-    The stream is left after it.
-    """
+    """Read a ``.npy`` header, no further: shape, is_by_columns, dtype. Raises ValueError without one."""
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, is_fortran, dtype = read(stream)
@@ -125,10 +121,7 @@ def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> Va
 
 
 def npy_of(data: bytes) -> Values:
-    """The array of ``.npy`` bytes. Raises ValueError for objects, or another number of bytes than announced.
-
-    `np.load` would allocate what the header announces.
-    """
+    """The array of ``.npy`` bytes. Raises ValueError for objects or another size."""
     return _array(BytesIO(data), "", len(data), None)
 
 
@@ -153,7 +146,10 @@ class ArrayFile(ABC):
         """Yield about `BLOCK` rows at a time. Raises InputError if unreadable."""
 
     def columns(self, names: Sequence[str]) -> Rows:
-        """Arrays side by side as columns (T, K). Raises InputError if missing, not numbers or of several lengths."""
+        """Arrays side by side as columns (T, K).
+
+        Raises InputError if missing, not numbers or of several lengths.
+        """
         headers = [self._checked(name) for name in names]
         lengths = [shape[0] for shape, _ in headers]
         if len(set(lengths)) > 1:

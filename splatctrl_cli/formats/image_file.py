@@ -40,8 +40,8 @@ class ImageHead:
 def image_head(data: bytes) -> ImageHead | None:
     """Read the head of a whole, plain JPEG or PNG; None for others.
 
-    Plain: Huffman-coded 8-bit JPEG of one or three channels, with its closing mark; grey or RGB PNG without
-    transparency or interlace, all checksums right (ITU-T T.81; W3C PNG).
+    Plain: Huffman-coded 8-bit JPEG of one or three channels, with its end; grey or RGB PNG without transparency or
+    interlace, all checksums right (ITU-T T.81; W3C PNG).
     """
     head = (_jpeg_head if data.startswith(JPEG) else _png_head)(data)
     return None if head is None or not 0 < head.width * head.height <= MOST_PIXELS else head
@@ -104,7 +104,7 @@ def _png_head(data: bytes) -> ImageHead | None:
 def decode_file(data: bytes, *, color: bool) -> Array | None:
     """Decode a JPEG, PNG, WebP, ..., ignoring its orientation tag; None if invalid or truncated.
 
-    color: 8-bit RGB; else as OpenCV has it, in BGR. OpenCV alone would fill a cut JPEG with grey.
+    color: 8-bit RGB; else as OpenCV has it, in BGR.
     """
     if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
         return None
@@ -124,7 +124,7 @@ def decode_file(data: bytes, *, color: bool) -> Array | None:
 
 
 def _says_more_than_it_holds(png: bytes) -> bool:
-    """True if a PNG announces more than its bytes (OpenCV would allocate it).
+    """True if a PNG announces more than its bytes.
 
     Also without pixels, or with an unknown critical chunk.
     """

@@ -18,8 +18,7 @@ STL_HEADER, STL_FACE = 84, 50  # bytes; the header ends with the number of faces
 class TriangleMesh:
     """vertices (V, 3) float64 [m]; faces (F, 3) int64, counter-clockwise from outside.
 
-    is_closed: every edge has two faces in opposite directions, so there is an inside. note: ignored parts of the
-    file.
+    is_closed: every edge has two faces in opposite directions. note: ignored parts.
     """
 
     vertices: Float64
@@ -36,9 +35,8 @@ class TriangleMesh:
 def load_mesh(path: Path) -> TriangleMesh:
     """Load a mesh with trimesh (OBJ, STL, PLY, OFF, GLB, COLLADA), all parts as one.
 
-    Vertices at one place are merged: a texture seam is not a hole. COLLADA is scaled by its unit; its up axis
-    is ignored, as in RViz. Bytes after a binary STL's faces are ignored, with a note. Raises InputError if
-    unreadable, without triangles, or not finite.
+    Vertices at one place are merged. COLLADA is scaled by its unit; its up axis is ignored, as in RViz. Bytes after a
+    binary STL's faces are ignored, with a note. Raises InputError if unreadable, without triangles, or not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a mesh, got no such file")

@@ -36,7 +36,6 @@ class PlyFile:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Properties in the file's order."""
         return self.rows.dtype.names or ()
 
     def pairs(self) -> dict[str, str]:
@@ -58,7 +57,7 @@ class PlyFile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Element:
-    """properties: names and scalar types; a list has the types of its length and values, with a space between."""
+    """properties: names and scalar types; of a list, length and values, with a space between."""
 
     name: str
     count: int
@@ -123,8 +122,8 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
 def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
     """Write `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
 
-    Some readers want the vertex count in line three, so comments follow the properties; some stop outside ASCII,
-    which becomes backslash escapes. Raises UsageError for a comment of several lines, or a key with a colon.
+    Comments follow the properties: some readers want the vertex count in line three. Non-ASCII is escaped. Raises
+    UsageError for a comment of several lines, or a key with a colon.
     """
     fields: Mapping[str, Any] = rows.dtype.fields or {}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
@@ -254,9 +253,8 @@ _Line = tuple[int, list[str]]
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
     """Yield a CSV's points as (Q, 3) float64 [m], at most `POINTS_PER_BLOCK` at once.
 
-    Without a header (a first line not all numbers) it has three columns; other columns are ignored. Raises InputError
-    naming `name`, line and column for a missing column, a line of another length, or no finite number within
-    `MAX_PLACE`.
+    Without a header (a first line not all numbers) it has three columns; others are ignored. Raises InputError for a
+    missing column, a line of another length, or no finite number within `MAX_PLACE`.
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)

@@ -1,4 +1,4 @@
-"""File reads, and decompression to no more than announced, within a bound."""
+"""File reads, and bounded decompression to no more than announced."""
 
 import bz2
 from pathlib import Path
@@ -39,7 +39,7 @@ class BadBlockError(ValueError):
 
 
 class Budget:
-    """A bound on what a file unpacks to, so its size bounds the time."""
+    """A bound on what a file unpacks to."""
 
     def __init__(self, file_size: int) -> None:
         self._left = FREE_BYTES + MOST_RATIO * file_size

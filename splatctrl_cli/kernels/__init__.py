@@ -1,7 +1,7 @@
-"""Compiled kernels: numpy in, numpy out. Imports nothing of ours.
+"""Compiled kernels: numpy in, numpy out.
 
-`native` is the best for this processor's instruction set; SPLATCTRL_KERNELS=base or v3 forces a plainer one. v3
-(AVX2) and v4 (AVX-512) give the same bytes.
+`native` is the best for this processor; SPLATCTRL_KERNELS=base or v3 forces a plainer one. v3 (AVX2) and v4 (AVX-512)
+give the same bytes.
 """
 
 import importlib
@@ -41,9 +41,9 @@ MIN_CAP = 16  # threads allowed on any machine
 
 
 def num_threads(requested: int = 0) -> int:
-    """Return `requested`, capped at 16 or the number of usable processors, whichever is more.
+    """`requested`, capped at 16 or the number of usable processors, whichever is more.
 
-    0 means one per processor. Starting thousands takes minutes; results do not depend on it.
+    0 means one per processor. Results do not depend on it.
     """
     if 0 < requested <= MIN_CAP:
         return requested

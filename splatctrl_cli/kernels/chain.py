@@ -1,7 +1,7 @@
 """Spheres on a kinematic tree, gaps between them, and edges proved free.
 
-Shapes: B bodies, the base first, J = B - 1 joints, S spheres, T postures, P pairs; E straight edges in joint space, R
-rows (M moving spheres, then P pairs).
+B bodies, the base first, J = B - 1 joints, S spheres, T postures, P pairs; E straight edges in joint space, R rows (M
+moving spheres, then P pairs).
 """
 
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ class Chain(NamedTuple):
 def pair_gaps(centers: Float64, radii: Float64, pairs: Int64) -> tuple[Float64, Float64]:
     """Gaps (P,) [m] of sphere surfaces, unit directions (P, 3) from second to first centre.
 
-    centers (S, 3), radii (S,) [m]; pairs (P, 2). A direction is zero where the centres coincide.
+    centers (S, 3), radii (S,) [m]; pairs (P, 2). Zero direction where centres coincide.
     """
     gap, direction = np.empty(len(pairs)), np.empty((len(pairs), 3))
     native.pair_gaps(np.ascontiguousarray(centers), radii, pairs, gap, direction)
@@ -116,7 +116,7 @@ class EdgeRoom:
         )
 
     def among(self, balls: Float64, boxes: Float64, rods: Float64) -> "EdgeRoom":
-        """Return the arm among other solids."""
+        """Arm among other solids."""
         return replace(self, balls=balls, boxes=boxes, rods=rods)
 
     def advance(
@@ -134,8 +134,8 @@ class EdgeRoom:
         """Share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,).
 
         A row whose value less `rounding` is below `contact` [m] collides; one that an edge does not move loses
-        `still` [m] over it. Less than `give_up` [rad] before a collision stays unproved. With only_whole, an edge
-        that is not all free has share 0.
+        `still` [m] over it. Less than `give_up` [rad] before a collision stays unproved. With only_whole, other edges
+        have share 0.
         """
         share, num_checks = np.empty(len(start)), np.empty(len(start), np.int64)
         native.advance_edges(

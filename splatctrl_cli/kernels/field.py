@@ -1,7 +1,7 @@
 """Distances to spheres and on baked grids: typed wrappers.
 
-Shapes: N spheres as C clusters of `LANES`, in G groups of as many clusters; Q points, (X, Y, Z) cells. float32
-wants an origin near the data.
+N spheres as C clusters of `LANES`, in G groups of as many clusters; Q points, (X, Y, Z) cells. float32 wants an
+origin near the data.
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class GridSpan:
     """The cells centred at ``origin + voxel (i, j, k)``, i in [first, last), of a grid.
 
     origin (3,) [m], in the spheres' frame; `first`: a multiple of `BLOCK`; `last`: another, or the grid's end; mask
-    (blocks of the whole grid): zero where a block keeps its values.
+    (blocks of the grid): zero where a block keeps its values.
     """
 
     origin: Float64
@@ -59,7 +59,6 @@ class GridSpan:
 
     @property
     def arrays(self) -> tuple[Float64, float, Int64, UInt8 | None]:
-        """Arguments of the kernels."""
         sizes = np.array([*self.shape, self.first, self.last], dtype=np.int64)
         return self.origin, self.voxel, sizes, self.mask
 
@@ -69,7 +68,7 @@ class LogSumExp:
     """The terms of a kernel field.
 
     offsets: for culling; exact (16 C,): offsets [m] of Matern, log weights of the Gaussian; radii (16 C,) [m];
-    tolerance: of terms left out, their largest share of Matern's sum, or the largest rise [m] of the Gaussian.
+    tolerance: largest omitted share of Matern's sum, or largest rise [m] of the Gaussian.
     """
 
     is_matern: bool
@@ -84,7 +83,7 @@ class LogSumExp:
 def nearest(
     spheres: Clusters, radii: Offsets, points: Float32, *, threads: int = 0
 ) -> tuple[Float32, Float32, Int32]:
-    """``min_i |x - p_i| - r_i`` (Q,), its gradient (Q, 3), 0 at a centre, its entry (Q,)."""
+    """``min_i |x - p_i| - r_i`` (Q,), its gradient (Q, 3), 0 at a centre, and entry (Q,)."""
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     entry = np.empty(len(points), np.int32)
     native.field_nearest(*spheres, *radii, points, num_threads(threads), score, gradient, entry)
@@ -103,7 +102,7 @@ def matern(
 ) -> tuple[Float32, Float32]:
     """``-l log sum_i c_i exp(-(|x - p_i| - o_i) / l)`` (Q,) and its gradient (Q, 3).
 
-    sign (16 C,): c, 1 if None. Terms left out are at most the share `truncation` of the sum of sizes: without signs,
+    sign (16 C,): c, 1 if None. Omitted terms are at most the share `truncation` of the sum of sizes: without signs,
     the result rises by at most ``-l log(1 - truncation)``. NaN where the sum is not positive.
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
@@ -161,7 +160,7 @@ def safe(
 ) -> tuple[Float64, Float64] | None:
     """The smaller of `gaussian` and `nearest` (Q,), its gradient (Q, 3); `nearest` if equal or NaN.
 
-    points (Q, 3), in the frame of anchor (3,). None if one is not finite.
+    points (Q, 3), in anchor's (3,) frame. None if one is not finite.
     """
     score, gradient = np.empty(len(points)), np.empty((len(points), 3))
     is_finite = native.field_safe(
@@ -184,7 +183,7 @@ def safe(
 def row_sums(spheres: Clusters, has_sphere: UInt8, length: float, *, is_matern: bool, threads: int = 0) -> Float64:
     """``sum_j k(p_i, p_j)`` (16 C,) over entries in `has_sphere` (16 C,), j = i included; else 0.
 
-    Terms are rounded to 2^-24 and added as integers: order changes no bit.
+    Terms are rounded to 2^-24 and added as integers.
     """
     total = np.empty(len(has_sphere))
     native.field_density(*spheres, has_sphere, is_matern, length, num_threads(threads), total)
@@ -266,7 +265,7 @@ def touched_blocks(
 ) -> None:
     """Set is_touched (blocks) to 1 where spheres in `changed` (16 C,) can matter.
 
-    They matter to `bake_hard` if `length` is None (offsets: radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
+    For `bake_hard` if `length` is None (offsets: radii), else `bake_gaussian` (``2 l^2 log |w_i|``).
     """
     native.field_touched(
         *spheres,

@@ -1,6 +1,6 @@
 """Queries of many points: views through them, cubes, nearby splats and solids.
 
-Bytes equal the NumPy expressions in tests/reference/points.py, at any thread count.
+Bytes equal tests/reference/points.py, at any thread count.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def seen_through(
 
 @dataclass(frozen=True, kw_only=True)
 class CubeMeans:
-    """Statistics of K cubes ordered by place, x first, summed in the points' order.
+    """Statistics of K cubes ordered by place, x first.
 
     count (K,); mean center, color, color^2 (K, 3); covariance (K, 6) xx, xy, xz, yy, yz, zz; nearest (K,): first
     point nearest to the mean.
@@ -63,13 +63,13 @@ class Cubes:
         return len(self._native)
 
     def members(self) -> tuple[Int32, Int64]:
-        """Return the cube (N,) of each point, and the first point (K,) of each cube."""
+        """Cube (N,) of each point, and first point (K,) of each cube."""
         of_point, first = np.empty(len(self._points), np.int32), np.empty(len(self), np.int64)
         self._native.members(of_point, first, self._num_threads)
         return of_point, first
 
     def means(self, colors: Float32) -> CubeMeans:
-        """Return each cube's statistics."""
+        """Each cube's statistics."""
         num = len(self)
         count, nearest, covariance = np.empty(num), np.empty(num, np.int64), np.empty((num, 6))
         center, color, square = (np.empty((num, 3)) for _ in range(3))
@@ -90,7 +90,7 @@ class SplatTree:
         self._native: Any = native.SplatTree(np.ascontiguousarray(centers), np.ascontiguousarray(radii))
 
     def are_further(self, points: Floats, gap: float) -> Bool:
-        """Points (K, 3) further than `gap` [m] from each of the eight balls with the nearest centres."""
+        """Points (K, 3) over `gap` [m] from each of the eight balls with nearest centres."""
         out = np.empty(len(points), np.uint8)
         self._native.are_further(np.ascontiguousarray(points, np.float64), gap, out, self._num_threads)
         return out.view(bool)

@@ -1,8 +1,8 @@
 """Splat rasteriser, image loss and optimiser; anisotropic Gaussians: typed wrappers.
 
-Shapes: N splats or Gaussians, (H, W) pixels. `planes` (5, H, W): red, green, blue, depth [m], accumulated opacity.
-`parameters` of Gaussians (N, 59): centre (3) [m], log scales (3), wxyz quaternion (4, any length but zero), logit
-opacity, 16 spherical-harmonic coefficients each of red, green, blue.
+N splats or Gaussians, (H, W) pixels. `planes` (5, H, W): red, green, blue, depth [m], accumulated opacity.
+`parameters` of Gaussians (N, 59): centre (3) [m], log scales (3), wxyz quaternion (4, nonzero), logit opacity, 16
+spherical-harmonic coefficients each of red, green, blue.
 """
 
 from dataclasses import astuple, dataclass
@@ -76,7 +76,6 @@ class Rasteriser(PreparedView):
         return out.astype(bool)
 
     def splats_per_tile(self) -> float:
-        """Mean length of the tile lists."""
         return float(self.native.splats_per_tile())
 
 
@@ -95,8 +94,8 @@ class LossTerms:
 class LossWeights:
     """Weights of eq. 4; `normalised` compares depth divided by accumulated opacity.
 
-    opacity: of mean transmittance where there is depth, 0 in the paper; background: colour + (1 - opacity)
-    background is compared.
+    opacity: of mean transmittance where there is depth, 0 in the paper; background: colour + (1 - opacity) background
+    is compared.
     """
 
     dssim: float
@@ -136,7 +135,7 @@ class ImageLoss:
 
 @dataclass(frozen=True, kw_only=True)
 class OptimiserSettings:
-    """Learning rates and limits, in kernel order; see `SceneConfig`."""
+    """Learning rates and limits, in kernel order (`SceneConfig`)."""
 
     lr_center: float
     lr_log_radius: float
@@ -191,8 +190,6 @@ CENTER, LOG_SCALE, QUAT, LOGIT, HARMONICS = slice(0, 3), slice(3, 6), slice(6, 1
 
 
 class GaussianRasteriser(PreparedView):
-    """Renders a view of Gaussians."""
-
     def prepare(self, camera: Float64, parameters: Float32, degree: int = 3) -> None:
         """Project, colour (harmonics to `degree`), sort and bin for a `pack_camera` camera."""
         colors = np.empty((len(parameters), 3), np.float32)

@@ -1,4 +1,4 @@
-"""Solids and triangles: rendered depth, and distances; the same bytes at any thread count."""
+"""Solids and triangles: rendered depth, and distances; same bytes at any thread count."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -55,9 +55,9 @@ def render_surface(
 ) -> SurfaceImage:
     """Cast a ray through every pixel's centre; intrinsics (6,): fx, fy, cx, cy, width, height.
 
-    measured (H, W) [m], 0 = none: a point is inside a solid if over `tolerance` + `quadratic` depth^2 [m] behind
-    its front and before its back; triangles contain none. Solids around the camera and triangles that reach behind
-    it are not seen.
+    measured (H, W) [m], 0 = none: a point is inside a solid if over `tolerance` + `quadratic` depth^2 [m] behind its
+    front and before its back; triangles contain none. Solids around the camera and triangles reaching behind it do
+    not count.
     """
     shape = (int(intrinsics[5]), int(intrinsics[4]))
     depth, link, inside = np.empty(shape, np.float32), np.empty(shape, np.int16), np.empty(shape, np.int16)
@@ -121,9 +121,8 @@ def better(
 ) -> None:
     """Lower signed distances (N,) [m] of points (N, 3), in place, where triangles are nearer.
 
-    poses (4, 4): from points to each tree. Triangles beyond `within` (N,) [m] do not count, nor the inside for
-    points `outside` (N,). If `enough` (N,) [m] >= 0, any distance on the same side of `enough` and `within` will
-    do.
+    poses (4, 4): from points to each tree. Triangles beyond `within` (N,) [m] do not count, nor the inside for points
+    `outside` (N,). If `enough` (N,) [m] >= 0, any distance on the same side of both will do.
     """
     num = len(distance)
     native.signed_distance(

@@ -1,7 +1,7 @@
 """BiRRT: trees from start and goals grow towards samples and each other.
 
 RRT-Connect (Kuffner and LaValle, ICRA 2000) on batches of K samples and edges. Conservative advancement proves every
-edge free, also of shortcuts. J joints, G goals, W waypoints.
+edge. J joints, G goals, W waypoints.
 """
 
 import time
@@ -44,7 +44,6 @@ class Plan:
 
     @property
     def is_solved(self) -> bool:
-        """True with a path."""
         return self.outcome is PlanOutcome.SOLVED
 
 
@@ -103,10 +102,7 @@ class _Search:
         return check.free_share
 
     def grown(self, tree: _Tree, targets: Float64) -> Index:
-        """Grow `tree` towards targets (K, J) by at most `reach`, where all is free.
-
-        Nodes of partial growth, near contact, would be nearest to most samples but lead nowhere.
-        """
+        """Grow `tree` towards targets (K, J) by at most `reach`, where all is free."""
         near = tree.nearest(targets)
         way = targets - tree.q[near]
         way *= np.minimum(1.0, self.config.reach / np.maximum(np.linalg.norm(way, axis=1), 1e-12))[:, None]
@@ -155,9 +151,8 @@ class _Search:
 def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig, *, seed: int = 0) -> Plan:
     """Plan a path from start (J,) to one of goals (G, J) or (J,) [rad].
 
-    The same seed gives the same path. Running out of iterations or time is an outcome, not an error; only time
-    depends on the machine. Raises InputError for a start or goal outside the limits, NotEvaluableError for one in
-    collision, naming sphere and depth.
+    The same seed gives the same path. Running out of iterations or time is an outcome, not an error. Raises
+    InputError for a start or goal outside the limits, NotEvaluableError for one in collision.
     """
     began = time.perf_counter()
     roots = checked_postures(clearance, start, goals, config)
@@ -183,7 +178,7 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
 
 
 def checked_postures(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig) -> Float64:
-    """Return start and goals (1 + G, J) within limits and free. Raises as `plan`."""
+    """Start and goals (1 + G, J) within limits and free. Raises as `plan`."""
     model = clearance.model
     rows = [checked_posture(model, start, what="start")]
     several = np.atleast_2d(np.asarray(goals, dtype=np.float64))
@@ -210,10 +205,9 @@ def checked_postures(clearance: Clearance, start: Float64, goals: Float64, confi
 def shortened(
     clearance: Clearance, waypoints: Float64, config: PlannerConfig, random: np.random.Generator
 ) -> tuple[Float64, int, int]:
-    """Return a path (W', J) of proved edges, not longer, and the checks made.
+    """A path (W', J) of proved edges, not longer, and the checks made.
 
-    The shortest way over waypoints comes first. Each round then draws random shortcuts and takes the free one that
-    saves most.
+    After the shortest way over waypoints, each round takes the free one of random shortcuts that saves most.
     """
     path, num_edges, num_checks = _over_waypoints(clearance, waypoints, config)
     for _ in range(config.shortcut_rounds):

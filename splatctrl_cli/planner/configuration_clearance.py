@@ -1,4 +1,4 @@
-"""Scenes of solids, clearance of many postures, its loss over motions, and proofs of free edges.
+"""Scenes of solids, clearance of many postures and motions, and proofs of free edges.
 
 B postures, J joints; R rows: moving spheres, then pairs of spheres.
 """
@@ -55,7 +55,7 @@ Solid = Ball | Cuboid | Rod
 class Solids:
     """A `DistanceField` of solids: signed distance, negative inside, 1-Lipschitz.
 
-    Inside several solids: the depth in the deepest, at most the way out. Raises InputError for a size not above zero.
+    Inside several: the depth in the deepest. Raises InputError for a size not above zero.
     """
 
     solids: Sequence[Solid]
@@ -68,7 +68,7 @@ class Solids:
         object.__setattr__(self, "_packed", np.array([_packed(solid) for solid in self.solids]).reshape(-1, 16))
 
     def rows(self) -> tuple[Float64, Float64, Float64]:
-        """Return balls (., 4), boxes (., 15), rods (., 15) for `kernels.chain.EdgeRoom`."""
+        """Balls (., 4), boxes (., 15), rods (., 15) for `kernels.chain.EdgeRoom`."""
         balls, boxes, cylinders, capsules = (
             self._packed[self._packed[:, 0] == kind, 1:] for kind in (BALL, BOX, CYLINDER, CAPSULE)
         )
@@ -77,11 +77,11 @@ class Solids:
         return np.column_stack([-balls[:, 9:12], balls[:, 12]]), boxes, rods
 
     def distance(self, points: Float64) -> Float64:
-        """Return signed distances (Q,) at points (Q, 3), inf without solids."""
+        """Signed distances (Q,) at points (Q, 3), inf without solids."""
         return solid_distance(points, self._packed)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return distance (Q,) and central-difference gradient (Q, 3)."""
+        """Distance (Q,) and central-difference gradient (Q, 3)."""
         steps = STEP * np.eye(3)
         gradient = [(self.distance(points + step) - self.distance(points - step)) / (2 * STEP) for step in steps]
         return self.distance(points), np.stack(gradient, axis=1)
@@ -122,16 +122,16 @@ class HasDistance(Protocol):
     """A scene with distance but no gradient, such as `Solids`."""
 
     def distance(self, points: Float64) -> Float64:
-        """Return signed distance (Q,) [m] at points (Q, 3) [m], world."""
+        """Signed distance (Q,) [m] at points (Q, 3) [m], world."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
     """Signed distances of an arm's spheres to a scene and each other, less margins.
 
-    taken (R,) [m]: radii and margins to subtract; moving (M,) spheres; pairs (P, 2) of all spheres; levers (R, J): a
-    motion dq costs a row at most ``levers @ |dq|`` [m], if the scene's distance is 1-Lipschitz (exact ones are; else
-    `lipschitz` scales its rows). compiled: kernel for edges among `Solids`, None without a chain.
+    taken (R,) [m]: radii and margins; moving (M,) spheres; pairs (P, 2) of all spheres; levers (R, J): a motion dq
+    costs a row at most ``levers @ |dq|`` [m], if the scene's distance is 1-Lipschitz (else `lipschitz` scales its
+    rows). compiled: kernel for edges among `Solids`, None without a chain.
     """
 
     model: RobotModel
@@ -153,7 +153,7 @@ class Clearance:
         self_margin: float = 0.0,
         lipschitz: float = 1.0,
     ) -> "Clearance":
-        """Return an arm's clearance in a scene.
+        """An arm's clearance in a scene.
 
         margin [m] to the scene (one number, or (S,) per sphere); self_margin [m] less the model's allowance. Raises
         InputError if no sphere moves.
@@ -182,13 +182,13 @@ class Clearance:
         return room.in_scene(scene)
 
     def in_scene(self, scene: HasDistance) -> "Clearance":
-        """Return the same arm and margins in another scene."""
+        """Same arm and margins in another scene."""
         if self.compiled is None or not isinstance(scene, Solids):
             return replace(self, scene=scene)
         return replace(self, scene=scene, compiled=self.compiled.among(*scene.rows()))
 
     def rows(self, q: Float64) -> Float64:
-        """Return distances less margins (B, R) [m] at q (B, J).
+        """Distances less margins (B, R) [m] at q (B, J).
 
         Raises NotEvaluableError where the scene has no distance.
         """
@@ -212,15 +212,15 @@ class Clearance:
         return rows
 
     def at(self, q: Float64) -> Float64:
-        """Return the least row (B,) [m] at q (B, J)."""
+        """Least row (B,) [m] at q (B, J)."""
         return np.asarray(np.min(self.rows(q), axis=1))
 
     def speeds(self, motion: Float64) -> Float64:
-        """Return the largest loss (E, R) [m] over motions dq (E, J)."""
+        """Largest loss (E, R) [m] over motions dq (E, J)."""
         return np.asarray(np.abs(motion) @ self.levers.T)
 
     def worst(self, q: Float64) -> tuple[str, float]:
-        """Return the least row's name and value [m] at q (J,)."""
+        """Least row's name and value [m] at q (J,)."""
         row = self.rows(q[None])[0]
         return self.names[int(np.argmin(row))], float(np.min(row))
 
@@ -273,9 +273,8 @@ def check_edges(
 ) -> EdgeCheck:
     """Prove edges start (E, J) to end (E, J) free.
 
-    Less than `contact` [m] counts as collision: this bounds the checks and rejects grazing edges, never accepting a
-    false one. Less than `give_up` [rad] before a collision stays unproved. With `only_whole`, an edge's first
-    collision sets its free_share to 0.
+    Less than `contact` [m] counts as collision, which bounds the checks. Less than `give_up` [rad] before a collision
+    stays unproved. With `only_whole`, a collision sets an edge's free_share to 0.
     """
     if clearance.compiled is None or not isinstance(clearance.scene, Solids):
         return check_sampled_edges(clearance, start, end, contact=contact, give_up=give_up, only_whole=only_whole)

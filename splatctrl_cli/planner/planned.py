@@ -22,7 +22,7 @@ from splatctrl_cli.robot.model import RobotModel
 
 
 def resampled(waypoints: Float64, spacing: float) -> Float64:
-    """Return postures (K, J) at most `spacing` [rad] apart, with every waypoint."""
+    """Postures (K, J) at most `spacing` [rad] apart, with every waypoint."""
     rows = [waypoints[:1]]
     for a, b in pairwise(waypoints):
         num = max(int(np.ceil(np.linalg.norm(b - a) / spacing)), 1)
@@ -33,7 +33,7 @@ def resampled(waypoints: Float64, spacing: float) -> Float64:
 def effector_rates(
     model: RobotModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
-    """Return edge shares per second (W - 1,) within a frame's speeds [m/s], [rad/s].
+    """Edge shares per second (W - 1,) within a frame's speeds [m/s], [rad/s].
 
     Sampled `FRAME_SPACING` apart; infinite where an edge does not move it.
     """
@@ -50,7 +50,7 @@ def effector_rates(
 def timed(
     waypoints: Float64, velocity_limit: Float64, max_acceleration: float, *, max_rate: Float64 | None = None
 ) -> TimedPath:
-    """Return the fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
+    """Fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
 
     max_rate (W - 1,): limits edge shares per second. Raises InputError for fewer than two waypoints or limits not
     above zero.
@@ -83,8 +83,7 @@ NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision
 class PlannedPath:
     """A timed path, or None with the reason in outcome.
 
-    margin, self_margin [m]: reduced where start or goal is nearer. num_proved of num_edges edges are proved free.
-    seconds [s]: of planning.
+    margin, self_margin [m]: reduced where start or goal is nearer. seconds [s]: of planning.
     """
 
     outcome: str
@@ -108,9 +107,8 @@ def planned_path(
 ) -> PlannedPath:
     """Plan a path from start to goal pose, within the controller's frame speeds.
 
-    scene: lower bound of a 1-Lipschitz distance, so every edge is proved. Goal postures start from home, start and
-    random guesses. approach [m]: length of a straight last stretch along the frame's z axis, as
-    far as that is free.
+    scene: lower bound of a 1-Lipschitz distance. Goal postures start from home, start and random guesses. approach
+    [m]: straight last stretch along the frame's z axis, as far as free.
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame
@@ -164,10 +162,7 @@ def _found(
 
 
 def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: PlannerConfig) -> Plan:
-    """Return a path to the nearest goal (G, J) within `NEAREST_ITERATIONS`, else to any.
-
-    Two trees meet first at a goal with much free space around, not at a near one.
-    """
+    """A path to the nearest goal (G, J) within `NEAREST_ITERATIONS`, else to any."""
     nearest = goals[np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")]
     few = replace(planner, max_iterations=min(fixed.NEAREST_ITERATIONS, planner.max_iterations))
     found = plan(room, start, nearest[:1], few, seed=planner.seed)
@@ -177,9 +172,9 @@ def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: Pl
 def approach_to(
     room: Clearance, frame: str, goal: Float64, length: float, planner: PlannerConfig, control: ControlConfig
 ) -> Float64:
-    """Return postures (W, J) straight along the z axis of a goal's (J,) frame.
+    """Postures (W, J) straight along the z axis of a goal's (J,) frame.
 
-    They start up to `length` [m] before it, as far as postures and free edges lead there.
+    They start up to `length` [m] before it, as far as postures and edges are free.
     """
     model, way = room.model, [goal]
     T_world_goal = model.frame_pose(goal, frame)
@@ -219,7 +214,7 @@ def planned_detours(
     *,
     home: Float64 | None = None,
 ) -> PlanDetour:
-    """Return a planner of detours by `planned_path`, in the scene of the stall's stamp."""
+    """A planner of detours by `planned_path`, in the scene of the stall's stamp."""
 
     def detour(stamp_ns: int, q: Float64, T_world_goal: Float64) -> Detour | None:
         task = ReplayTask(start=q, T_world_goal=T_world_goal, frame=frame, stamp_ns=stamp_ns, home=home)
@@ -232,7 +227,7 @@ def planned_detours(
 def goal_postures(
     model: RobotModel, frame: str, T_world_goal: Float64, guesses: Float64, config: ControlConfig, *, at_most: int
 ) -> Float64:
-    """Return distinct postures (G, J) within limits that bring `frame` to a pose.
+    """Distinct postures (G, J) within limits that bring `frame` to a pose.
 
     They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, 0 if no guess (K, J) succeeds.
     """

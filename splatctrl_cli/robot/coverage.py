@@ -1,12 +1,12 @@
-"""Coverage of a robot's collision surface by its spheres: proven bounds, not samples.
+"""Coverage of a robot's collision surface by its spheres, with proven bounds.
 
 phi(p) = min_i |p - c_i| - r_i is positive exactly outside a union of balls, and is then the distance to it. Each term
 is convex, so over a triangle it is largest at a corner:
 
     max over the triangle of phi  <=  min_i max_k |v_k - c_i| - r_i,
 
-exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest corner phi agree
-to a tolerance. Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
+exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest corner phi agree.
+Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
 """
 
 import pickle
@@ -31,7 +31,7 @@ PAIRS_PER_CHUNK = 1_000_000  # of corners and spheres
 class Deficit:
     """Largest distance of a surface point outside all spheres: found <= truth <= proven [m].
 
-    Negative where all of the surface is inside (by at least ``-proven``). place (3,): of `found`.
+    Negative: all of the surface is inside. place (3,): of `found`.
     """
 
     proven: float
@@ -43,9 +43,9 @@ class Deficit:
 class LinkCoverage:
     """Coverage of one link's collision surface by its spheres and those fixed to it.
 
-    area [m2]; uncovered_area [m2], proven bounds; deficit: None without spheres; protrusion [m]: bound on how far
-    spheres leave the body, exact for a convex one; worst_sphere: its index in the sphere set, -1 without
-    spheres; is_closed: False if a hull replaced an open surface.
+    area [m2]; uncovered_area [m2], proven bounds; deficit: None without spheres; protrusion [m]: bound of spheres
+    beyond the body, exact for a convex one; worst_sphere: its index in the sphere set, -1 without spheres; is_closed:
+    False if a hull replaced an open surface.
     """
 
     link: str
@@ -60,7 +60,6 @@ class LinkCoverage:
 
     @property
     def is_covered(self) -> bool:
-        """True if the whole surface is proven to lie in spheres."""
         return self.deficit is not None and self.deficit.proven <= 0
 
     @property
@@ -84,12 +83,11 @@ class CoverageReport:
 
     @property
     def open_links(self) -> tuple[str, ...]:
-        """Links whose surface is not closed."""
         return tuple(link.link for link in self.links if not link.is_closed)
 
     @property
     def worst(self) -> LinkCoverage | None:
-        """The link with the largest proven deficit; None if a link is bare, because no distance bounds it."""
+        """The link with the largest proven deficit; None if a link is bare."""
         return None if self.bare_links else max(self.links, key=_proven)
 
     @property
@@ -113,8 +111,7 @@ def coverage_of_solids(
 ) -> CoverageReport:
     """Measure how spheres cover the `solids` of each link of `urdf`.
 
-    Spheres of any link joined by fixed joints count. Results are cached. Raises InputError for a sphere on an unknown
-    link.
+    Spheres of links joined by fixed joints count. Cached. Raises InputError for a sphere on an unknown link.
     """
     bodies = urdf.rigid_bodies()
     unknown = [link for link in spheres.links if link not in bodies]
@@ -127,7 +124,7 @@ def coverage_of_solids(
 
 @lru_cache(maxsize=32)
 def _measured(packed: bytes) -> CoverageReport:
-    """`coverage_of_solids` of pickled arguments, hashable as bytes."""
+    """`coverage_of_solids` of pickled, hashable arguments."""
     bodies, solids, spheres, resolution = pickle.loads(packed)
     leaders = {link: leader for link, (leader, _) in bodies.items()}
     measured = {leaders[link] for link in solids}
@@ -150,9 +147,9 @@ def _measured(packed: bytes) -> CoverageReport:
 
 
 def deficit_by_sphere(urdf: UrdfFile, spheres: SphereSet, report: CoverageReport) -> Float64:
-    """Return the proven deficit (S,) [m] of each sphere's rigid body; 0 without geometry.
+    """Proven deficit (S,) [m] of each sphere's rigid body; 0 without geometry.
 
-    Spheres of fixed links cover each other's surface, so the body's worst link counts.
+    The body's worst link counts.
     """
     leaders = {link: leader for link, (leader, _) in urdf.rigid_bodies().items()}
     worst: dict[str, float] = {}
@@ -165,7 +162,7 @@ def deficit_by_sphere(urdf: UrdfFile, spheres: SphereSet, report: CoverageReport
 def largest_deficit(
     triangles: Float64, centers: Float64, radii: Float64, *, tolerance: float = DEFICIT_GAP, floor: float = 0.0
 ) -> Deficit:
-    """Return the largest phi on `triangles`, between bounds that agree to `tolerance` [m].
+    """Largest phi on `triangles`, between bounds that agree to `tolerance` [m].
 
     Triangles below `floor` are not refined.
     """
@@ -186,9 +183,9 @@ def largest_deficit(
 def uncovered_area(
     triangles: Float64, centers: Float64, radii: Float64, *, resolution: float = COVERED_EDGE
 ) -> tuple[float, float, float]:
-    """Return the area [m2] with phi > 0: best guess, proven lower and upper bound.
+    """Area [m2] with phi > 0: best guess, proven lower and upper bound.
 
-    Triangles are halved until in one sphere, outside all, or no longer than `resolution` [m]; then their middle
+    Triangles are halved until in one sphere, outside all, or no longer than `resolution` [m], where the middle
     decides.
     """
     outside = unsure = guess = 0.0
@@ -209,12 +206,12 @@ def uncovered_area(
 
 
 def areas(triangles: Float64) -> Float64:
-    """Return triangle areas (F,) [m2]."""
+    """Triangle areas (F,) [m2]."""
     return np.asarray(0.5 * np.linalg.norm(face_normals(triangles), axis=1))
 
 
 def refined(triangles: Float64, longest: float) -> tuple[Float64, Float64]:
-    """Return the surface in triangles with edges up to `longest` [m], and their areas."""
+    """Surface in triangles with edges up to `longest` [m], and their areas."""
     parts = []
     pending = triangles
     while len(pending):

@@ -44,8 +44,7 @@ class ExpectedContact:
 class Declarations:
     """Declared entries in file order.
 
-    num_uses counts by (table, index) how often an entry changed a label or excused a contact: an unused one is stale
-    or wrong.
+    num_uses: by (table, index), how often an entry changed a label or excused a contact.
     """
 
     carried: tuple[Carried, ...] = ()
@@ -53,7 +52,7 @@ class Declarations:
     num_uses: dict[tuple[str, int], int] = field(default_factory=dict)
 
     def carried_at(self, time_s: float) -> list[tuple[str, Box]]:
-        """Return links and boxes carried at a time, in their frames."""
+        """Links and boxes carried at a time, in their frames."""
         return [(entry.link, entry.box) for entry in self.carried if entry.start <= time_s <= entry.end]
 
     def is_carried(self, link: str, points_link: Floats, time_s: float) -> Bool:
@@ -67,7 +66,7 @@ class Declarations:
         return inside
 
     def expects(self, link: str, point_world: Floats, time_s: float) -> ExpectedContact | None:
-        """Return the first entry for a contact at a point (3,) [m]; counts its use."""
+        """First entry for a contact at a point (3,) [m]; counts its use."""
         for index, entry in enumerate(self.expected_contact):
             if link == entry.link and entry.start <= time_s <= entry.end and entry.box.contains(point_world):
                 self.used("expected_contact", index, 1)
@@ -75,12 +74,11 @@ class Declarations:
         return None
 
     def used(self, table: str, index: int, count: int) -> None:
-        """Count uses of an entry."""
         if count:
             self.num_uses[table, index] = self.num_uses.get((table, index), 0) + count
 
     def carried_uses(self) -> list[dict[str, Any]]:
-        """Return carried entries with their number of points, for JSON."""
+        """Carried entries with their number of points, for JSON."""
         return [
             {
                 **{"link": entry.link, "start": entry.start, "end": entry.end},
@@ -91,14 +89,14 @@ class Declarations:
         ]
 
     def unused(self) -> list[tuple[str, int]]:
-        """Return (table, index) of unused entries."""
+        """(table, index) of unused entries."""
         counts = {"carried": len(self.carried), "expected_contact": len(self.expected_contact)}
         entries = [(table, index) for table, count in counts.items() for index in range(count)]
         return [entry for entry in entries if not self.num_uses.get(entry)]
 
 
 def carried_words(entry: Mapping[str, Any]) -> str:
-    """Return an entry of `Declarations.carried_uses` in words; warn if unused."""
+    """An entry of `Declarations.carried_uses` in words; warn if unused."""
     used = (
         f"{entry['num_uses']} points"
         if entry["num_uses"]
@@ -110,8 +108,7 @@ def carried_words(entry: Mapping[str, Any]) -> str:
 def read_declarations(path: Path, links: Collection[str] | None = None) -> Declarations:
     """Read declarations from TOML; `links`: of the robot, None if unknown.
 
-    Raises InputError for an unreadable file, unknown tables, keys or links, an invalid box, or an end before the
-    start.
+    Raises InputError for an unreadable file, unknown tables, keys or links, or an invalid box or time.
     """
     with refuse_faults(f"{path}: not valid TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=REMEDY):
         document = tomllib.loads(read_text(path, "give --declare a TOML file"))

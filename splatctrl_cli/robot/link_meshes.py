@@ -1,4 +1,4 @@
-"""Collision geometry of a robot's links as closed triangle surfaces, and exact distance to them, in float64."""
+"""Collision geometry of links as closed triangle surfaces, and exact distance to them, in float64."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -41,10 +41,10 @@ class MeshDistance:
         np.add.at(self._of_edge, self._edge.reshape(-1), np.repeat(self._of_face, 3, axis=0))
 
     def closest(self, points: Float64) -> tuple[Float64, Float64, Bool]:
-        """Return distance (Q,), nearest surface point (Q, 3) and is_inside (Q,).
+        """Distance (Q,), nearest surface point (Q, 3) and is_inside (Q,).
 
-        Inside by the angle-weighted normal of the nearest face, edge or vertex (Baerentzen, Aanaes, Signed distance
-        computation using the angle weighted pseudonormal, 2005), exact for a closed mesh; all False for an open one.
+        Inside by the angle-weighted normal of the nearest face, edge or vertex, exact for a closed mesh; all False
+        for an open one (Baerentzen, Aanaes, Signed distance computation using the angle weighted pseudonormal, 2005).
         """
         distance, face, shares = self._tree.closest(points)
         surface = np.einsum("qk,qka->qa", shares, self.mesh.corners[face])
@@ -54,11 +54,11 @@ class MeshDistance:
         return distance, surface, is_inside
 
     def distance(self, points: Float64, within: float = np.inf) -> Float64:
-        """Return distances (Q,), infinite beyond `within`."""
+        """Distances (Q,), infinite beyond `within`."""
         return self._tree.closest(points, within)[0]
 
     def signed(self, points: Float64) -> Float64:
-        """Return distances (Q,), negative inside a closed mesh."""
+        """Distances (Q,), negative inside a closed mesh."""
         distance, _, is_inside = self.closest(points)
         return np.where(is_inside, -distance, distance)
 
@@ -82,8 +82,8 @@ UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 class Solid:
     """A piece of a link's collision geometry, in the frame of `link` [m].
 
-    slack: the true surface's largest distance from the triangles. body: closed mesh for inside tests: the surface,
-    else its convex hull, None if flat. ball: centre (3,) and radius of a ball.
+    slack: the true surface's largest distance from the triangles. body: closed mesh for inside tests, or the convex
+    hull, None if flat. ball: centre (3,), radius.
     """
 
     link: str
@@ -122,10 +122,10 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
 
 
 def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path:
-    """Return a mesh's file.
+    """A mesh's file.
 
-    ``package://NAME/REST`` is NAME/REST, or REST in a folder called NAME, in one of `folders` or above the URDF; a
-    path without scheme is relative to the URDF. Raises InputError if not found.
+    ``package://NAME/REST`` is NAME/REST, or REST in a folder NAME, in `folders` or above the URDF; a path without
+    scheme is relative to the URDF. Raises InputError if not found.
     """
     name = mesh.filename
     above = [Path(urdf).resolve().parent, *Path(urdf).resolve().parent.parents]
@@ -156,8 +156,7 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
 class SolidDistance:
     """A bound on the signed distance (Q,) [m] of points (Q, 3), link frame, to solids.
 
-    The least to each: outside exact; inside no deeper than the truth, so the ball of that radius lies inside.
-    Unsigned for an open, flat surface.
+    The least to each: outside exact, inside no deeper than the truth. Unsigned for an open, flat surface.
     """
 
     def __init__(self, solids: Sequence[Solid]) -> None:
@@ -191,7 +190,7 @@ def _primitive(shape: Shape) -> Solid:
 
 
 def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
-    """Return the mesh in the link's frame. Raises InputError for an implausible length (another unit)."""
+    """Mesh in the link's frame. Raises InputError for an implausible length (another unit)."""
     vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
     length = float(np.ptp(vertices, axis=0).max())
     if not MESH_LENGTHS[0] <= length <= MESH_LENGTHS[1]:
@@ -217,7 +216,7 @@ def _unit_words(shape: MeshShape, length: float) -> str:
 
 
 def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
-    """Return the mesh's solids, link frame; an open mesh as closed pieces and rest."""
+    """Mesh's solids, link frame; an open mesh as closed pieces and rest."""
     whole = placed(shape, mesh)
     pieces = [whole] if whole.is_closed else _taken_apart(whole)
     return [

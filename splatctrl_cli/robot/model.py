@@ -1,6 +1,6 @@
 """A robot arm: forward kinematics and Jacobians of its collision spheres and frames.
 
-Pinocchio reads kinematics alone, so meshes may be missing. S spheres, J joints, T postures.
+Meshes may be missing. S spheres, J joints, T postures.
 """
 
 from bisect import bisect_right
@@ -34,10 +34,10 @@ class RobotModel:
     """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
     joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); middle (J,): of the limits, 0 without;
-    base_position (3,) [m]; sphere_set in link frames; frame_names: links that `frame_pose` knows; left_out: links of
-    the sphere file missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None if not
-    measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a surface point of the sphere's rigid body may
-    lie outside all spheres, NaN if unknown; held: locked fingers and their values.
+    base_position (3,) [m]; sphere_set in link frames; frame_names: links that `frame_pose` knows; left_out:
+    sphere-file links missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None for the
+    reason coverage_unknown; sphere_deficit (S,) [m]: `deficit_by_sphere`, NaN if unknown; held: locked fingers and
+    values.
     """
 
     def __init__(
@@ -102,8 +102,8 @@ class RobotModel:
     ) -> "RobotModel":
         """Build the robot of a URDF, with given spheres or the URDF's own.
 
-        T_world_base (4, 4) places the root link (default: world origin). locked fixes joints at values [rad or m],
-        with their mimics. packages: folders for ``package://``, before those above the URDF. Raises InputError.
+        T_world_base (4, 4): of the root link (default: world origin). locked: joints fixed at values [rad or m], with
+        mimics. packages: folders for ``package://``, as in `read_solids`. Raises InputError.
         """
         file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
         with refuse_faults(f"{file.path}: not a URDF that can be built", ValueError, RuntimeError):
@@ -119,9 +119,9 @@ class RobotModel:
         )
 
     def moved_by(self, names: Sequence[str]) -> "RobotModel":
-        """Return the robot for a log of these joints.
+        """Robot for a log of these joints.
 
-        Fingers that it does not move, and their mimics, are locked in the middle of their limits (`held`).
+        Unmoved fingers and their mimics are locked in the middle of their limits (`held`).
         """
         fingers = [name for name in self.urdf.fingers(names) if name in self.joint_names]
         if not fingers:
@@ -141,7 +141,7 @@ class RobotModel:
         )
 
     def carrying(self, boxes: Sequence[tuple[str, Box]]) -> "RobotModel":
-        """Return the robot with carried boxes in link frames, in its spheres and its surface."""
+        """Robot with carried boxes in link frames, in spheres and surface."""
         robot = RobotModel(
             self.urdf,
             self._model,
@@ -156,7 +156,7 @@ class RobotModel:
         return robot
 
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
-        """Return the robot with measured coverage; `unknown` explains a missing one."""
+        """Robot with measured coverage; `unknown` explains a missing one."""
         deficit = np.full(len(self.sphere_set.radii), np.nan)
         if coverage is not None:
             deficit = deficit_by_sphere(self.urdf, self.sphere_set, coverage)
@@ -170,7 +170,7 @@ class RobotModel:
         return self._surface
 
     def with_self_model(self, found: SelfModel) -> "RobotModel":
-        """Return the robot with a self-model's permanent parts; `surface_at` adds temporary ones."""
+        """Robot with a self-model's permanent parts; `surface_at` adds temporary ones."""
         return self._changed(_surface=self.surface.joined(found.pieces()), self_model=found, _surfaces={})
 
     @property
@@ -179,7 +179,7 @@ class RobotModel:
         return [] if self.self_model is None else self.self_model.changes()
 
     def surface_at(self, stamp_ns: int) -> RobotSurface:
-        """Return `surface` plus the temporary parts at a stamp [ns]."""
+        """`surface` plus the temporary parts at a stamp [ns]."""
         if self.self_model is None or not self.changes:
             return self.surface
         number = bisect_right(self.changes, stamp_ns)
@@ -188,21 +188,19 @@ class RobotModel:
         return self._surfaces[number]
 
     def at(self, stamp_ns: int) -> "RobotModel":
-        """Return the robot with its surface of a stamp [ns] for all times."""
+        """Robot with its surface of a stamp [ns] for all times."""
         return self._changed(_surface=self.surface_at(stamp_ns), self_model=None) if self.changes else self
 
     def extents(self) -> dict[str, list[float]]:
-        """Return `RobotSurface.extents` of each link in one bent posture."""
+        """`RobotSurface.extents` of each link in one bent posture."""
         q = np.asarray(0.3 * (1 + np.arange(len(self.joint_names)) % 3), np.float64)  # bent, so that each axis shows
         surface = self.surface
         return surface.extents(surface.poses({link: self.frame_pose(q, link) for link in surface.links}))
 
     def with_self_pairs(self, pairs: Index) -> "RobotModel":
-        """Return the robot with these `self_pairs` (P, 2)."""
         return self._changed(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2), _allowance=None)
 
     def with_self_allowance(self, allowance: Float64) -> "RobotModel":
-        """Return the robot with this `self_allowance` (P,) [m]."""
         return self._changed(_allowance=allowance)
 
     @property
@@ -236,13 +234,11 @@ class RobotModel:
 
     @property
     def held_words(self) -> str:
-        """Locked fingers and their values."""
         values = ", ".join(f"{name} = {value:g}" for name, value in self.held.items())
         return f"fingers that the log does not move are locked in their middle: {values}; --lock holds them elsewhere"
 
     @property
     def num_joints(self) -> int:
-        """J."""
         return len(self.joint_names)
 
     @property
@@ -252,22 +248,22 @@ class RobotModel:
         return Box(lower=self.base_position - reach, upper=self.base_position + reach)
 
     def sphere_centers(self, q: Float64) -> Float64:
-        """Return centres (S, 3) at q (J,)."""
+        """Centres (S, 3) at q (J,)."""
         return np.asarray(self.chain.centers(self._checked(q)[None])[0])
 
     def sphere_centers_batch(self, q: Float64, *, threads: int = 1) -> Float64:
-        """Return centres (T, S, 3) at q (T, J)."""
+        """Centres (T, S, 3) at q (T, J)."""
         postures = np.asarray(q, dtype=np.float64)
         if postures.ndim != 2 or postures.shape[1] != self.num_joints:
             raise InputError(f"joint positions: expected shape (T, {self.num_joints}), got {postures.shape}")
         return self.chain.centers(postures, threads=threads)
 
     def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
-        """Return centres (S, 3) and Jacobians (S, 3, J) at q (J,)."""
+        """Centres (S, 3) and Jacobians (S, 3, J) at q (J,)."""
         return self.chain.jacobians(self._checked(q))
 
     def frame_pose(self, q: Float64, frame: str) -> Float64:
-        """Return T_world_frame (4, 4) of a link at q (J,). Raises InputError for an unknown link."""
+        """T_world_frame (4, 4) of a link at q (J,). Raises InputError for an unknown link."""
         return np.vstack([self._framed(q, frame)[0], [0.0, 0.0, 0.0, 1.0]])
 
     def surface_gaps(
@@ -277,9 +273,9 @@ class RobotModel:
         radii: Floats,
         links: Collection[str] | None = None,
     ) -> dict[str, Float64]:
-        """Return the signed gap (T,) [m] of each meshed link to the nearest ball.
+        """Signed gap (T,) [m] of each meshed link to the nearest ball.
 
-        Balls (N, 3), (N,) [m], world; positions (T, J). It covers all of the link's geometry and what it carries.
+        Balls (N, 3), (N,) [m], world; positions (T, J). Carried boxes count.
         """
         surface = self.surface
         return {
@@ -298,7 +294,7 @@ class RobotModel:
         return {link: partial(self.surface.distance_to, link) for link in sorted(links)}
 
     def frame_jacobian(self, q: Float64, frame: str) -> Float64:
-        """Return a link origin's Jacobian (6, J), world axes: linear rows [m], then angular."""
+        """A link origin's Jacobian (6, J), world axes: linear rows [m], then angular."""
         return self._framed(q, frame)[1]
 
     def _framed(self, q: Float64, frame: str) -> tuple[Float64, Float64]:
@@ -308,18 +304,18 @@ class RobotModel:
         )
 
     def lever_arms(self) -> Float64:
-        """Return upper bounds (S, J) [m] on a centre's travel per radian (or metre) of a joint, in any posture."""
+        """Upper bounds (S, J) [m] on a centre's travel per radian (or metre), in any posture."""
         return lever_arms(self.chain, self.lower, self.upper)
 
     def reach(self) -> float:
-        """Return the radius [m] about the base that no sphere leaves (sum of link lengths)."""
+        """Radius [m] about the base that no sphere leaves (sum of link lengths)."""
         return float(np.max(self._lever_arms() + self.sphere_set.radii))
 
     def self_pairs(self, posture: Float64 | None = None, touching: float = 0.0) -> Index:
-        """Return pairs (P, 2) of spheres that could collide.
+        """Pairs (P, 2) of spheres that could collide.
 
         Excluded: pairs on one or adjacent bodies (fixed joints merge bodies), and pairs within `touching` [m] at
-        `posture` (J,) (default: `middle`). `with_self_pairs` replaces the default.
+        `posture` (J,) (default: `middle`).
         """
         if self._chosen_pairs is not None and posture is None:
             return self._chosen_pairs
@@ -333,7 +329,7 @@ class RobotModel:
         return np.stack([a[keep], b[keep]], axis=1).astype(np.int64)
 
     def joint_columns(self, log_joint_names: Sequence[str]) -> tuple[Index, Float64, Float64]:
-        """Return each joint's index, factor, offset (J,) in a log: ``position[order] * factor + offset``.
+        """Each joint's index, factor, offset (J,) in a log: ``position[order] * factor + offset``.
 
         An unlogged joint follows the one that it mimics. Raises InputError for missing joints.
         """
@@ -353,7 +349,7 @@ class RobotModel:
         return np.array(order, dtype=np.int64), np.array(factor), np.array(offset)
 
     def positions_of(self, log_joint_names: Sequence[str], position: Float64) -> Float64:
-        """Return a log's positions (..., J) in model order."""
+        """A log's positions (..., J) in model order."""
         order, factor, offset = self.joint_columns(log_joint_names)
         return np.asarray(position[..., order] * factor + offset)
 
@@ -420,7 +416,6 @@ class RobotModel:
 
 
 def _without(model: pinocchio.Model, locked: dict[str, float], path: Path) -> pinocchio.Model:
-    """Fix the joints of `locked` at their values."""
     names = [str(name) for name in model.names]
     for name, joint in zip(names[1:], list(model.joints)[1:], strict=True):
         if joint.nv != 1:

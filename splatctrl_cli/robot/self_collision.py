@@ -25,7 +25,7 @@ class DisabledPair:
 
 
 def read_srdf(path: Path, urdf: UrdfFile) -> tuple[tuple[DisabledPair, ...], tuple[DisabledPair, ...]]:
-    """Return the ``disable_collisions`` pairs within `urdf`, and those with an unknown link.
+    """``disable_collisions`` pairs within `urdf`, and those with an unknown link.
 
     Raises InputError for a file that is no SRDF, a pair without links, or no pair within the URDF.
     """
@@ -81,7 +81,6 @@ class SelfCollisionPairs:
 
     @property
     def left_out(self) -> tuple[LinkPair, ...]:
-        """Unchecked pairs of links."""
         return tuple(pair for pair in self.link_pairs if pair.left_out is not None)
 
 
@@ -93,11 +92,11 @@ def self_collision_pairs(
     seed: int = 0,
     drop_never: bool = False,
 ) -> SelfCollisionPairs:
-    """Return pairs of spheres that may collide.
+    """Pairs of spheres that may collide.
 
-    Omitted: links of one rigid body or joined by one joint, and `disabled` (an SRDF). Without `disabled`,
-    `num_postures` uniform postures decide: pairs always in contact are omitted, for no posture parts them. With
-    `drop_never` also those never nearer than NEVER_MARGIN: a guess from a sample, not a proof.
+    Omitted: links of one rigid body or joined by one joint, and `disabled` (an SRDF). Without `disabled`, pairs
+    always in contact over `num_postures` uniform postures are omitted. With `drop_never` also those never nearer than
+    NEVER_MARGIN: a guess from a sample.
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)
@@ -130,7 +129,7 @@ def self_collision_pairs(
 
 
 def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Index:
-    """Return `self_pairs` (P, 2) without links that `disabled` (an SRDF) names."""
+    """`self_pairs` (P, 2) without links that `disabled` (an SRDF) names."""
     off = {frozenset(pair.links) for pair in disabled}
     links, pairs = model.sphere_set.links, model.self_pairs()
     keep = [frozenset((links[a], links[b])) not in off for a, b in pairs]
@@ -138,7 +137,7 @@ def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Ind
 
 
 def fixtures(model: RobotModel) -> set[str]:
-    """Return links that stand still and carry no moving joint: table, post, base cover."""
+    """Links that stand still and carry no moving joint: table, post, base cover."""
     bodies = model.urdf.rigid_bodies(model.joint_names)
     moving = [joint for joint in model.urdf.joints if joint.name in model.joint_names]
     led = {joint.child for joint in moving}
@@ -146,7 +145,7 @@ def fixtures(model: RobotModel) -> set[str]:
 
 
 def joined_links(model: RobotModel, links: Sequence[str]) -> dict[frozenset[str], str]:
-    """Return inseparable pairs of links, and why: one rigid body, or one joint.
+    """Inseparable pairs of links, and why: one rigid body, or one joint.
 
     Fixtures are excepted from the latter.
     """
@@ -176,7 +175,7 @@ def _sampled_reason(gaps: Float64, drop_never: bool) -> str | None:
 
 
 def random_postures(model: RobotModel, num_postures: int, seed: int) -> Float64:
-    """Return uniform postures (T, J) within the limits; an unlimited joint turns once."""
+    """Uniform postures (T, J) within the limits; an unlimited joint turns once."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     lower, upper = np.where(limited, model.lower, -np.pi), np.where(limited, model.upper, np.pi)
     return np.random.default_rng(seed).uniform(lower, upper, (num_postures, model.num_joints))

@@ -47,7 +47,7 @@ BLOCK = 3  # cells along an edge
 
 
 def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
-    """Return up to `most` of M moments, in order, with the links farthest apart.
+    """Up to `most` of M moments, in order, with the links farthest apart.
 
     Farthest-point sampling by places and ways in between. T_world_link: (M, L, 4, 4).
     """
@@ -74,13 +74,13 @@ def learn(
     name: str = "recording",
     reach: float = REACH,
 ) -> SelfModel:
-    """Return the self-model that V frames show, in order of time.
+    """Self-model that V frames show, in order of time.
 
     T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
     link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
-    `NUM_CONFIGURATIONS` show it as a surface and at most `FREE_SHARE` see through it; most of a configuration's views
-    decide. It must also leave its place in
-    the world with the link, and move against each nearer link. Raises InputError where no link can be learned.
+    `NUM_CONFIGURATIONS` show it as a surface, and at most `FREE_SHARE` see through it; most views of one decide. It
+    must also leave its place in the world with the link, and move against each nearer link. Raises InputError where
+    no link can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
@@ -118,7 +118,7 @@ class _View:
     """An image: depth (H, W) float32 [m], and its explanation.
 
     links (h, w) int16: the link that explains each `stride`-th pixel, `UNEXPLAINED`, or `EXPLAINED` by some link;
-    points_world (M, 3) [m]: unexplained points.
+    points_world (M, 3) [m]: unexplained.
     """
 
     stamp_ns: int
@@ -261,8 +261,7 @@ def _stays_in_world(
 ) -> tuple[Bool, Bool]:
     """True for cells (N,) that stay in the world, and for cells that move enough.
 
-    A cell stays if views show a surface at its old place, `AWAY` from the new one, at least as often as they see
-    through it. Near a joint's axis none moves that far.
+    A cell stays if views show a surface at its old place, `AWAY` from the new one, as often as they see through it.
     """
     places, votes = _moved(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:

@@ -41,7 +41,7 @@ class Fused:
     free: Bool
 
     def within(self, run: slice) -> tuple[Float64, Bool, Bool]:
-        """Return a run's mean distance (N,) [m] or NaN, and where it is seen but not free, and free (R, N)."""
+        """A run's mean distance (N,) [m] or NaN; seen but not free, and free (R, N)."""
         total, weight = self.total[run].sum(axis=0), self.weight[run].sum(axis=0)
         mean = np.where(weight > 0.5, total / np.maximum(weight, 1e-9), np.nan).astype(np.float64)
         return mean, self.seen[run] & ~self.free[run], self.free[run]
@@ -49,8 +49,7 @@ class Fused:
     def is_robot(self, gap: Float64, run: slice, least: int, most_free: float) -> Bool:
         """True for cells (N,) inside a surface that is robot.
 
-        `least` configurations show it, at most a share `most_free` sees through; gap (N,) [m]: from the link's own
-        surface.
+        `least` configurations show it, at most a share `most_free` sees through; gap (N,) [m] as in `find_intervals`.
         """
         mean, seen, free = self.within(run)
         num, num_free = seen.sum(axis=0), free.sum(axis=0)
@@ -58,7 +57,7 @@ class Fused:
         return np.asarray(is_robot & (np.maximum(np.nan_to_num(mean, nan=TRUNCATION), VOXEL - gap) < 0))
 
     def votes(self, run: slice) -> Float32:
-        """Return votes (N,) of a run: surface configurations less `FREE_WEIGHT` per free one."""
+        """Votes (N,) of a run: surface configurations less `FREE_WEIGHT` per free one."""
         num, num_free = (self.seen[run] & ~self.free[run]).sum(axis=0), self.free[run].sum(axis=0)
         return np.asarray(num - FREE_WEIGHT * num_free, np.float32)
 
@@ -87,11 +86,11 @@ def _runs(fused: Fused) -> tuple[Index, Index]:
 
 
 def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> list[Interval]:
-    """Return the whole recording, and intervals shared by the runs of enough connected cells.
+    """Whole recording, and intervals shared by the runs of enough connected cells.
 
     Configurations that see through a cell before or after its run bound it. At a part's begin or end, some
-    configuration sees through `GONE` of it: edges of static objects are free in a few views, too. mask (X, Y, Z): of
-    the cells; gap (N,) [m] from the link's own surface; stamps (K,) [ns].
+    configuration sees through `GONE` of it. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's own surface;
+    stamps (K,) [ns].
     """
     num, rows = len(stamps), np.arange(len(stamps))[:, None]
     first, last = _runs(fused)
@@ -132,10 +131,10 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
 
 
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
-    """Return the number (N,) of the interval in which each cell is robot, -1 for none.
+    """Number (N,) of the interval in which each cell is robot, -1 for none.
 
     Votes of robot cells around it decide. In the whole recording, the first, cells next to robot need fewer
-    configurations: some rays pass structures as thin as a pixel.
+    configurations.
     """
     runs = [slice(interval.first, interval.last + 1) for interval in intervals]
     is_robot = np.array([fused.is_robot(gap, run, NUM_CONFIGURATIONS, FREE_SHARE) for run in runs])
@@ -150,7 +149,7 @@ def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence
 
 
 def spread_cells(mask: Bool, values: Array, rest: float) -> Float32:
-    """Return a grid (X, Y, Z) of values (N,) in the mask and `rest` elsewhere."""
+    """A grid (X, Y, Z) of values (N,) in the mask and `rest` elsewhere."""
     grid = np.full(mask.shape, np.float32(rest))
     grid[mask] = values
     return grid

@@ -1,7 +1,6 @@
 """Distances between a robot's link surfaces, and the margins that their spheres can keep.
 
-Spheres decide where far enough apart, else triangles, exactly (coal). A pair keeps less than the configured margin
-where no controller could keep it. T postures, J joints, S spheres, K pairs.
+Spheres decide where far enough apart, else triangles, exactly (coal). T postures, J joints, S spheres, K pairs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +34,7 @@ FLAT = 1e-9  # of a solid's size: rounding of a vertex's height above a face's p
 
 
 class LinkSurface:
-    """Collision surface of one link, in its frame: the triangles of all its solids."""
+    """Collision surface of one link, in its frame: the triangles of its solids."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
         parts = [solid.surface for solid in solids]
@@ -54,7 +53,7 @@ class LinkSurface:
         self._depths: list[Depth] = []
 
     def depth(self, points: Float64) -> float:
-        """Return the largest depth [m] of points (Q, 3), link frame; 0 outside or in open surfaces."""
+        """Largest depth [m] of points (Q, 3), link frame; 0 outside or in open surfaces."""
         is_near = np.zeros(len(points), dtype=np.bool_)
         for lower, upper in self._boxes:
             is_near |= np.all((points >= lower) & (points <= upper), axis=1)
@@ -65,9 +64,9 @@ class LinkSurface:
 
 
 def depth_in(solid: Solid) -> Depth:
-    """Return a function for depths (Q,) [m] in a closed solid, negative outside.
+    """A function for depths (Q,) [m] in a closed solid, negative outside.
 
-    In a convex one the least depth below the face planes is the surface distance, in a tenth of the time.
+    In a convex one, that is the least depth below the face planes.
     """
     corners = solid.surface.corners
     normals = face_normals(corners)
@@ -81,10 +80,10 @@ def depth_in(solid: Solid) -> Depth:
 
 
 def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
-    """Return the gap [m] of two surfaces, b at T_a_b (4, 4); negative where they overlap.
+    """Gap [m] of two surfaces, b at T_a_b (4, 4); negative where they overlap.
 
-    Exact between triangles, a lower bound for round shapes. A link inside the other overlaps it, although the
-    surfaces do not meet. The depth is the deepest vertex's, at least LEAST_OVERLAP.
+    Exact between triangles, a lower bound for round shapes. A link inside the other overlaps it. The depth is the
+    deepest vertex's, at least LEAST_OVERLAP.
     """
     here, there = coal.Transform3s(), coal.Transform3s(T_a_b[:3, :3], T_a_b[:3, 3])
     request, result = coal.DistanceRequest(), coal.DistanceResult()
@@ -132,7 +131,7 @@ class SelfSurfaces:
         self.names = tuple(f"{a} and {b}" for a, b in (*self.pairs, *((links[a], links[b]) for a, b in self._bare)))
 
     def gaps(self, q: Float64, centers: Float64, enough: float) -> Float64:
-        """Return gaps (T, K + P) [m] at postures (T, J).
+        """Gaps (T, K + P) [m] at postures (T, J).
 
         centers: (T, S, 3). Links' gaps are exact below `enough` [m], else lower bounds above it.
         """
@@ -155,11 +154,11 @@ class SelfSurfaces:
         return found
 
     def number_of(self, pair: LinkNames) -> int | None:
-        """Return two links' index in `pairs`, in either order; None if absent."""
+        """Two links' index in `pairs`, in either order; None if absent."""
         return next((number for number, own in enumerate(self.pairs) if own in (pair, pair[::-1])), None)
 
     def gaps_of(self, pair: LinkNames, q: Float64, centers: Float64, enough: float = np.inf) -> Float64 | None:
-        """Return one pair's gaps (T,) [m], as `gaps`; None for no such pair."""
+        """One pair's gaps (T,) [m], as `gaps`; None for no such pair."""
         if self.number_of(pair) is None:
             return None
         gaps = self._bounds([pair], centers)[:, 0]
@@ -168,7 +167,7 @@ class SelfSurfaces:
         return gaps
 
     def gap(self, q: Float64, pair: LinkNames) -> float:
-        """Return the gap [m] of two links' surfaces at q (J,), negative where they overlap."""
+        """A pair's gap [m] at q (J,), negative where its surfaces overlap."""
         for link in pair:
             if link not in self._surfaces:
                 self._surfaces[link] = LinkSurface(self._solids[link])
@@ -193,10 +192,10 @@ class SelfSurfaces:
 class KeptMargin:
     """Two links whose spheres keep `margin` [m] instead of the configured one.
 
-    margin: negative if the spheres may overlap; None: they cannot be separated, and the configured margin stays.
-    apart: least gap [m] of their surfaces (of their spheres if unknown) that is not *near* (`kept_margins`).
-    is_fixture: one stands still and carries none, such as a table. surface_gap: least gap [m] of their surfaces in
-    sampled postures that keep the margin, negative where they overlap; None if unknown.
+    margin: negative if the spheres may overlap; None: inseparable, so the configured margin stays. apart: least gap
+    [m] of their surfaces (of their spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one is in
+    `fixtures`. surface_gap: least gap [m] of their surfaces in sampled postures that keep the margin, None if
+    unknown.
     """
 
     links: tuple[str, str]
@@ -207,7 +206,7 @@ class KeptMargin:
 
 
 def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) -> tuple[KeptMargin, ...]:
-    """Return pairs of a moving link and one of `fixtures`, which no map contains.
+    """Pairs of a moving link and one of `fixtures`, which no map contains.
 
     They keep `margin` [m], or a share of their largest gap if that is less.
     """
@@ -220,13 +219,12 @@ def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) ->
 
 
 def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None) -> tuple[KeptMargin, ...]:
-    """Return pairs whose spheres often break `margin` [m], with the margin they keep.
+    """Pairs whose spheres often break `margin` [m], with the margin they keep.
 
     Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are within the
     margin or half their largest gap, whichever is less. The pair keeps the largest sphere gap of the near postures if
-    most others keep more: its row then excludes all sampled near postures. With too coarse spheres or unknown
-    surfaces, it keeps what nearly all other postures keep; in the latter case at least 0, for sphere contact is then
-    the only visible contact.
+    most others keep more. With too coarse spheres or unknown surfaces, it keeps what nearly all other postures keep;
+    in the latter case at least 0.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]
@@ -246,7 +244,7 @@ def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None
 
 
 def with_kept_margins(model: RobotModel, margin: float, kept: Sequence[KeptMargin]) -> RobotModel:
-    """Return the robot with self_allowance for these pairs, relative to `margin` [m]."""
+    """Robot with self_allowance for these pairs, relative to `margin` [m]."""
     less = {frozenset(pair.links): margin - pair.margin for pair in kept if pair.margin is not None}
     names = model.sphere_set.links
     allowance = [less.get(frozenset((names[a], names[b])), 0.0) for a, b in model.self_pairs()]
@@ -254,7 +252,7 @@ def with_kept_margins(model: RobotModel, margin: float, kept: Sequence[KeptMargi
 
 
 def least_gap(model: RobotModel, surfaces: SelfSurfaces | None, pair: KeptMargin, postures: Float64) -> float:
-    """Return a pair's least gap [m] at postures (T, J), exact below `pair.apart`."""
+    """A pair's least gap [m] at postures (T, J), exact below `pair.apart`."""
     gaps = None
     if surfaces is not None:
         gaps = surfaces.gaps_of(pair.links, postures, model.sphere_centers_batch(postures), pair.apart)
@@ -262,7 +260,7 @@ def least_gap(model: RobotModel, surfaces: SelfSurfaces | None, pair: KeptMargin
 
 
 def sphere_gaps(model: RobotModel, links: tuple[str, str], postures: Float64) -> Float64:
-    """Return the least sphere gap (T,) [m] of two links' `self_pairs` at postures (T, J)."""
+    """Least sphere gap (T,) [m] of two links' `self_pairs` at postures (T, J)."""
     names, radii, centers = model.sphere_set.links, model.sphere_set.radii, model.sphere_centers_batch(postures)
     a, b = np.array([(a, b) for a, b in model.self_pairs() if (names[a], names[b]) == links], dtype=np.int64).T
     gaps = np.linalg.norm(centers[:, a] - centers[:, b], axis=2) - radii[a] - radii[b]

@@ -1,4 +1,4 @@
-"""The robot's self-model: parts that move with its links beyond the URDF, as grids and surfaces."""
+"""The robot's self-model: parts that move with its links beyond the URDF."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -22,10 +22,10 @@ class LearnedLink:
     """A link seen in clearly different configurations, or a temporary part: a grasped object.
 
     Its parts last from start_ns to end_ns [ns], `ALWAYS` if unbounded. origin (3,) [m], link frame: first cell's
-    centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8 with a surface
-    there; triangles (F, 3, 3) [m], link frame: closed surfaces of parts beyond the visual surface. outside_95,
-    outside_most [m]: protrusion of 95 % and of all of their cells, most at place (3,) [m]; since [s] from the first
-    frame: when knowable. Without parts 0 and NaN. first_ns [ns]: first frame.
+    centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8 with a surface;
+    triangles (F, 3, 3) [m], link frame: closed surfaces of parts beyond the visual surface. outside_95, outside_most
+    [m]: protrusion of 95 % and all of their cells, most at place (3,) [m]; since [s] from the first frame: when
+    knowable. Without parts 0 and NaN. first_ns [ns]: first frame.
     """
 
     link: str
@@ -45,7 +45,7 @@ class LearnedLink:
     first_ns: int = 0
 
     def words(self, first_ns: int) -> str:
-        """Return the link's part, its times [s] after a stamp [ns] and protrusion, in words."""
+        """Link's part, its times [s] after a stamp [ns] and protrusion, in words."""
         start, end = (f"{1e-9 * (stamp - first_ns):.2f}" for stamp in (self.start_ns, self.end_ns))
         until = f" until {end} s" if self.end_ns != ALWAYS[1] else ""
         if self.start_ns != ALWAYS[0]:
@@ -55,7 +55,6 @@ class LearnedLink:
 
     @property
     def is_always(self) -> bool:
-        """True for a permanent part."""
         return (self.start_ns, self.end_ns) == ALWAYS
 
     @property
@@ -77,7 +76,7 @@ class SelfModel:
     unknown: Mapping[str, str]
 
     def pieces(self) -> list[tuple[str, Float64]]:
-        """Return links and triangles (F, 3, 3) [m], link frame, of permanent parts."""
+        """Links and triangles (F, 3, 3) [m], link frame, of permanent parts."""
         return [(part.link, part.triangles) for part in self.learned if part.is_always and len(part.triangles)]
 
     @property
@@ -86,20 +85,19 @@ class SelfModel:
         return [part for part in self.learned if not part.is_always and len(part.triangles)]
 
     def held_at(self, stamp_ns: int) -> list[tuple[str, Float64]]:
-        """Return the temporary parts at a stamp [ns]."""
+        """Temporary parts at a stamp [ns]."""
         return [(part.link, part.triangles) for part in self.held if part.start_ns <= stamp_ns < part.end_ns]
 
     @property
     def parts(self) -> list[LearnedLink]:
-        """Permanent and temporary parts."""
         return [part for part in self.learned if len(part.triangles)]
 
     def changes(self) -> list[int]:
-        """Return stamps [ns], in order, at which `held_at` may change."""
+        """Stamps [ns], in order, at which `held_at` may change."""
         return sorted({stamp for part in self.held for stamp in (part.start_ns, part.end_ns)} - set(ALWAYS))
 
     def arrays(self) -> dict[str, Array]:
-        """Return all of it by name, for a file."""
+        """All of it by name, for a file."""
         keys = [f"{part.link} {number}" for number, part in enumerate(self.learned)]
         rows = zip(keys, self.learned, strict=True)
         return {
@@ -137,7 +135,7 @@ class SelfModel:
 
 
 def surface_digest(surface: RobotSurface) -> str:
-    """Return sha256 of the links' geometry, except links that spheres replace."""
+    """Sha256 of the links' geometry, except links that spheres replace."""
     digest = hashlib.sha256()
     for number, link in enumerate(surface.links):
         if link not in surface.by_spheres:

@@ -2,7 +2,7 @@
 
 Files are URDFs, and YAML of this tool, robometrics and cuRobo. As in cuRobo (NVlabs/curobo, cuda_robot_generator.py),
 `collision_sphere_buffer`, a number or one per link, adds to every radius; `collision_spheres` may name a file; a
-sphere whose radius is then not above 0 is switched off, as for objects not attached yet.
+sphere whose radius is then not above 0 is switched off.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ RENAMED = (
 
 
 def spheres_of(urdf: UrdfFile) -> SphereSet:
-    """Return `own_spheres`. Raises InputError without any."""
+    """`own_spheres`. Raises InputError without any."""
     found = own_spheres(urdf)
     if not len(found.radii):
         others = len(urdf.meshes) + len(urdf.other_shapes) + sum(shape.kind != "sphere" for shape in urdf.shapes)
@@ -39,9 +39,9 @@ def spheres_of(urdf: UrdfFile) -> SphereSet:
 
 
 def own_spheres(urdf: UrdfFile) -> SphereSet:
-    """Return the spheres of a URDF with no other collision geometry.
+    """Spheres of a URDF with no other collision geometry.
 
-    Else none, as they would leave other shapes uncovered.
+    Else none.
     """
     has_others = urdf.meshes or urdf.other_shapes or any(shape.kind != "sphere" for shape in urdf.shapes)
     shapes = () if has_others else urdf.shapes
@@ -66,10 +66,10 @@ def with_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSe
 
 
 def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:
-    """Return the spheres by the URDF's link names, and the links missing there.
+    """Spheres by the URDF's link names, and the links missing there.
 
-    Those are left out, such as a hand not mounted. If no name agrees, names are compared without their first part:
-    `panda_link1` fits `fr3_link1`. Raises InputError about `name` if nothing fits even so.
+    Those are left out. If no name agrees, names are compared without their first part: `panda_link1` fits
+    `fr3_link1`. Raises InputError about `name` if nothing fits.
     """
     names = {link: link for link in urdf.links}
     asked = spheres.links
@@ -88,16 +88,15 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
 
 
 def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:
-    """True if the two have no link name in common."""
     return not set(spheres.links) & set(urdf.links)
 
 
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:
-    """Return bounds (S, J) on a centre's travel per radian (or metre) within the limits.
+    """Bounds (S, J) on a centre's travel per radian (or metre) within the limits.
 
     About its own joint the centre keeps to a circle, inside a ball about the circle's middle. Each joint towards the
-    base carries that middle on a circle in turn; the ball grows by its distance from the axis. 0 where the joint does
-    not move the sphere.
+    base carries that middle on a circle; the ball grows by its distance from the axis. 0 where the joint does not
+    move the sphere.
     """
     levers = np.zeros((len(chain.sphere_body), len(chain.parent) - 1))
     for s, (start, offset) in enumerate(zip(chain.sphere_body, chain.offset, strict=True)):
@@ -132,7 +131,7 @@ class SphereFile:
 
 
 def read_spheres(path: Path) -> SphereSet:
-    """Return the spheres of a file [m]; see `read_sphere_file`."""
+    """Spheres of a file [m]; see `read_sphere_file`."""
     return read_sphere_file(path).spheres
 
 
@@ -180,7 +179,7 @@ def read_sphere_file(path: Path) -> SphereFile:
 
 
 def spheres_yaml(spheres: SphereSet, comments: Sequence[str] = ()) -> str:
-    """Return YAML text of `spheres` by link, at full precision, with `comments` on top."""
+    """YAML text of `spheres` by link, at full precision, with `comments` on top."""
     lines = [*(f"# {comment}" for comment in comments), "collision_spheres:"]
     for link in dict.fromkeys(spheres.links):
         lines.append(f"  {link}:")
@@ -259,5 +258,5 @@ def _sphere(where: str, sphere: Any) -> list[float]:
 
 
 def sphere_names(spheres: SphereSet) -> tuple[str, ...]:
-    """Return each sphere's link and number on it: ``panda_hand[2]``."""
+    """Each sphere's link and number on it: ``panda_hand[2]``."""
     return tuple(f"{link}[{spheres.links[:index].count(link)}]" for index, link in enumerate(spheres.links))

@@ -7,8 +7,7 @@ centre c takes the protrusion
     K[c, p] = max_k |v_pk - c| + d(c),
 
 and the best n spheres are a k-centre problem: minimise the largest over p of the least K over centres. Greedy set
-cover at a bisected t gives centres, which alternating assignment and recentring improve; then balls shrink. Each
-patch ends up inside one ball: covered by construction. `coverage` measures it independently.
+cover at a bisected t gives centres, which alternating assignment and recentring improve; then balls shrink.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,9 +29,9 @@ DIGITS = 6  # decimals of a written sphere: micrometres
 class FitOptions:
     """Requirements on the spheres.
 
-    max_spheres: over all links; or max_protrusion [m], met by as few spheres as are found. max_deficit [m]: how far
-    surface points may stay outside.
-    restarts: greedy covers per link and protrusion; num_patches, num_candidates: approximate, per link.
+    max_spheres: over all links; or max_protrusion [m], met by as few spheres as are found. max_deficit [m]: of
+    surface points outside. restarts: greedy covers per link and protrusion; num_patches, num_candidates: approximate,
+    per link.
     """
 
     max_spheres: int | None = None
@@ -77,7 +76,7 @@ def _check(options: FitOptions, num_links: int) -> None:
 
 
 def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Float64]]:
-    """Distribute `budget` spheres: one t for all links, then singly to the most protruding."""
+    """Distribute `budget` spheres: one t for all links, the rest to the most protruding."""
     low, high = 0.0, max(link.single for link in links)
     chosen = [np.array([link.middle]) for link in links]
     for _ in range(FIT_BISECTIONS):

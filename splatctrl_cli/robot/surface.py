@@ -35,11 +35,10 @@ KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
 class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
-    kinds (P,) as in `kernels.surface_image`; sizes (P, 3) (half edges; radius and half length; or radius);
-    T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame of triangle_links (F,), as a `mesh` to draw and `trees`
-    by link number to measure. by_spheres: links of missing or unreadable geometry, where spheres replace it. notes:
-    replaced visual geometry, and why. fixed: links that no joint moves. num_carried: number of carried boxes, each
-    with its link again at the end of `links`.
+    kinds (P,), sizes (P, 3) as in `kernels.surface_image`; T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame
+    of triangle_links (F,), as a `mesh` to draw and `trees` by link number to measure. by_spheres: links whose
+    unreadable geometry spheres replace. notes: replaced visual geometry, and why. fixed: links that no joint moves.
+    num_carried: carried boxes, each with its link again at the end of `links`.
     """
 
     links: tuple[str, ...]
@@ -60,7 +59,7 @@ class RobotSurface:
     def of(cls, urdf: UrdfFile, spheres: SphereSet, folders: Sequence[Path] = ()) -> "RobotSurface":
         """Build the visual geometry of a URDF, else collision geometry, else spheres, by link.
 
-        folders: for ``package://``, before those above the URDF. Raises InputError for a mesh in another unit.
+        folders: as in `read_solids`. Raises InputError for a mesh in another unit.
         """
         seen = visual_urdf(urdf)
         pieces, unread = _read(seen, folders)
@@ -127,7 +126,7 @@ class RobotSurface:
         return cls.from_parts(balls, by_spheres=("spheres",))
 
     def with_boxes(self, boxes: Sequence[tuple[str, Box]]) -> "RobotSurface":
-        """Return the surface with carried boxes, each fixed to a link, in its frame."""
+        """Surface with carried boxes, each in the frame of its link."""
         shapes = [
             Shape(
                 link=link,
@@ -150,7 +149,7 @@ class RobotSurface:
         )
 
     def joined(self, pieces: Sequence[tuple[str, Float64]]) -> "RobotSurface":
-        """Return the surface with more triangles (F, 3, 3) [m], in frames of `links`."""
+        """Surface with more triangles (F, 3, 3) [m], in frames of `links`."""
         added = [np.full(len(part), self.links.index(link), np.int16) for link, part in pieces]
         triangles, owners = np.concatenate([self.triangles, *(p for _, p in pieces)]), self.triangle_links
         owners = np.concatenate([owners, *added])
@@ -166,18 +165,15 @@ class RobotSurface:
 
     @property
     def is_drawn(self) -> bool:
-        """True if visual meshes cover every link.
-
-        Then nothing but the robot is inside.
-        """
+        """True if visual meshes cover every link: all inside is robot."""
         return bool(self.trees) and not self.notes and not self.vague
 
     def poses(self, T_world_link: Mapping[str, Float64]) -> Float64:
-        """Return (L, 4, 4) of `links`, from poses by name."""
+        """(L, 4, 4) of `links`, from poses by name."""
         return np.array([T_world_link[link] for link in self.links], np.float64).reshape(-1, 4, 4)
 
     def extents(self, T_world_link: Float64) -> dict[str, list[float]]:
-        """Return box corners (lower, upper) [m] and area [m^2] by link, at T_world_link (L, 4, 4)."""
+        """Box corners (lower, upper) [m] and area [m^2] by link, at T_world_link (L, 4, 4)."""
         T = T_world_link[self.solid_links] @ self.T_link_solid
         half, areas = _half_extents(self.kinds, self.sizes, T[:, :3, :3]), _areas(self.kinds, self.sizes)
         T_link = T_world_link[self.triangle_links]
@@ -231,11 +227,10 @@ class RobotSurface:
         outside: Bool | None = None,
         num_threads: int = 1,
     ) -> Float64:
-        """Return signed distances (Q,) [m] of points (Q, 3), negative inside.
+        """Signed distances (Q,) [m] of points (Q, 3), negative inside.
 
         Infinite to triangles beyond `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0, any distance on the same
-        side of both bounds, which is faster. Points `outside` (Q,) of all triangles skip the slow inside test. Links
-        `without` do not count.
+        side of both bounds. Points `outside` (Q,) of all triangles skip the inside test.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)
@@ -249,7 +244,7 @@ class RobotSurface:
         return least
 
     def distance_to(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:
-        """Return signed distances (Q,) [m] of points (Q, 3), link frame, to one link.
+        """Signed distances (Q,) [m] of points (Q, 3), link frame, to one link.
 
         Carried boxes count. outside (Q,): known outside.
         """
@@ -257,7 +252,7 @@ class RobotSurface:
         return self.distance(still, points, without=[name for name in self.links if name != link], outside=outside)
 
     def gaps(self, link: str, T_world_link: Float64, centers: Floats, radii: Floats) -> Float64:
-        """Return a link's signed gap (T,) [m] to the nearest ball; infinite without balls.
+        """A link's signed gap (T,) [m] to the nearest ball; infinite without balls.
 
         Carried boxes count. Balls (N, 3), (N,) [m]; T_world_link (T, 4, 4).
         """

@@ -56,8 +56,8 @@ class Joint:
 class UrdfFile:
     """Checked text of a URDF, with links, joints and collision shapes.
 
-    A capsule becomes a cylinder and two spheres. other_shapes: (link, tag) of collision elements that are neither a
-    primitive nor a mesh; solid_links: links with a collision or visual element.
+    A capsule becomes a cylinder and two spheres. other_shapes: (link, tag) of other collision elements; solid_links:
+    links with a collision or visual element.
     """
 
     path: Path
@@ -82,7 +82,6 @@ class UrdfFile:
 
     @property
     def collision_links(self) -> tuple[str, ...]:
-        """Links with collision geometry, in order."""
         named = {
             *(s.link for s in self.shapes),
             *(m.link for m in self.meshes),
@@ -91,7 +90,7 @@ class UrdfFile:
         return tuple(link for link in self.links if link in named)
 
     def rigid_bodies(self, movable: Collection[str] | None = None) -> dict[str, tuple[str, Float64]]:
-        """Return the leader of each link's rigid body, and T_leader_link (4, 4).
+        """Leader of each link's rigid body, and T_leader_link (4, 4).
 
         Fixed joints merge links; the one nearest to the root leads. movable: joints that move (default: all not
         fixed); the others are at 0.
@@ -114,8 +113,7 @@ class UrdfFile:
     def grippers(self) -> tuple[str, ...]:
         """Joints typical of fingers.
 
-        They are several prismatic joints on one rigid body, or mimics and their leaders, without another kind of
-        joint beyond them.
+        Several prismatic joints on one rigid body, or mimics and their leaders, without another kind of joint beyond.
         """
         movable = [joint for joint in self.joints if joint.kind != "fixed"]
         leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
@@ -132,9 +130,9 @@ class UrdfFile:
         return tuple(joint.name for joint in movable if joint.name in found - carries_others)
 
     def fingers(self, moved: Collection[str]) -> tuple[str, ...]:
-        """Return `grippers` that stand still while the `moved` joints move.
+        """`grippers` that stand still while the `moved` joints move.
 
-        They are on the moved arm, but neither before a moved joint nor in step with one.
+        On the moved arm, but neither before a moved joint nor in step with one.
         """
         by_name = {joint.name: joint for joint in self.joints}
         busy = set(moved).union(*(self._before(by_name[name]) for name in moved if name in by_name))
@@ -152,7 +150,7 @@ class UrdfFile:
             yield joint.name
 
     def with_followers(self, locked: Mapping[str, float]) -> dict[str, float]:
-        """Return `locked` values, with unnamed joints that mimic them."""
+        """`locked` values, with unnamed joints that mimic them."""
         followers = {
             joint.name: joint.mimic[1] * locked[joint.mimic[0]] + joint.mimic[2]
             for joint in self.joints
@@ -164,8 +162,7 @@ class UrdfFile:
 def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
     """Read and check the URDF at `path`, or `text` under that name.
 
-    Raises InputError for no URDF, several roots, missing limits, a zero axis, or no movable joint (such as an
-    unexpanded xacro).
+    Raises InputError for no URDF, several roots, missing limits, a zero axis, or no movable joint.
     """
     text, root = _parse(path, _read(path) if text is None else text)
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
@@ -203,10 +200,7 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
 
 
 def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
-    """Return the URDF with visual instead of collision geometry, where a link has some.
-
-    without: unchanged links.
-    """
+    """URDF with visual instead of collision geometry where a link has some, not `without`."""
     root = ElementTree.fromstring(urdf.text)
     for link in root.findall("link"):
         is_seen = link.get("name") not in without

@@ -1,7 +1,4 @@
-"""The rasteriser as a torch function: for custom losses, and as the oracle of the fused optimiser.
-
-The fitter needs no torch.
-"""
+"""The rasteriser as a torch function, for custom losses and as the fused optimiser's oracle."""
 
 from typing import Any
 
@@ -25,7 +22,7 @@ def rasterise(
     """Planes (5, H, W), as in `kernels.raster` (eq. 1 to 3), differentiable.
 
     camera (18,): `scene.render.camera_array`; centers (N, 3) [m], world; radii (N,) [m]; opacities (N,); colors (N,
-    3); float32 on the CPU. No derivative by the camera.
+    3); float32 on the CPU.
     """
     planes: torch.Tensor = _Rasterise.apply(  # type: ignore[no-untyped-call]
         camera, centers, radii, opacities, colors, threads

@@ -1,4 +1,4 @@
-"""A fixed budget of splat slots. Dead ones stay, transparent, until reused."""
+"""A fixed budget of splat slots; dead ones stay, transparent, until reused."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class Seeds(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """Number of seeds that got a fresh slot, a reused slot, or none."""
+    """Seeds that got a fresh slot, a reused slot, or none."""
 
     added: int = 0
     relocated: int = 0
@@ -67,7 +67,7 @@ class SplatBuffer:
         return np.asarray(np.exp(self.parameters[:, LOG_RADIUS]), np.float32)
 
     def kill(self, slots: Bool) -> None:
-        """Make the slots of a mask (M,) dead: transparent, without moments, reusable."""
+        """Make slots of a mask (M,) dead: transparent, without moments, reusable."""
         self.is_alive[slots] = False
         self.parameters[slots, LOGIT] = DEAD_LOGIT
         self.labels[slots] = Label.OBJECT
@@ -97,9 +97,9 @@ class SplatBuffer:
         return Filled(added=count - num_reused, relocated=num_reused, unmet=len(seeds) - count)
 
     def copy(self, sources: NDArray[np.intp], opacities: Float64, radii: Float64) -> int:
-        """Copy slots `sources` (K,), with repetitions, into dead slots as available; return how many.
+        """Copy slots `sources` (K,), with repetitions, into available dead slots; return how many.
 
-        opacities (M,), radii (M,) [m]: new values for sources and copies. Labels are copied; moments restart.
+        opacities (M,), radii (M,) [m]: of sources and copies. Labels are copied; moments restart.
         """
         slots = np.flatnonzero(~self.is_alive)[: len(sources)]
         sources = sources[: len(slots)]
@@ -133,7 +133,6 @@ class SplatBuffer:
         )
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Whole state, by name."""
         return {
             "parameters": self.parameters,
             "first_moment": self.moments.first,

@@ -27,9 +27,9 @@ FRAME_NAMES = tuple(field.name for field in fields(RgbdFrame))
 
 
 def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
-    """Return splats, moments, occupancy, frames and counters: views, not copies.
+    """Splats, moments, occupancy, frames and counters: views, not copies.
 
-    No random state: each time step and block of refining seeds its own generator by number.
+    There is no random state: steps and blocks seed generators by number.
     """
     arrays: dict[str, NDArray[np.generic]] = dict(fitter.buffer.arrays())
     arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
@@ -116,7 +116,6 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
 
 
 def workspace_of(arrays: Arrays) -> Box:
-    """Workspace of a fitter's state."""
     lower, upper = np.asarray(arrays["workspace"], np.float64)
     return Box(lower=lower, upper=upper)
 

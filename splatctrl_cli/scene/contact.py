@@ -39,9 +39,9 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
 def count_carried(
     declared: Declarations, frame: RgbdFrame, mask: SelfMask, robot: RobotPosture, bare: RobotSurface, time_s: float
 ) -> None:
-    """Count the declared boxes that explain robot pixels, where the `bare` surface does not.
+    """Count declared boxes that explain robot pixels, where the `bare` surface does not.
 
-    bare: the robot's surface without what it carries; time_s: of the frame, from the first joint state.
+    bare: without what the robot carries; time_s: since the first joint state.
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     poses = dict(zip(surface.links, T_world_link, strict=True))
@@ -63,9 +63,8 @@ def contact_seeds(
 ) -> Seeds:
     """Seeds on objects near the robot without a splat's centre within `contact_radius`.
 
-    Their radius is half of it: larger splats stand out of a plane by more than the gaps are deep. mappable: pixels
-    (H, W) of each frame. The robot hides the contact, and depth edges have no return: the surface is assumed to
-    extend that far beyond its measured part.
+    Their radius is half of it: larger splats stand out of a plane. The surface is assumed to extend that far into
+    the hidden contact. mappable: pixels (H, W) of each frame.
     """
     radius = config.contact_radius
     beside = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)
@@ -85,9 +84,9 @@ def contact_seeds(
 def hidden_objects(
     buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig
 ) -> NDArray[np.intp]:
-    """Slots (K,) of objects within `ROBOT_REACH` of the robot, base included, that no pixel shows.
+    """Slots (K,) of objects within `ROBOT_REACH` of the robot or base that no pixel shows.
 
-    Images show the robot there; fitting would pull them out of their object.
+    Fitting would pull them out of their object.
     """
     if robot is None:
         return np.zeros(0, np.intp)

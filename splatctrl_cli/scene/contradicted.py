@@ -1,6 +1,6 @@
 """Rays through a surface that another camera measures: shiny or dark objects.
 
-Such an object is measured far behind its place, or returns no depth.
+Depth of such an object is far too large, or missing.
 """
 
 from collections.abc import Iterator
@@ -34,9 +34,8 @@ ALONG = np.array([[1.0, -2.0, 1.0]], np.float32)  # twice the deviation from the
 class Contradicted:
     """Blocks of `side` pixels (h, w) of a frame that another frame contradicts.
 
-    until (h, w) [m]: depth at which a block's rays cross the surface of another frame, 0 = they do not; is_blank (h,
-    w): the block has no depth; through (h, w) [m]: depth of the block's own surface where rays of another frame
-    cross it, 0 = none do.
+    until (h, w) [m]: depth where a block's rays cross another frame's surface, 0 = nowhere; is_blank (h, w): no
+    depth; through (h, w) [m]: depth of the block's surface where another frame's rays cross it, 0 = nowhere.
     """
 
     side: int
@@ -45,7 +44,7 @@ class Contradicted:
     through: Float32
 
     def pixels(self, shape: tuple[int, ...]) -> Bool:
-        """Pixels (H, W) whose depth is on no surface, as their rays cross another frame's."""
+        """Pixels (H, W) whose depth lies on no surface, as their rays cross another frame's."""
         return self._spread((self.until > 0) & ~self.is_blank, shape)
 
     def unproven(self, frame: RgbdFrame) -> RgbdFrame:
@@ -54,9 +53,9 @@ class Contradicted:
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
     def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Points (K, 3) [m], world, half a voxel apart on rays of its blocks, up to `until` or `through`.
+        """Points (K, 3) [m], world, half a voxel apart on its rays up to `until` or `through`.
 
-        is_blank: take the blocks without depth, or those with it.
+        is_blank: from blocks without depth, or with it.
         """
         end = np.maximum(self.until, self.through)
         v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
@@ -84,12 +83,12 @@ class _Surface:
 
 
 def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
-    """Yield for each frame of a time step what other frames or the drawn robot contradict.
+    """Yield what other frames or the drawn robot contradict in each frame of a step.
 
-    All rays of a contradicted block and its neighbours cross a surface of another frame. They end more than
-    `CONTRADICTED` [m] behind it, or return no depth, in range and outside stereo shadows. No return from the drawn
-    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong:
-    where others' rays cross at least `SEEN_THROUGH_PIXELS` adjacent blocks, these prove no space free.
+    All rays of a contradicted block and its neighbours cross another frame's surface. They end more than
+    `CONTRADICTED` [m] behind it, or have no return, in range and outside stereo shadows. No return from the drawn
+    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Where others' rays cross at least
+    `SEEN_THROUGH_PIXELS` adjacent blocks, these prove no space free.
     """
     surfaces = [_surface(*one) for one in seen]
     through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
@@ -115,7 +114,6 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
 
 
 def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
-    """Mask with contradicted depth marked."""
     return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
 
@@ -144,7 +142,7 @@ def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
 def _is_plane(depth: Float32) -> Bool:
     """True (h, w) where a depth differs from the plane through its neighbours by less than `MASK_STEP`.
 
-    Inverse depth of a plane is linear over the image, however it is tilted.
+    Inverse depth of any plane is linear over the image.
     """
     inverse = 1 / np.maximum(depth, np.float32(1e-3))
     bend = [cv2.filter2D(inverse, -1, line, borderType=cv2.BORDER_REPLICATE) for line in (ALONG, ALONG.T)]
@@ -173,7 +171,7 @@ class _Rays:
     def run_through(self, surface: _Surface, until: Float32) -> Index:
         """Write the depth of crossed surface points into `until` (h, w).
 
-        Returns the indices of those points behind which a ray measures depth.
+        Return indices of points behind which a ray measures depth.
         """
         pixel, z = pixels_at(self.frame, surface.points)
         width = self.frame.intrinsics.width

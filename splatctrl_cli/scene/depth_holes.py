@@ -1,8 +1,7 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
-Depth surrounds a hole. An object in it is on its rays, before what is seen around it. Rays of other cameras and later
-images clear it. Depth is also lost at depth edges: the nearer surface may extend there. A stereo shadow, which only
-one imager sees, is no such hole. Voxels near the robot that no camera ever saw get a reason.
+An object in a hole is on its rays, which rays of other cameras and later images clear. At depth edges without depth,
+the nearer surface may extend. Voxels near the robot that no camera ever saw get a reason.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,8 +31,8 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
     Some repeat. Rays are about a voxel apart, from `min_range` to the depth of the nearest pixel with depth. Holes
-    up to `NARROW_HOLE` voxels wide do not count, nor those at the robot or its stereo shadow, where background may
-    show. robot_depth (H, W) [m]: rendered, 0 = none.
+    up to `NARROW_HOLE` voxels wide do not count, nor those at the robot or its stereo shadow. robot_depth (H, W)
+    [m]: rendered, 0 = none.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
@@ -101,9 +100,8 @@ def lost_edges(
 ) -> dict[str, LostEdges]:
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
-    Its depth is that of the nearest object next to it. Its radius is one pixel: a surface shown there ends before
-    the next centre. Lone object pixels are noise. Balls that a frame sees through by `see_through` are left out.
-    Balls as near to the robot are left out, too: they are its outline.
+    Its depth is that of the nearest object next to it, its radius one pixel. Lone object pixels are noise. Balls
+    that a frame sees through by `see_through`, or that are as near to the robot, are left out.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
@@ -138,8 +136,7 @@ def shadowed(depth: Float32, focal: float) -> Bool:
     """Pixels (H, W) without depth in the shadow of something nearer in their row.
 
     depth (H, W) [m], 0 = none; focal [px]. With baseline B, an object at z hides B focal (1/z - 1/z_behind) pixels
-    behind it, always on the same side. Side and baseline are measured from the image (`_baseline`); z_behind is the
-    largest depth around connected pixels without depth.
+    behind it, always on the same side. The image gives side and baseline (`_baseline`), and z_behind (`_behind`).
     """
     is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
     for turn in (1, -1):  # the nearer object is right of its shadow, then left
@@ -161,8 +158,7 @@ def _baseline(depth: Float32, following: Index, focal: float) -> float:
     """Baseline [m] of shadows left of nearer objects; 0 without any.
 
     following (H, W): column of the next depth, W = none. Each step nearer by `SHADOW_STEP` gives a baseline by its
-    lost pixels. The median is over the higher half of the steps, weighted by height: fattened outlines cover low
-    steps' shadows.
+    lost pixels. The median is over the higher half of the steps, weighted by height.
     """
     following = following[:, 1:]
     before = depth[:, :-1]
@@ -209,7 +205,7 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> 
 
 
 def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> NDArray[np.uint16]:
-    """Return why a frame does not show points (K, 3) [m]: `Unseen` (K,)."""
+    """Reason `Unseen` (K,) why a frame does not show points (K, 3) [m]."""
     pixel, z = pixels_at(frame, points)
     is_in_view = pixel >= 0
     if frame.valid is not None:

@@ -1,4 +1,4 @@
-"""Descent of the loss of eq. 4 over the splats of a buffer."""
+"""Descent of the loss (eq. 4) over the splats of a buffer."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -28,7 +28,7 @@ class Descent:
     """Optimiser of a buffer's M splats, with noise drawn from seed and iteration.
 
     background: colour behind the splats, None until chosen. heard: called after each iteration. device: computes
-    `run` and `rendering`, which raise DeviceError if it fails; None: the processor computes them.
+    `run` and `rendering`, or raises DeviceError; None: the processor.
     """
 
     def __init__(
@@ -44,9 +44,9 @@ class Descent:
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
 
     def run(self, views: Sequence[View], settings: OptimiserSettings, depth: float = 1.0) -> dict[int, LossTerms]:
-        """Run an iteration on each view; return each view's last loss, by id.
+        """Run an iteration on each view; return their last losses, by id.
 
-        `depth` multiplies the weight of the depth loss.
+        depth: factor of the depth loss.
         """
         weights = self._weights()
         weights = replace(weights, depth=depth * weights.depth)
@@ -98,7 +98,6 @@ class Descent:
         return self._raster.forward()
 
     def rendering(self, view: View) -> Rendering:
-        """Render a view, on the device if there is one."""
         if self.device is None:
             planes = self.planes(view)
         else:
@@ -107,7 +106,6 @@ class Descent:
         return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
 
     def evaluate(self, view: View) -> LossTerms:
-        """Loss of a view."""
         return self._loss.evaluate(
             self.planes(view), view.target, self._weights(), empty_planes(*view.target.depth.shape)
         )
@@ -134,7 +132,7 @@ class Descent:
     def misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:
         """Colour error of each view where mappable, and summed blended opacity of each slot (M,).
 
-        The derivative of a summed colour plane by a splat's colour is the sum of its weights.
+        The derivative of a summed colour plane by a splat's colour is that sum.
         """
         background = np.array(self.background, np.float32)[:, None, None]
         misfits, shown = [], np.zeros(self._config.max_splats)

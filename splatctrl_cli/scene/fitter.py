@@ -61,7 +61,7 @@ from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 class SceneFitter:
     """Fits a fixed budget of isotropic splats to RGB-D frames.
 
-    The same frames and seed give the same bytes at any thread count; `checkpoint.fitter_state` is the whole state.
+    The same frames and seed give the same bytes at any thread count.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class SceneFitter:
     def refine(self, num_iterations: int, progress: Callable[[int], None] = lambda _: None) -> AuditRow:
         """Optimise a static scene over the window, with rates that fall to `final_rate`.
 
-        `progress` gets the iterations done after each of ten blocks; a restored fitter continues with the next.
+        `progress` gets the iterations after each of ten blocks; a restored fitter continues with the next.
         """
         views = [self.view(view.frame) for view in (*self.window.newest, *self.window.keyframes)]
         for block in range(self.refined.num_blocks, fixed.REFINE_BLOCKS):
@@ -221,7 +221,6 @@ class SceneFitter:
         )
 
     def splats(self) -> SplatSet:
-        """Live splats."""
         return self.buffer.splats(self.num_threads)
 
     def shell_splats(self) -> SplatSet | None:
@@ -230,7 +229,7 @@ class SceneFitter:
 
     @property
     def unrepresented(self) -> Balls:
-        """Occupied voxels, except the robot's, without a splat after the last time step or refining."""
+        """Occupied voxels, except the robot's, without a splat after the last step or refining."""
         if self._unrepresented is None:
             seen = [view.frame.depth[::8, ::8] for view in self.window.newest]
             depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0, np.float32)
@@ -250,7 +249,6 @@ class SceneFitter:
         self._unrepresented = balls
 
     def known_voxels(self) -> KnownVoxels:
-        """Present knowledge of space."""
         return self.occupancy.known(self.unrepresented)
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
@@ -330,7 +328,7 @@ class SceneFitter:
         return {reason: int(mask.sum()) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
-        """Fill dead slots at pixels of M_add; on the first full view, the density uses `fill` of the budget."""
+        """Fill dead slots at pixels of M_add; the first full view sets the density."""
         found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
         added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
         every = thinning(added)
@@ -377,8 +375,8 @@ class SceneFitter:
     ) -> Filled:
         """Add splats where measured surfaces are far from all spheres, in alternate halves per step.
 
-        The robot's surface has spheres of its own. If slots are missing for other surfaces, splats are evicted
-        every EVICT_EVERY steps, and counted in `removed`.
+        The robot's surface has its own spheres. For missing slots, splats are evicted every EVICT_EVERY steps, and
+        counted in `removed`.
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
@@ -411,9 +409,9 @@ class SceneFitter:
     def _is_lasting(
         self, robot: RobotPosture | None, views: Sequence[View], lasting: Sequence[Bool], points: Float32
     ) -> Bool:
-        """Points (K,) that a `lasting` pixel (H, W) shows, or that are not near a link that no joint moves.
+        """Points (K,) that a `lasting` pixel (H, W) shows, or not near unmoved links.
 
-        Stereo gives pixels outside of an outline the link's depth in some frames: splats there would float.
+        Stereo gives pixels outside an outline the link's depth in some frames.
         """
         if robot is None:
             return np.ones(len(points), bool)
@@ -433,9 +431,9 @@ class SceneFitter:
     def _show_contact(
         self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, steady: Sequence[Bool]
     ) -> Filled:
-        """Give objects near moving links splats of half `contact_radius`, at most `contact_radius` apart.
+        """Give objects near moving links splats of half `contact_radius`, at most that radius apart.
 
-        Only `steady` pixels (H, W) count: noise would stay while the arm hides it.
+        Only `steady` pixels (H, W) count.
         """
         if robot is None:
             return Filled()
@@ -454,7 +452,7 @@ class SceneFitter:
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
         """Put object splats near the robot on measured depth, and shrink those that stand out.
 
-        They shrink down to half of `contact_radius`; hidden splats get at most that radius at once.
+        They shrink to no less than half of `contact_radius`; hidden splats get at most that at once.
         """
         if robot is None:
             return
@@ -477,7 +475,7 @@ class SceneFitter:
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf
     ) -> Bool:
-        """Points (K,) that no view sees through by the smaller of `see_through` and `least` [m]: others are noise.
+        """Points (K,) that no view sees through by the smaller of `see_through` and `least` [m].
 
         least 0 counts as unlimited.
         """

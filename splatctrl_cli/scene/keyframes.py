@@ -47,8 +47,7 @@ def make_view(
 ) -> View:
     """View of `frame`; `mappable` (H, W): pixels with depth in the workspace.
 
-    is_robot (H, W): the robot's pixels. Pixels without depth count in the colour loss. Pixels that are invalid,
-    `mounted`, or outside the workspace do not count.
+    The colour loss counts pixels without depth, but none that are invalid, `mounted`, or outside the workspace.
     """
     counted = mappable | (frame.depth <= 0)
     if frame.valid is not None:
@@ -75,8 +74,8 @@ def seen_through(
 ) -> Bool:
     """Splats (N,) that float: nearer than every valid depth around their pixel in some view.
 
-    "Around" is as in `nearest_depth`, "nearer" by more than `tolerance` [m]: silhouettes and noise remove none. This
-    is finer than voxels: one with a surface and the air before it stays occupied. label: of the splats.
+    "Around" is as in `nearest_depth`, "nearer" by more than `tolerance` [m]. This is finer than voxels. label: of the
+    splats.
     """
     cameras = [view.camera for view in views]
     nearest = [view.nearest if label == Label.ROBOT else view.nearest_object for view in views]
@@ -84,11 +83,11 @@ def seen_through(
 
 
 def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
-    """Move centres (N, 3) [m], world, that float by up to `most` [m] onto the measured surface.
+    """Move centres (N, 3) [m], world, floating up to `most` [m], onto the measured surface.
 
     A centre floats if all views that see it measure more depth at its pixel and around it. It moves to the least of
-    these depths, along the ray with the smallest step. A view that measures depth more than `most` before the
-    centre does not see it.
+    these depths, along the ray with the smallest step. Views that measure depth more than `most` before it do not see
+    it.
     """
     least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
     for view in views:
@@ -106,10 +105,10 @@ def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
 def kept_radii(
     centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
 ) -> Float32:
-    """Radii (N,) [m] that keep spheres within measured depth, shrunk to no less than `least` [m].
+    """Radii (N,) [m] that keep spheres within measured depth, `least` [m] or more.
 
     A sphere shrinks while a point of its edge floats by more than `tolerance` [m] before depth around its pixel in
-    some view. So it does while its nearest point floats before the centre pixel's depth.
+    some view. So it does while its nearest point floats before its pixel's depth.
     """
     cameras = [view.camera for view in views]
     depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]

@@ -22,7 +22,7 @@ def relabel(
     """Relabel the splats; return trails (M,): robot or human before, object now.
 
     Without a posture, robot splats keep their label. Robot pixels overrule human masks. A robot splat that depth
-    shows to be an object is no trail; its radius becomes at most `least` [m], as no object's depth has bounded it.
+    shows to be an object is no trail; its radius becomes at most `least` [m].
     """
     labels = np.where(human_splats(buffer, occupancy), np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     if robot is None:
@@ -42,9 +42,8 @@ def relabel(
 def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture, seen: Seen) -> tuple[Bool, Bool]:
     """Splats (M,) of the robot, and those that a pixel shows to be an object.
 
-    The pixel whose depth a splat explains best decides. Splats that no pixel shows keep their label, since the
-    robot hides objects; its own must be within `see_through` of its body. Others well inside the body become robot,
-    in solid voxels only if all of it is drawn.
+    The pixel whose depth a splat explains best decides. Hidden splats keep their label; the robot's must be within
+    `see_through` of its body. Others well inside the body become robot, in solid voxels only if all of it is drawn.
     """
     alive, config = buffer.is_alive, occupancy.config
     kind = shown_kinds(buffer.centers, seen, config)
@@ -62,8 +61,8 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
 def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
     """`PixelKind` (N,) of the pixel with depth nearest to centers (N, 3) [m], world.
 
-    OBJECT within `see_through`, unless nearer to the rendered robot; ROBOT within its tolerance, without what it
-    occludes; else NOTHING.
+    OBJECT within `see_through`, unless nearer to the rendered robot; ROBOT within its tolerance, not behind it; else
+    NOTHING.
     """
     best = np.full(len(centers), np.inf, np.float32)
     kinds = np.full(len(centers), PixelKind.NOTHING, np.uint8)
@@ -84,7 +83,7 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:
     """Splats (M,) in voxels that human pixels hit.
 
-    They stay human while one of the eight nearest voxels is: the surface is a voxel thick, and splats move.
+    They stay human while one of the eight nearest voxels is.
     """
     is_in = occupancy.entity_at(buffer.centers) & Label.HUMAN > 0
     was_human = buffer.is_alive & (buffer.labels == Label.HUMAN)

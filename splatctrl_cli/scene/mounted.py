@@ -1,7 +1,6 @@
 """Pixels of what is mounted on a moving camera, such as a gripper.
 
-They stay the same while the world moves: they are neither seeded nor compared. A known robot has a model instead
-(`labels`).
+They are neither seeded nor compared. A known robot has a model instead (`labels`).
 """
 
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 
 
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """The first frames, at most `MOUNTED_MAX_VIEWS`, that are more than `MOUNTED_APART` [m] apart."""
+    """The first frames, at most `MOUNTED_MAX_VIEWS`, over `MOUNTED_APART` [m] apart."""
     chosen: list[RgbdFrame] = []
     places: list[Float64] = []
     for frame in frames:
@@ -43,9 +42,9 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
 
 
 def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tuple[float, float, float]:
-    """Median colour in [0, 1] of counted pixels (H, W) away from depth; black if too few.
+    """Median colour in [0, 1] of counted pixels (H, W) away from depth, else black.
 
-    Surroundings out of range, dark or bright lose depth in whole areas; a hole has depth around it.
+    Surroundings lose depth in whole areas; a hole has depth around it.
     """
     parts = []
     for frame, mask in zip(frames, counted, strict=True):

@@ -45,8 +45,8 @@ class OccupancyMap:
     def take_in(self, frames: Sequence[RgbdFrame]) -> None:
         """Add the depth images of one time step; human pixels set the human bit.
 
-        Rays that pass a voxel clear its human and solid bits. If masked images hit it with other pixels alone, these
-        clear the human bit, too. Occluded people stay.
+        Rays that pass a voxel clear its human and solid bits. If masked images hit it with other pixels alone, they
+        clear the human bit, too.
         """
         self._begin_step(frames)
         self._was_free = self.log_odds < 0
@@ -63,7 +63,7 @@ class OccupancyMap:
             self._label_hits(frame, mask != 0, set_bits=Label.HUMAN)
 
     def _begin_step(self, frames: Sequence[RgbdFrame]) -> None:
-        """Count a time step by its earliest stamp; at `MAX_STEPS`, every second one merges into its predecessor."""
+        """Count a time step by its earliest stamp; at `MAX_STEPS`, pairs of steps merge."""
         if len(self.step_stamps_ns) == MAX_STEPS:
             self.step_stamps_ns = self.step_stamps_ns[::2]
             is_step = self.last_seen < min(Unseen)
@@ -71,7 +71,7 @@ class OccupancyMap:
         self.step_stamps_ns.append(min(frame.stamp_ns for frame in frames))
 
     def integrate(self, frame: RgbdFrame) -> None:
-        """Add one depth image: voxels are free along its rays, hit at their ends, and both last seen now."""
+        """Add one depth image: voxels are free along its rays, hit at their ends."""
         integrate_depth(
             self._packed,
             self.log_odds,
@@ -129,9 +129,9 @@ class OccupancyMap:
     def label_robot(self, centers: Float64, radii: Float64, seen: Sequence[tuple[RgbdFrame, Bool, Bool]]) -> None:
         """Set the robot bit only where spheres (S, 3), (S,) [m] or pixels show the robot.
 
-        seen: frames of one time step, pixels (H, W) of robot and objects. A voxel that an object pixel hits is
-        solid, not robot, until rays pass or robot pixels alone hit. A swept voxel that becomes solid falls to the
-        log-odds of one hit: robot pixels do not count for an object.
+        seen: frames of one time step, pixels (H, W) of robot and objects. A voxel that an object pixel hits is solid,
+        not robot, until rays pass or robot pixels alone hit. A swept voxel that becomes solid falls to the log-odds
+        of one hit.
         """
         was_solid = self.entity & SOLID > 0
         self.mark_robot(centers, radii)
@@ -147,9 +147,9 @@ class OccupancyMap:
         self._hide_beside(arrived, math.ceil(len(self.edges) / max(len(seen), 1)))
 
     def _hide_beside(self, arrived: NDArray[np.intp], num_steps: int) -> None:
-        """Forget views of the space within `HIDDEN` of voxels (K, 3), unless of the last `num_steps` time steps.
+        """Forget views of space within `HIDDEN` of voxels (K, 3), before the last `num_steps` steps.
 
-        An object arrived in these, and its unseen side may fill that space. Every camera took part in so many steps.
+        The unseen side of an object that arrived may fill that space.
         """
         reach = math.ceil(HIDDEN / self.config.voxel)
         around = (arrived[:, None] + np.argwhere(np.ones(3 * [2 * reach + 1])) - reach).reshape(-1, 3)
@@ -161,8 +161,7 @@ class OccupancyMap:
     def forget_hidden(self, centers: Float64, radii: Float64, distance: Callable[[Float32], Float64]) -> None:
         """Clear solid voxels within the robot that connect to none outside.
 
-        Their object left while the contact was hidden. Spheres (S, 3), (S,) [m] contain the robot; distance: points
-        (Q, 3) -> signed distance (Q,) [m].
+        Spheres (S, 3), (S,) [m] contain the robot; distance: points (Q, 3) -> signed distance (Q,) [m].
         """
         reach = radii.max() + 2.0 * self.config.voxel
         low, high = ((f - self.origin) / self.config.voxel for f in (centers.min(axis=0), centers.max(axis=0)))
@@ -210,10 +209,9 @@ class OccupancyMap:
         return bits
 
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
-        """Largest occupancy (N,) of the eight nearest voxels, and True (N,) if one of them was ever seen.
+        """Largest occupancy (N,) of the eight nearest voxels; True (N,) if any was seen.
 
-        The eight reach half a voxel to all sides: a surface that near supports a splat. Never-seen voxels do not
-        count; if all eight are never seen, the occupancy is one half.
+        Never-seen voxels do not count; if all eight are never seen, the occupancy is one half.
         """
         base = np.floor((points_world - self.origin) / self.config.voxel).astype(np.int64)
         limit = np.array(self.log_odds.shape) - 1
@@ -227,14 +225,14 @@ class OccupancyMap:
         return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32), is_observed
 
     def occupied_voxels(self) -> NDArray[np.intp]:
-        """Flat indices (K,) of voxels hit more than once, as one may be noise, except the robot's."""
+        """Flat indices (K,) of voxels hit more than once, except the robot's."""
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
         voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))
         return voxels[~self._may_be_robot(voxels)]
 
     def _may_be_robot(self, voxels: NDArray[np.intp]) -> Bool:
-        """True for voxels (K,) swept, without an object since: they stay occupied a while."""
+        """True for voxels (K,) swept, without an object since."""
         return np.asarray(self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) == SWEPT)
 
     def swept_box(self) -> Box | None:
@@ -256,7 +254,6 @@ class OccupancyMap:
         return self.centers_of(self.occupied_voxels())
 
     def grid(self) -> OccupancyGrid:
-        """Copy of the present grid."""
         return OccupancyGrid(
             origin=self.origin.copy(),
             voxel=self.config.voxel,
@@ -266,7 +263,6 @@ class OccupancyMap:
         )
 
     def known(self, unrepresented: Balls) -> KnownVoxels:
-        """Present knowledge of space."""
         return KnownVoxels(
             grid=self.grid(),
             last_seen=self.last_seen.copy(),
@@ -279,8 +275,7 @@ class OccupancyMap:
 class PeopleMemory:
     """Flat indices `voxels` (K,) of people, and `stamps_ns` (K,) of their last observation.
 
-    `OccupancyMap.take_in` clears voxels that are seen free or as something else. Voxels that no camera has observed
-    for longer than `memory` [s] become unknown.
+    Voxels unobserved for longer than `memory` [s] become unknown.
     """
 
     def __init__(self, memory: float) -> None:

@@ -17,7 +17,7 @@ class RobotPosture:
     """The robot's spheres and surface.
 
     centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4); surface: None if only spheres are known;
-    surfaces: by frame stamp [ns], where different; T_world_surface: by stamp, poses (L, 4, 4) of its links.
+    surfaces: by frame stamp [ns], where different; T_world_surface: by stamp (L, 4, 4).
     """
 
     centers: Float64
@@ -37,7 +37,7 @@ class RobotPosture:
     def distance(self, points_world: NDArray[np.floating], without: Sequence[str] = ()) -> Float64:
         """Signed distance (N,) [m] of points (N, 3) to the robot at the newest stamp, negative inside.
 
-        Exact up to `ROBOT_REACH`; the links `without` do not count.
+        Exact up to `ROBOT_REACH`.
         """
         surface, T = self.seen_at(max(self.T_world_surface, default=0))
         return surface.distance(T, points_world, without=without, within=ROBOT_REACH, num_threads=self.num_threads)
@@ -58,7 +58,7 @@ def posture_of(
 ) -> RobotPosture:
     """The robot at joint positions q (J,).
 
-    at_frames: joint positions (J,) by frame stamp [ns]; carried: boxes in link frames, part of its surface.
+    at_frames: joint positions (J,) by frame stamp [ns]; carried: boxes in link frames.
     """
     spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried) if carried else robot.surface
     surfaces = {stamp: robot.surface_at(stamp) for stamp in at_frames} if robot.changes else {}
@@ -82,7 +82,7 @@ POSTURE_NAMES = ("centers", "radii", "T_world_link")  # kept for the next time s
 def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
     """Move points (N, 3) [m], world, with the link of the nearest sphere surface.
 
-    Splats left behind would become trails, and the arm be seeded anew every frame. The paper does not move them.
+    Splats left behind would become trails. The paper does not move them.
     """
     gap = np.linalg.norm(points[:, None] - before.centers[None], axis=2) - before.radii
     sphere = np.argmin(np.abs(gap), axis=1)

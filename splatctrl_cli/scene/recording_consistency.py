@@ -36,8 +36,7 @@ class Agreement:
     def holds(self) -> bool:
         """False if median and detour exceed the limit, and the quartile half of it.
 
-        Both sides of a thin object look like one surface. Then a share of the pixels, or a third camera, still
-        agrees; with wrong poses neither does.
+        A thin object looks like one surface from both sides: still, a share of pixels or a third camera agrees.
         """
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 
@@ -49,7 +48,7 @@ CAUSES = (
 
 
 def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) -> list[Agreement]:
-    """Agreement of camera pairs with enough common pixels, from views of one moment or of a still scene.
+    """Agreement of camera pairs with enough common pixels, at once or of a still scene.
 
     Views of one camera are paired, too. Depth counts from `min_range` to `max_range` [m].
     """

@@ -1,7 +1,4 @@
-"""Removal of splats, by reason (III-C), eviction for bare surface, and use of idle slots.
-
-Idle slots take clones (3DGS-MCMC), or detail where colours are wrong.
-"""
+"""Removal of splats, by reason (III-C), eviction for bare surface, and use of idle slots."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,8 +21,7 @@ REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain"
 def nearest_depth(frame: RgbdFrame, reach: float = fixed.NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
     """Least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
 
-    `reach` is at the median depth. Robot pixels count only for themselves and neighbours: near the robot, what is
-    before all else floats.
+    `reach` is at the median depth. Robot pixels count only for themselves and neighbours.
     """
     depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
     valid = frame.depth[frame.depth > 0]
@@ -56,11 +52,11 @@ def removals(
     """Masks (M,) of live splats to remove, each under its first reason in `REASONS`.
 
     broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
-    seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: was
-    robot or human, is no longer. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
+    seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: no longer
+    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
 
-    Splats in never-seen surroundings stay, unless the rule is "literal". `counts_time`: this is a time step, which
-    counts towards the patience.
+    Splats in never-seen surroundings stay, unless the rule is "literal". counts_time: count this step towards the
+    patience.
     """
     config = occupancy.config
     centers = buffer.centers
@@ -101,10 +97,10 @@ def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tupl
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
-    """Slots (M,) of at most `num` splats to evict, and the seeds in the order in which they get slots.
+    """Slots (M,) of at most `num` splats to evict, and the seeds in order of service.
 
-    Only object splats go: redundant ones that show least, then those far from the robot's path, for seeds near it.
-    shown (M,): how much slots show; tolerance [m]: as in `redundant`.
+    Only object splats go: redundant ones that show least, then, for seeds near the robot's path, far ones. shown
+    (M,): how much slots show; tolerance [m]: of `redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
@@ -133,9 +129,8 @@ def redundant(
 ) -> NDArray[np.intp]:
     """The first splats of `order`, at most `num_wanted`, that the others together can replace.
 
-    splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within
-    `tolerance` [m] of its sphere, among the eight nearest centres. It may go if all its voxels keep another: this
-    bares no surface.
+    splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within `tolerance`
+    [m] of its sphere, among the eight nearest centres. It may go if all its voxels keep another.
     """
     if not len(order) or not len(voxels) or num_wanted < 1:
         return np.zeros(0, np.intp)
@@ -160,7 +155,7 @@ def redundant(
 def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
     """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
-    Each is at least EVICT_NEARER farther from the path than its seed, so that no two surfaces exchange slots in turn.
+    Each is at least EVICT_NEARER farther from the path than its seed.
     """
     to_splat = distance_to_box(centers, path)
     farthest = np.argsort(-to_splat, kind="stable")[:num_wanted]
@@ -208,7 +203,7 @@ def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Fil
 
 @dataclass(frozen=True, kw_only=True)
 class Misfit:
-    """A view's mean absolute colour error (H, W), 0 where the pixel is not mappable."""
+    """A view's mean absolute colour error (H, W), 0 where not mappable."""
 
     frame: RgbdFrame
     error: Float32
@@ -220,9 +215,9 @@ def use_idle(
     config: SceneConfig,
     rng: np.random.Generator,
 ) -> tuple[Filled, int]:
-    """Use dead slots beyond the reserve as `when_idle` says; return also the number of weak splats removed.
+    """Use dead slots beyond the reserve as `when_idle` says; count weak splats removed.
 
-    misfits: returns those of the views, and how much each slot (M,) shows.
+    misfits: of the views, and how much each slot (M,) shows.
     """
     is_alive, reserve = buffer.is_alive, int(config.gap_reserve * config.max_splats)
     if config.when_idle == "leave" or not is_alive.any():
@@ -241,8 +236,7 @@ def use_idle(
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
     """At most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
 
-    The error is a 3 x 3 mean, weighted by a pixel's area of surface. No two seeds are closer than their
-    diameters, as several views show one spot.
+    The error is a 3 x 3 mean, weighted by a pixel's area of surface. No two seeds are closer than their diameters.
     """
     every = thinning(misfit.error > 0 for misfit in misfits)
     masks = [thinned(misfit.error > 0, every) for misfit in misfits]
@@ -263,7 +257,7 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
 def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
     """Draw `count` different indices in proportion to weight (K,), at least `count` of them positive.
 
-    As ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, without its slow checks.
+    Same as ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, but faster.
     """
     left = weight / weight.sum()
     found = np.zeros(0, np.intp)

@@ -37,7 +37,7 @@ class Rendering:
     opacity: Float32
 
     def normalised_depth(self) -> Float32:
-        """Depth / opacity (H, W) [m] for opacity of 0.5 or more, else 0."""
+        """`normalised_depth` of this view."""
         return normalised_depth(self.depth, self.opacity)
 
     def before(self, background: Color) -> "Rendering":
@@ -87,7 +87,7 @@ def loss_weights(config: SceneConfig, background: Color = BLACK) -> LossWeights:
 
 
 def mean_loss(terms: Sequence[LossTerms], config: SceneConfig) -> float | None:
-    """Mean over images of the image part of eq. 4; None without images."""
+    """Mean image part of eq. 4; None without images."""
     c = config
     values = [
         c.lambda_color * ((1 - c.lambda_dssim) * t.l1 + c.lambda_dssim * t.dssim)
@@ -127,7 +127,7 @@ def parameters_of(gaussians: GaussianSet) -> Float32:
 def render_gaussians(
     gaussians: GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0
 ) -> Rendering:
-    """Render from a pinhole camera at T_world_camera (4, 4); black where empty."""
+    """Render as `render` does."""
     raster = GaussianRasteriser(num_threads(threads))
     raster.prepare(camera_array(intrinsics, T_world_camera), parameters_of(gaussians))
     planes = raster.forward()

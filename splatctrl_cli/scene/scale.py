@@ -58,9 +58,8 @@ def depth_noise(images: Sequence[Float32]) -> float:
     """Standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
     The standard deviation at depth z is that times z^2, as in disparity sensors (Khoshelham and Elberink 2012:
-    1.425e-3 of a Kinect). Inverse depth of a plane is linear in the pixel: residuals of linear fits to blocks are
-    noise, and a low quantile leaves out edges. Fits absorb noise that neighbours share. Blocks two or three times as
-    wide may raise it, up to twice; more is shape.
+    1.425e-3 of a Kinect). Residuals of linear fits to blocks are noise; a low quantile leaves out edges. Blocks two
+    or three times as wide may raise it, up to twice, as fits absorb noise that neighbours share.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *fixed.NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))
@@ -83,11 +82,11 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
 
 
 def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:
-    """Return `config` with defaults fitted to the recording; the same object if nothing changes.
+    """`config` with defaults fitted to the recording; the same object if nothing changes.
 
-    Lengths scale by `scene.scale`, or if 0, by the median depth over a table's at arm's length. min_range becomes
-    at most half the nearest depth, not below its default, max_range at least the farthest. With a robot, scale 0
-    scales nothing, and a larger recorded error replaces the default.
+    Lengths scale by `scene.scale`, or if 0, by the median depth over a table's at arm's length. min_range becomes at
+    most half the nearest depth, max_range at least the farthest. With a robot, scale 0 scales nothing, and a larger
+    recorded error replaces the default.
     """
     least = OccupancyConfig().depth_error
     if has_robot and depth.noise > least == config.occupancy.depth_error:
@@ -110,7 +109,6 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
 
 
 def in_words(config: Config, depth: RecordedDepth) -> str:
-    """Describe what `fitted_to` chose."""
     scene, occupancy = config.scene, config.occupancy
     if scene.scale == 0:
         return f"depth is noisier than usual: {1e3 * occupancy.depth_error:.2g} mm at 1 m, growing with its square"

@@ -1,7 +1,6 @@
 """Nested cubes over coloured points: one splat each, more where there is detail.
 
-The paper seeds every pixel. On a smaller budget, equal cubes leave objects as coarse as the floor. Here a cube splits
-in eight while its points differ in colour or lie off a plane.
+The paper seeds every pixel. Here a cube splits in eight while its points differ in colour or lie off a plane.
 """
 
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from splatctrl_cli.records import Bool, Float32, Float64
 class CubeLevel:
     """Occupied cubes of one size: points (K, 3) [m], means, and parent (K,) one level up.
 
-    A cube's point is the measured one nearest to the mean: in a concave corner, the mean itself hangs in air.
+    A cube's point is the measured one nearest to the mean.
     """
 
     edge: float

@@ -47,9 +47,9 @@ def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, mi
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
     """M_add (H, W): pixels to seed, eq. 5 with a term for holes.
 
-    A mappable pixel is seeded if it is a hole (opacity below `hole_opacity`), or closer than the map by more than
-    lambda_MDE times the median depth error. The median is over mappable pixels that the map explains; this
-    threshold has a floor and a ceiling. The map's depth is normalised by opacity.
+    Holes are mappable pixels with opacity below `hole_opacity`. Others are seeded if closer than the map by more than
+    lambda_MDE times the median depth error. The median is over explained mappable pixels; the threshold has a floor
+    and a ceiling. The map's depth is normalised by opacity.
     """
     is_hole = rendering.opacity < config.hole_opacity
     error = rendering.normalised_depth() - frame.depth
@@ -69,7 +69,7 @@ class Candidates(Columns):
 
 
 def thinning(masks: Iterable[Bool]) -> int:
-    """Return n such that every n-th pixel of masks (H, W) leaves about `SEED_MOST_PIXELS` or fewer."""
+    """Step n that leaves about `SEED_MOST_PIXELS` of masks (H, W), or fewer."""
     return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
 
 
@@ -95,9 +95,7 @@ def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates
 
 @dataclass(frozen=True, kw_only=True)
 class SeedDensity:
-    """Density of seeds: coarsest edge [m], detail at which a cube splits, and the number of candidates
-    behind both.
-    """
+    """Density of seeds: coarsest edge [m], splitting detail, and number of candidates."""
 
     edge: float
     tolerance: float
@@ -107,8 +105,7 @@ class SeedDensity:
 def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
     """Density that spends at most `count` seeds on the candidates.
 
-    The edge starts at what the largest splats cover, and grows by 5 % while cubes are too many, up to the cloud's
-    extent.
+    The edge starts at what the largest splats cover, and grows by 5 % while cubes are too many.
     """
     points, colors, _ = _joined(sources)
     extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
@@ -128,9 +125,8 @@ def seeds_at(
 ) -> Seeds:
     """One seed per standing cube over the candidates, finest cubes first.
 
-    None is within 0.7 edges of a live splat (L, 3): blended depth at silhouettes would ask for seeds forever. The
-    paper's radius min(D/f, r_max) is one pixel. For a smaller budget, r = min(max(radius_per_edge * edge, D/f),
-    r_max).
+    None is within 0.7 edges of a live splat (L, 3). The paper's radius min(D/f, r_max) is one pixel; here r =
+    min(max(radius_per_edge * edge, D/f), r_max).
     """
     points, colors, pixel = _joined(sources)
     levels = cube_levels(points, colors, density.edge, SEED_LEVELS, num_threads)
@@ -153,10 +149,9 @@ def gap_seeds(
 ) -> Seeds:
     """Seeds where a measured surface is further than `max_gap` [m] from every sphere.
 
-    Blending covers pixels with distant splats; a distance field shows the gap. Every `stride`-th pixel and row of
-    the views is checked (by default every third or fewer, about half of `max_gap`). So are occupied centres (K, 3),
-    for surfaces out of view; they may be half a voxel off. `half` 0 or 1: only every second row. `each`: a `map`
-    over views.
+    Every `stride`-th pixel and row of the views is checked (by default every third or fewer, about half of
+    `max_gap`). So are occupied centres (K, 3), which may be half a voxel off. `half` 0 or 1: only every second row.
+    `each`: a `map` over views.
     """
     spheres = SplatTree(splats.centers, splats.radii, num_threads)
 

@@ -37,8 +37,8 @@ from splatctrl_cli.scene.time_steps import AuditRow
 class PixelKind(IntEnum):
     """Kinds of depth pixels.
 
-    MIXED: near the robot, on no surface. DOUBTED: an object if another frame measured it. CONTRADICTED: behind what
-    another frame measured on its ray.
+    MIXED: near the robot, on no surface. DOUBTED: an object if another frame measured it. CONTRADICTED: behind
+    another frame's surface.
     """
 
     NOTHING = 0
@@ -69,11 +69,10 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     """Self-mask of a frame, with the robot's pose at its stamp.
 
     A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths nearby:
-    as many pixels as the tolerance spans, as surfaces slant and calibration shifts outlines. So is a point this
-    near to a triangle, or inside: slits show it. Points inside balls and carried boxes, which enclose the true
-    surface, are robot. Other depth is object, if `_judge` agrees.
+    in as many pixels as the tolerance spans. So is a point this near to a triangle, or inside. Points inside balls
+    and carried boxes are robot. Other depth is object, if `_judge` agrees.
 
-    The image is widened by 1 / `MASK_BORDER`: an outline just outside fattens edges inside.
+    The image is widened by 1 / `MASK_BORDER`.
     """
     k, border = frame.intrinsics, frame.intrinsics.width // MASK_BORDER
     lens = replace(k, cx=k.cx + border, cy=k.cy + border, width=k.width + 2 * border, height=k.height + 2 * border)
@@ -157,9 +156,9 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
 
 
 def _is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, fx: float) -> Bool:
-    """True for object pixels (H, W) between a nearer object and a farther surface, both within `reach` pixels.
+    """True for object pixels (H, W) within `reach` pixels of a nearer object and a farther surface.
 
-    A time-of-flight camera mixes their depths. The object is nearer than a surface tilted by `MASK_STEEP` would be.
+    Time-of-flight cameras mix their depths. The object is nearer than a surface tilted by `MASK_STEEP`.
     """
     apart = np.maximum(np.float32(MASK_STEP), np.float32(MASK_STEEP * reach / fx) * depth)
     is_behind = depth - nearest_within(depth, is_object, reach) > apart
@@ -191,8 +190,8 @@ def settled(
 ) -> SelfMask:
     """Mask with each doubted piece decided: object or mixed.
 
-    It is an object if one of `others` measured half of it, or if there are none. others: other cameras' frames, and
-    settled ones of the last time step.
+    It is an object if one of `others` measured half of it, or if there are none. others: of other cameras, and
+    settled ones of the last step.
     """
     is_doubted = mask.kinds == PixelKind.DOUBTED
     if not is_doubted.any():
@@ -215,8 +214,8 @@ def settled(
 def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
     """Masks of one time step without object pixels that robot pixels outvote.
 
-    All frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
-    object pixels are outline or noise, and become mixed.
+    Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
+    object pixels become mixed.
     """
     parts = []
     for number, (frame, mask) in enumerate(seen):
@@ -313,7 +312,7 @@ class LinkResidual:
     """The residual of one link over several masks.
 
     median [m]: of measured minus rendered depth over num_pixels, None without any; num_inside: as in `SelfMask`;
-    reach [m]: the least `SelfMask.reach` of masks that show the link.
+    reach [m]: the least `SelfMask.reach`.
     """
 
     median: float | None
@@ -323,7 +322,7 @@ class LinkResidual:
 
     @property
     def sign(self) -> int:
-        """1 if the robot is measured behind its rendered surface, -1 before it, 0 at it or unknown."""
+        """1 if the robot is measured behind its rendered surface, -1 before it, else 0."""
         return 0 if self.median is None else int(np.sign(self.median))
 
 
@@ -344,7 +343,7 @@ def link_residuals(masks: Sequence[SelfMask]) -> dict[str, LinkResidual]:
 
 
 def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
-    """Return `link_residuals` as in `AuditRow`."""
+    """`link_residuals` as in `AuditRow`."""
     found = link_residuals(masks)
     rows = {
         link: {
@@ -362,9 +361,9 @@ def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
 def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -> dict[str, Any]:
     """Part of the self-mask in ``run.json``, over all time steps.
 
-    `self_mask`: by link, median residual and reach [mm], and pixels; `self_mask_residual_mm`: the largest size
-    of judged links' residuals, None without any; `inside_robot_points`, with the first step and link. Links with at
-    least `MASK_PIXELS` are judged, those in `holding` only if no others are: their surface was itself learned.
+    `self_mask`: by link, median residual and reach [mm], and pixels; `self_mask_residual_mm`: the largest size of
+    judged links' residuals, None without any; `inside_robot_points`, with the first step and link. Links with at
+    least `MASK_PIXELS` are judged, learned ones in `holding` only if no others are.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}

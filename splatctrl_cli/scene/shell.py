@@ -1,6 +1,6 @@
 """The shell: coarse splats beyond the workspace, for rendering only.
 
-It fits pixels that the map leaves out, with its own budget; the map's bytes do not depend on it.
+It has its own budget; the map's bytes do not depend on it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -92,7 +92,7 @@ class Shell:
         return self.buffer.splats(self._num_threads)
 
     def _add(self, shown: Masked) -> None:
-        """Seed what the shell does not explain; restart coarser if too many seeds are unmet.
+        """Seed what the shell does not explain; restart coarser if too many are unmet.
 
         A restart seeds all views and its own splats' places.
         """
@@ -125,7 +125,6 @@ class Shell:
         self.buffer.kill(self.buffer.is_alive & gone)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return its whole state, by name."""
         d = self._density
         density = (0.0, 0.0, 0) if d is None else (d.edge, d.tolerance, d.num_candidates)
         counters = (self.num_steps, self._descent.num_iterations)

@@ -17,8 +17,7 @@ def steadied(frame: RgbdFrame, before: Before, is_object: Bool, config: Occupanc
     """Frame with a running mean of its depth, and its steady pixels (H, W).
 
     An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2. Depths around
-    it may change by at most `STEADY_MOVED` `depth_error` z^2 on average: a moving surface lags no more. Only what was
-    an object before is averaged: a mean with the robot's surface is in mid-air.
+    it may change by at most `STEADY_MOVED` `depth_error` z^2 on average. Only what was an object before is averaged.
 
     Without `before`, no pixel is steady. If the camera moved, depth stays, and all pixels are steady.
     """

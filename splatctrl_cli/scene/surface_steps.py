@@ -12,9 +12,8 @@ def surface_steps(
 ) -> Float32:
     """Largest depth step (H, W) [m] from each pixel to a neighbour on its surface.
 
-    It is `MASK_STEP`, except in the robot's outline (is_edge), `edge` pixels wide: mixed pixels there would lead
-    from robot to background in small steps. An object pixel off its plane by more than `tolerance` (H, W) [m] gets
-    half that distance, if less.
+    It is `MASK_STEP`, except in the robot's outline (is_edge), `edge` pixels wide. An object pixel there, off its
+    plane by more than `tolerance` (H, W) [m], gets half that distance, if less.
 
     The plane fits 1 / depth of object pixels beyond the outline, within `MASK_PLANES` widths. It counts if
     its residuals match the sensor (`depth_error` [m] at 1 m) and its variance is at most `MASK_UNSURE` of a pixel's.

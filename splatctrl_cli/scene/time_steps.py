@@ -36,7 +36,7 @@ class TimeStep:
         }
 
     def without_depth(self) -> "TimeStep":
-        """Return the step as colour cameras would see it."""
+        """The step as colour cameras would see it."""
         return replace(self, frames=tuple(replace(frame, depth=np.zeros_like(frame.depth)) for frame in self.frames))
 
     @property
@@ -46,7 +46,6 @@ class TimeStep:
 
     @property
     def has_depth(self) -> bool:
-        """True if any pixel has depth."""
         return any(bool((frame.depth > 0).any()) for frame in self.frames)
 
 
@@ -56,9 +55,8 @@ class AuditRow:
 
     Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames at their last iteration, None if none shows
     the workspace. dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface.
-    unrepresented: occupied voxels without a splat. without_depth: frames without any depth; blind: their cameras.
-    self_mask: by link, measured minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link,
-    unexplained points inside.
+    unrepresented: voxels. without_depth: frames; blind: their cameras. self_mask: by link, measured minus rendered
+    depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link, unexplained points inside.
     """
 
     stamp_ns: int
@@ -102,7 +100,7 @@ def time_steps(
     """Group frames of `cameras` by stamp, or without a clock, FRAMES_PER_STEP at a time.
 
     With a clock, a frame with exactly its camera's last depth is skipped, and counted in `repeats` by camera.
-    `observe` gets every record: one pass serves both.
+    `observe` gets every record.
     """
     last_depth: dict[str, Float32] = {}
     frames: list[RgbdFrame] = []
@@ -131,7 +129,7 @@ def time_steps(
 
 
 def planar(frame: RgbdFrame) -> RgbdFrame:
-    """Return the frame with colour by plane, as the optimiser takes it: views then share memory."""
+    """Frame with colour by plane, as the optimiser takes it: views share memory."""
     planes = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0))
     return replace(frame, color=np.moveaxis(planes, 0, 2))
 

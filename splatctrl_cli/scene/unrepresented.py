@@ -38,8 +38,7 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
 def confirmed(found: Balls, before: Balls | None) -> Balls:
     """Balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
-    Smaller groups are often noise or gaps not yet filled. before: of the last time step; None in the first,
-    where all count.
+    before: of the last time step; None in the first, where all count.
     """
     voxel = 2.0 * found.radius / 3**0.5
     if before is None or not len(found):
@@ -56,7 +55,7 @@ def confirmed(found: Balls, before: Balls | None) -> Balls:
 def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:
     """Largest distance [m] of a voxel's centre from a sphere that represents it.
 
-    That is `max_gap` and half a voxel, as in gap filling, plus the sensor's error [m]; at most a voxel's diagonal.
+    That is `max_gap`, half a voxel, and the sensor's error [m]; at most a voxel's diagonal.
     """
     return min(config.max_gap + 0.5 * voxel + error, 3**0.5 * voxel)
 
@@ -76,10 +75,7 @@ def bare_voxels(
 
 
 def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Bool:
-    """Voxels (X, Y, Z) within `reach` [m] of a sphere, wherever its centre is in its voxel.
-
-    This settles most, at a tenth of the cost of a search.
-    """
+    """Voxels (X, Y, Z) within `reach` [m] of a sphere, wherever its centre is in its voxel."""
     voxel, shape = occupancy.config.voxel, occupancy.log_odds.shape
     cells = np.floor((splats.centers - occupancy.origin) / voxel + 0.5).astype(np.int64)
     is_inner = np.all((cells > 0) & (cells < np.array(shape) - 1), axis=1)  # keeps all neighbours inside
@@ -96,8 +92,8 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 class GridAgreement:
     """Agreement of splats with a grid; NaN without any.
 
-    on_surface: share of object and human splats at a voxel that is not free, among splats outside the grid or at a
-    seen voxel. "At" means in or next to. represented: share of num_voxels occupied voxels with a splat or ball.
+    on_surface: share of object and human splats in or next to a voxel that is not free, among those not at never-seen
+    voxels. represented: share of num_voxels occupied voxels with a splat or ball.
     """
 
     on_surface: float
@@ -107,7 +103,7 @@ class GridAgreement:
 
     @property
     def holds(self) -> bool:
-        """True if both shares are as large as a reconstruction leaves them; False with nothing to compare."""
+        """True if both shares are as large as a reconstruction leaves them; False without any."""
         return self.on_surface >= fixed.SPLATS_ON_SURFACE and self.represented >= fixed.OCCUPIED_WITH_SPLATS
 
 
@@ -116,7 +112,7 @@ def agreement_with_grid(
 ) -> GridAgreement:
     """Agreement of splats with the voxels of their map or snapshot.
 
-    Swept voxels are left out. Both shares detect wrong units or moved splats, `represented` missing ones.
+    Swept voxels are left out.
     """
     grid = known.grid
     states = grid.states(occupancy.free_below, occupancy.occupied_above)

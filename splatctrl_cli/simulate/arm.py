@@ -1,8 +1,7 @@
 """The simulated arm: the Franka Emika Panda's joints in primitive shapes, and its motion.
 
-Joints follow the published (modified) Denavit-Hartenberg table (d1 = 0.333, d3 = 0.316, a4 = 0.0825, a5 = -0.0825, d5
-= 0.384, a7 = 0.088, flange 0.107 m), and published position and velocity limits. The shapes are ours: capsules (a
-cylinder and two spheres) and boxes that roughly follow the real links.
+Joints follow the modified Denavit-Hartenberg table (d1 = 0.333, d3 = 0.316, a4 = 0.0825, a5 = -0.0825, d5 = 0.384, a7
+= 0.088, flange 0.107 m), and published limits. The shapes are ours: capsules (a cylinder and two spheres) and boxes.
 """
 
 from collections.abc import Iterator, Mapping
@@ -94,7 +93,7 @@ SHAPES: dict[str, tuple[Capsule | Block, ...]] = {
 
 
 def slim(shape: Capsule | Block) -> tuple[Capsule | Block, ...]:
-    """Visual shapes inside a collision shape, as real parts lie inside convex hulls.
+    """Visual shapes inside a collision shape.
 
     Over the collision surface, the visual one is 3 mm (median) and 27 mm (95 %) away, at most 30 mm.
     """
@@ -142,7 +141,6 @@ UNMODELLED: dict[str, tuple[str, tuple[Capsule, ...]]] = {
 
 
 def link_shape(link: str, shape: Capsule | Block) -> Shape:
-    """The shape as a solid of its link."""
     if isinstance(shape, Block):
         return Shape(link=link, kind="box", size=shape.size, T_link_shape=pose_at(shape.middle))
     start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
@@ -212,8 +210,8 @@ def arm_spheres_yaml() -> str:
 def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64, float]]:
     """Spheres (center (3,), radius) [m], link frame, whose union contains every shape.
 
-    At steps h along a segment, radius sqrt(R^2 + (h/2)^2) covers a tube of radius R. For a bar of a box, R is half
-    its section's diagonal. Spheres inside others are dropped.
+    At steps h along a segment, radius sqrt(R^2 + (h/2)^2) covers a tube of radius R (of a box's bar: half its
+    section's diagonal). Spheres inside others are dropped.
     """
     spheres: list[tuple[Float64, float]] = []
     for start, end, radius in (spine for shape in shapes for spine in _spines(shape)):
@@ -231,8 +229,7 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64,
 def _spines(shape: Capsule | Block) -> list[tuple[Float64, Float64, float]]:
     """Segments (start, end) and tube radii, of a capsule or a box's bars.
 
-    Bars lie along the longest side. They end half a step early: corners are as far from the last sphere as edges
-    between spheres.
+    Bars lie along the longest side and end half a step early.
     """
     if isinstance(shape, Capsule):
         return [(np.array(shape.start, dtype=float), np.array(shape.end, dtype=float), shape.radius)]

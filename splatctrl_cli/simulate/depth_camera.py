@@ -18,15 +18,15 @@ EDGE = 0.5  # [px] of disparity between neighbours that are no longer one surfac
 class StereoDepth:
     """Depth measured by two imagers, in the image of a colour camera.
 
-    A depth pixel is a pixel of the imagers; the image's `focal` over theirs gives its width in the image.
+    A depth pixel is a pixel of the imagers.
 
     - Disparity d = f b / z errs by `spread` [px], so depth errs by z^2 spread / (f b): with 0.07 px, 3.6 mm at 1 m
       and 14.5 mm at 2 m. Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Steps are of 1/32 px.
     - Next to an edge of 0.5 px or more, the background takes the foreground's depth over `fattening` depth pixels.
-      That width is uniform between the two numbers, and constant within a window.
+      That width is uniform between the two numbers, constant within a window.
     - Background that the second imager does not see is lost: f b (1 / z_foreground - 1 / z_background) depth pixels
       left of the foreground, less those that took its depth.
-    - A share `dropout` of all pixels is lost, in blobs twice as wide as the window, as are depths out of `least` to
+    - A share `dropout` of all pixels is lost, in blobs twice as wide as the window; so are depths out of `least` to
       `most` [m].
 
     width [px]: of the imagers, scaling their focal length; None: as wide as the image.
@@ -70,10 +70,7 @@ def _blurred(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> 
 
 
 def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
-    """True where a pixel is occluded from the second imager, right of the first.
-
-    A pixel to its right is then shifted there, or farther left.
-    """
+    """True where a pixel is occluded from the second imager, right of the first."""
     columns = np.arange(depth.shape[1])
     shifted = np.where(depth > 0, columns - focal_baseline / np.where(depth > 0, depth, 1.0), np.inf)
     least = np.minimum.accumulate(shifted[:, ::-1], axis=1)[:, ::-1]
@@ -92,12 +89,11 @@ def _fattened(disparity: Float64, reach: np.ndarray) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthNoise:
-    """Errors of a depth camera, like a D435 with depth registered to colour.
+    """Errors of a depth camera like a D435, registered to colour.
 
-    spread [m]: sigma at 1 m, growing with depth squared (disparity error). step [m]: quantisation at 1 m (disparity
-    steps). patch [px]: matching window, over which errors agree. dropout: share of pixels lost, in patch-sized blobs.
-    edge [m]: depth step that loses both neighbours. max_range [m]: farther is lost. baseline [m]: of the imagers, to
-    lose what the second does not see (0: off).
+    spread [m]: sigma at 1 m, growing with depth squared. step [m]: quantisation at 1 m. patch [px]: matching window,
+    over which errors agree. dropout: share of pixels lost, in patch-sized blobs. edge [m]: depth step that loses both
+    neighbours. max_range [m]: farther is lost. baseline [m]: of the imagers, to lose occluded depth (0: off).
     """
 
     spread: float = 0.0012

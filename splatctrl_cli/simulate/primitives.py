@@ -1,7 +1,6 @@
 """Textured boxes, cylinders, capsules and spheres: exact distance, surface points, ray hits, normals.
 
-Frames have their origin in the middle; cylinders and capsules stand along z. R rays, Q points. Solid textures have
-features of a few centimetres, smooth enough for a few thousand splats.
+Frames have their origin in the middle; cylinders and capsules stand along z. R rays, Q points.
 """
 
 from collections.abc import Sequence
@@ -81,7 +80,7 @@ def _hash(lattice: np.ndarray, seed: int) -> Float64:
 class Track:
     """Poses (K, 4, 4) at increasing stamps (K,) int64 [ns]; at rest outside.
 
-    In between, the origin moves linearly and the solid rotates about one axis, uniformly.
+    In between, the origin moves linearly; the solid rotates about one axis, uniformly.
     """
 
     stamp_ns: Stamps
@@ -111,7 +110,7 @@ class Primitive:
     """One solid: box, cylinder, sphere or capsule.
 
     size [m]: full x, y, z of a box; radius, height of a cylinder; radius of a sphere; radius, axis length of a
-    capsule. T_world_shape (4, 4): its pose, the first if it moves. It is present while from_ns <= stamp < to_ns.
+    capsule. T_world_shape (4, 4): its first pose. Present while from_ns <= stamp < to_ns.
     """
 
     name: str
@@ -130,7 +129,6 @@ class Primitive:
         return replace(self, T_world_shape=self.track.at(stamp_ns), track=None)
 
     def is_present(self, stamp_ns: int) -> bool:
-        """True while in the scene."""
         return self.from_ns <= stamp_ns < self.to_ns
 
     @property
@@ -212,7 +210,7 @@ def _capsule_closest(p: Float64, radius: float, half: float) -> tuple[Float64, F
 
 
 def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) -> Float64:
-    """Parameter t (R,) of the first hit of rays origin + t * directions (R, 3), inf without one."""
+    """Parameter t (R,) of rays' first hits, origin + t * directions (R, 3), else inf."""
     T_shape_world = invert_transform(primitive.T_world_shape)
     origin = T_shape_world[:3, :3] @ origin_world + T_shape_world[:3, 3]
     directions = directions_world @ T_shape_world[:3, :3].T
@@ -255,7 +253,7 @@ def _cylinder_span(origin: Float64, directions: Float64, radius: float, half: fl
 
 
 def _capsule_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
-    """Interval of t inside a capsule: of its cylinder and balls, because it is convex."""
+    """Interval of t inside a capsule: of its cylinder and balls, as it is convex."""
     end = np.array([0.0, 0.0, half])
     spans = [
         _cylinder_span(origin, directions, radius, half),

@@ -36,8 +36,8 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 class RecordingOptions:
     """Duration [s], frames per second per camera, image size [px], depth noise and seed.
 
-    with_person: a walking person with masks, instead of the cylinder. is_free: floor and walls alone. visitor: x, y
-    and radius [m] of the cylinder. color_rays: 0 to 4 per pixel, besides depth's.
+    with_person: a walking person with masks, instead of the cylinder. is_free: floor and walls alone. visitor: x, y,
+    radius [m] of the cylinder. color_rays: 0 to 4 per pixel, besides depth's.
     """
 
     duration_s: float = 7.0
@@ -92,7 +92,6 @@ class Scene:
 
     @classmethod
     def of(cls, options: RecordingOptions) -> "Scene":
-        """The scene of the options."""
         motion = tabletop.arm_motion(options.duration_s)
         if options.is_free:
             return cls(
@@ -115,7 +114,7 @@ class Scene:
 class Recording:
     """A recorded scene, reproducible by options and scene.
 
-    Images show the robot's visual geometry, if any. The arm respects velocity limits, even if time ends on the way.
+    Images show the robot's visual geometry, if any. The arm respects velocity limits.
     """
 
     def __init__(

@@ -48,8 +48,8 @@ class Meshes:
 class Renderer:
     """Renderer of one camera; static solids are cast once.
 
-    Rays have unit length along the optical axis, so that t is depth [m]. `color_rays` rays give a pixel's colour;
-    with 0, depth's ray does.
+    Rays have unit length along the optical axis: t is depth [m]. `color_rays` rays give a pixel's colour; with 0,
+    depth's ray does.
     """
 
     def __init__(self, camera: Camera, static: Sequence[Primitive], *, color_rays: int = 4) -> None:
@@ -77,7 +77,6 @@ class Renderer:
         return np.rint(mean * 255).astype(np.uint8), at_center.astype(np.float32)
 
     def depth(self, moving: Sequence[Primitive], meshes: Meshes | None = None) -> Float32:
-        """The same depth, without colours."""
         depth = self._depth[:1].copy()
         self._nearest(moving, depth)
         for _ in self._nearest_faces(meshes, depth):

@@ -1,7 +1,6 @@
 """The scene: objects on a textured table, an arm behind, fixed cameras around.
 
-World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward. Turntable views resemble a DTU
-scan.
+World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward.
 """
 
 from collections.abc import Iterator, Sequence
@@ -71,7 +70,7 @@ def things() -> list[Primitive]:
 
 
 def visitor(from_ns: int, to_ns: int, place: Sequence[float] = VISITOR) -> Primitive:
-    """The temporary obstacle; place: x, y and radius [m]."""
+    """The temporary obstacle; place: x, y, radius [m]."""
     x, y, radius = place
     stands = solid("visitor", "cylinder", (radius, 0.30), (x, y, 0.15), texture("stripes", 0.06, "grape", 2), 0.0)
     return replace(stands, from_ns=from_ns, to_ns=to_ns)
@@ -143,7 +142,7 @@ def arm_meshes(surface: RobotSurface) -> Meshes:
 
 
 def texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
-    """A texture in two colours of the `PALETTE`."""
+    """A texture in two colours of `PALETTE`."""
     dark, bright = PALETTE[palette]
     return Texture(pattern=pattern, feature=feature, dark=dark, bright=bright, seed=seed)
 

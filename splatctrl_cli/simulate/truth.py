@@ -24,7 +24,7 @@ class Truth:
     """Obstacles over time, cameras and robot of a simulated log; world frame, m, ns.
 
     clearance (T,) [m]: of moving collision spheres and `unmodelled` parts, at stamps (T,) int64 [ns] of joint states.
-    luminance_std: by camera, the least standard deviation of luminance (0 to 1).
+    luminance_std: by camera, the least (0 to 1).
     """
 
     path: Path
@@ -40,7 +40,7 @@ class Truth:
     unmodelled: tuple[str, ...] = ()
 
     def distance(self, points_world: Float64, stamp_ns: int) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) to the solids present at a stamp, without the robot."""
+        """Signed distance (Q,) [m] of points (Q, 3) to solids at a stamp, without the robot."""
         return distance_to(self.primitives, points_world, stamp_ns)
 
     def closest(self, points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:

@@ -1,1 +1,1 @@
-"""The formats of a baked distance grid, one a file."""
+"""The formats of a baked distance grid."""

@@ -1,9 +1,9 @@
 """The file formats of a baked distance grid: declarations, channels and headers.
 
-A channel may exceed memory as a memory map, so at most `CHUNK` bytes are copied at once.
+A memory map may exceed memory: at most `CHUNK` bytes are copied at once.
 
 `GridSlabs` fills a grid on disk along x: a ``NAME.npy`` per channel at full size, and ``progress.json`` with the plan
-and finished layers. A slab is one run of bytes in each file, so an interrupted bake can continue.
+and finished layers. An interrupted bake can continue.
 """
 
 import json
@@ -42,7 +42,6 @@ class Channel:
     may_be_unknown: bool = False
 
     def shape(self, cells: Shape) -> tuple[int, ...]:
-        """The array's shape."""
         return cells if self.components == 1 else (*cells, self.components)
 
 
@@ -156,13 +155,12 @@ def x_fastest(values: Values) -> Iterator[Values]:
 
 @dataclass(frozen=True, kw_only=True)
 class GridFormat:
-    """A file format, listed in its module's ``ENTRIES``, for the program and its docs.
+    """A file format, in its module's ``ENTRIES``.
 
     `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
-    `describe`: from a path and its first bytes; None for another kind. `needs`: the grid must have one
-    of these channels. `holds_unknown`: cells can be without a distance. `bytes_per_cell`: on disk, None for all
-    channels'. `check` raises UsageError if its library is missing. `docs`: row in docs/artefacts.md, cells between
-    bars: name, file, who opens it.
+    `describe`: from a path and its first bytes; None for another kind. `needs`: one of these channels.
+    `holds_unknown`: cells can be without a distance. `bytes_per_cell`: on disk, None for all channels'. `check`
+    raises UsageError without its library. `docs`: row in docs/artefacts.md: name | file | who opens it.
     """
 
     name: str
@@ -179,13 +177,12 @@ class GridFormat:
     docs: str = ""
 
     def files(self, channels: Collection[str]) -> tuple[str, ...]:
-        """File names for these channels."""
         stems = [f"{STEM}.{channel}" for channel in channels] if self.is_per_channel else [STEM]
         return tuple(f"{stem}{self.suffix}" for stem in stems)
 
 
 def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
-    """Cells, extent and the centres of the first and last cell [m]."""
+    """Cells, extent, and first and last cell's centres [m]."""
     first, sides = np.asarray(first_cell, np.float64), voxel * (np.asarray(shape) - 1)
     return {
         "shape": [int(n) for n in shape],
@@ -197,7 +194,7 @@ def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
 
 
 def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
-    """Return the header's `FIELD_FACTS`."""
+    """The header's `FIELD_FACTS`."""
     return {key: header[key] for key in FIELD_FACTS if header.get(key) is not None}
 
 
@@ -228,7 +225,7 @@ PROGRESS = "progress.json"
 
 @dataclass(frozen=True, kw_only=True)
 class SlabPlan:
-    """A bake's plan: origin and voxel [m], cells, channels, and settings (JSON)."""
+    """A bake's plan: origin, voxel [m], cells, channels, settings (JSON)."""
 
     origin: tuple[float, float, float]
     voxel: float
@@ -253,7 +250,7 @@ class GridSlabs:
     def write(self, slab: Mapping[str, Values], counts: Mapping[str, int] | None = None) -> None:
         """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress.
 
-        counts: the baker's so far, kept with it. Raises InputError if channels or shapes differ from the plan.
+        counts: the baker's so far. Raises InputError if channels or shapes differ from the plan.
         """
         if slab.keys() != set(self.plan.channels):
             raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")
@@ -272,7 +269,6 @@ class GridSlabs:
         _write_progress(self.folder, self.plan, self.num_layers, self.counts)
 
     def is_whole(self) -> bool:
-        """True if all layers are on disk."""
         return self.num_layers == self.plan.shape[0]
 
     def grid(self, header: Mapping[str, object]) -> DistanceGrid:

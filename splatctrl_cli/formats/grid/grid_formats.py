@@ -14,7 +14,7 @@ FORMATS: Mapping[str, GridFormat] = {kind.name: kind for kind in entries_of(__pa
 def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: str = "free") -> None:
     """Raise UsageError if `write_grid` would fail for `names`: a check before a long bake.
 
-    unknown: the policy on unknown space, which blanks cells if ``nan``.
+    unknown: the policy; ``nan`` blanks cells.
     """
     strange = [name for name in names if name not in FORMATS]
     if strange or not names:

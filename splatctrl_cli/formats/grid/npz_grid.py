@@ -1,7 +1,7 @@
-"""Baked distance fields as ``.npz``, which this project reads back. Same grid, same bytes.
+"""Baked distance fields as ``.npz``. Same grid, same bytes.
 
-Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () str (JSON), one array per channel
-(`grid_format.CHANNELS`), uncompressed: floats hardly compress, and readers can map them.
+Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () str (JSON), one uncompressed array per
+channel (`grid_format.CHANNELS`).
 """
 
 import errno

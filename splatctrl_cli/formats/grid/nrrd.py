@@ -2,7 +2,7 @@
 
 Format: http://teem.sourceforge.net/nrrd/format.html (NRRD0005, attached header, raw little-endian values). x is
 fastest: `nrrd.read` gives ``values[x, y, z]``, for a gradient ``values[component, x, y, z]``. Header entries are
-pairs ``splatctrl.KEY`` of JSON text. pynrrd would add a timestamp and need whole channels in memory.
+pairs ``splatctrl.KEY`` of JSON text.
 """
 
 import json

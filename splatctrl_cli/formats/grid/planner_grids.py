@@ -1,18 +1,18 @@
 """Baked grids for other planners: NVIDIA's cuRobo and MoveIt.
 
-cuRobo's voxel grid is ``field.curobo.npz``, which a few lines load. It follows the source (NVlabs/curobo, 0.7.5 to
-0.7.7: geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested on it. (x, y, z)
-is flattened with z fastest; the grid is placed by its middle's pose, ``x y z qw qx qy qz``. Values are positive
-inside; ``1 + floor(dims / voxel)`` cells a side.
+cuRobo's voxel grid is ``field.curobo.npz``. It follows the source (NVlabs/curobo, 0.7.5 to 0.7.7: geom/types.py
+`VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested on it. (x, y, z) is flattened with z
+fastest; the grid is placed by its middle's pose, ``x y z qw qx qy qz``. Values are positive inside;
+``1 + floor(dims / voxel)`` cells a side.
 
 The kernel truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the
 pose is half a voxel below our cells' middle. A sphere takes its centre's cell. The first three and last two cells of
-an axis, and the outside, are free. (0.7.0 to 0.7.4 count cells otherwise, and add half a voxel to values.)
+an axis, and the outside, are free. (0.7.0 to 0.7.4 differ.)
 
-MoveIt's distance field reads occupied cells and propagates distances itself: moveit_core,
-distance_field/src/propagation_distance_field.cpp (`readFromStream`; the same in MoveIt 1 and 2) and voxel_grid.h.
-Seven lines of text precede a zlib stream of bits: x slowest, each run of z in whole bytes, lowest bit first. There
-are ``int(size * (1 / resolution))`` cells a side; cell 0 is centred at the origin.
+MoveIt's distance field reads occupied cells: moveit_core, distance_field/src/propagation_distance_field.cpp
+(`readFromStream`; the same in MoveIt 1 and 2) and voxel_grid.h. Seven lines of text precede a zlib stream of bits: x
+slowest, each run of z in whole bytes, lowest bit first. There are ``int(size * (1 / resolution))`` cells a side; cell
+0 is centred at the origin.
 """
 
 import json
@@ -96,8 +96,8 @@ ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
 def write_moveit(path: Path, grid: DistanceGrid) -> None:
     """Write occupied cells: a splat may reach the cube, or sdf is not above 0.
 
-    A splat may if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes NaN,
-    and unknown space that the policy makes an obstacle. Raises InputError with neither bound nor hard.
+    A splat may if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes NaN and unknown
+    obstacles. Raises InputError with neither bound nor hard.
     """
     shape = check_grid(grid)
     if not {"bound", "hard"} & grid.channels.keys():
@@ -126,7 +126,7 @@ def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
 
 
 def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
-    """Read the header's numbers, and the offset [bytes] of the bits. Raises InputError if damaged."""
+    """Read header numbers, and the bits' offset [bytes]. Raises InputError if damaged."""
     with path.open("rb") as stream:
         lines = [stream.readline(128) for _ in FIELDS]
         start = stream.tell()

@@ -1,8 +1,7 @@
 """Distance fields as OpenVDB's ``.vdb``: a FloatGrid per scalar channel, a Vec3SGrid for the gradient.
 
 Needs OpenVDB's Python module (``openvdb``, formerly ``pyopenvdb``), which is not on PyPI, and all channels in memory.
-Voxel (i, j, k) is cell (i, j, k): the transform takes whole indices to cell centres. NaN cells and zero gradients,
-the background's value, are inactive.
+Voxel (i, j, k) is cell (i, j, k): whole indices are cell centres. NaN cells and zero gradients are inactive.
 """
 
 import json
@@ -36,8 +35,8 @@ _NUMBERS = {"int32": "<i", "int64": "<q", "float": "<f", "double": "<d", "bool":
 def write_vdb(path: Path, grid: DistanceGrid) -> None:
     """Write the grid; inactive voxels read as the float above the channel's largest.
 
-    As in a level set, that is positive; a planner must query active voxels only. A gradient's is zero. Raises
-    UsageError without OpenVDB, InputError for an invalid layout.
+    That is positive: a planner must query active voxels only. A gradient's is zero. Raises UsageError without
+    OpenVDB, InputError for an invalid layout.
     """
     check_grid(grid)
     vdb = openvdb()
@@ -96,8 +95,8 @@ def _plain(value: object) -> object:
 def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
     """Read name, type and metadata of a ``.vdb``'s grids, without OpenVDB.
 
-    The layout is OpenVDB's io/Archive.cc, io/GridDescriptor.cc and MetaMap.cc, since file version 222. Raises
-    InputError for another or a damaged file.
+    As in OpenVDB's io/Archive.cc, io/GridDescriptor.cc and MetaMap.cc, since file version 222. Raises InputError for
+    another or a damaged file.
     """
     with path.open("rb") as stream:
         if stream.read(8) != MAGIC:

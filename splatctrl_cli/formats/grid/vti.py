@@ -1,7 +1,7 @@
 """Baked distance fields as ParaView's ``.vti``: VTK ImageData with points at cell centres.
 
-Raw appended little-endian blocks, x fastest, each after its length; the header is a string in FieldData. Format:
-VTK's user guide and its page on XML file formats.
+Raw appended little-endian blocks, x fastest, each after its length; the header is a string in FieldData (VTK's page
+on XML file formats).
 """
 
 import re
@@ -105,7 +105,7 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, dict[str, int]]:
-    """The head, and by channel the offset [bytes] of its length, which its values follow."""
+    """The head, and by channel the offset [bytes] of its length, before its values."""
     text = stream.read(1 << 22)  # bytes in which the XML must end
     mark = text.find(_APPENDED)
     begin = text.find(b"_", mark) + 1

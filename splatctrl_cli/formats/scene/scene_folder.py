@@ -51,7 +51,6 @@ class Snapshot:
 
     @property
     def occupancy_path(self) -> Path:
-        """File of the voxels."""
         return self.path.with_suffix(".npz")
 
     def occupancy(self) -> OccupancyGrid | None:
@@ -71,7 +70,6 @@ class Snapshot:
 
     @property
     def shell_path(self) -> Path:
-        """File of the shell, absent if none."""
         return self.path.with_suffix(f".{SHELL_FILE}")
 
     def _read_voxels(self, read: Callable[[Path], T]) -> T | None:
@@ -178,8 +176,7 @@ class SceneFolder:
     def made_from(self) -> dict[str, Any]:
         """Facts that tell if the scene belongs to a log and a robot.
 
-        Digests (`inputs`), first frames, joints and links, depth correction, and how far off the cameras see the
-        robot.
+        Digests (`inputs`), first frames, joints and links, depth correction, and the robot's residual.
         """
         metrics = self.run.get("metrics", {})
         return {
@@ -190,7 +187,6 @@ class SceneFolder:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Cameras that trained the scene."""
         return self._metric("cameras", lambda names: tuple(map(str, names)))
 
     @property
@@ -250,7 +246,6 @@ class SceneFolder:
         return self.parts.checked(self.path / name)
 
     def occupancy(self) -> OccupancyGrid:
-        """The final occupancy grid."""
         return read_occupancy(self._isotropic("occupancy.npz"))
 
     def known(self) -> KnownVoxels | None:
@@ -297,14 +292,14 @@ class SceneFolder:
         return known[-1]
 
     def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
-        """Occupied voxels without a splat at `stamp_ns` (None: the end); None in an older scene."""
+        """Unrepresented voxels at `stamp_ns` (None: the end); None in an older scene."""
         if stamp_ns is not None:
             return self.snapshot_at(stamp_ns).unrepresented()
         path = self.path / "occupancy.npz"
         return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
 
     def shell_at(self, stamp_ns: int | None) -> SplatSet | None:
-        """The shell beyond the robot's reach, for pictures, as in `unrepresented_at`; None if absent."""
+        """The shell at `stamp_ns` (None: the end), for pictures; None if absent."""
         path = self.path / SHELL_FILE if stamp_ns is None else self.snapshot_at(stamp_ns).shell_path
         return read_shell(self.parts.checked(path)) if self.parts.has(path) else None
 
@@ -339,7 +334,6 @@ class SplatFile(SceneFolder):
 
     @cached_property
     def parts(self) -> Parts:
-        """The file, without digests."""
         return Parts(folder=self.path.parent)
 
     @property

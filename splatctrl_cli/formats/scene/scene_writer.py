@@ -58,9 +58,9 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 class SceneWriter:
-    """A writer of a scene during fitting, into an empty or a checkpoint's folder.
+    """A writer of a scene during fitting, into an empty or checkpoint's folder.
 
-    An empty folder may have `SELF_MODEL`. Snapshots are written in the background; the next call raises errors.
+    An empty folder may have `SELF_MODEL`. Snapshots are written in the background; the next call raises their errors.
     """
 
     def __init__(self, folder: Path, comments: Mapping[str, str], checkpoint: Checkpoint | None = None) -> None:
@@ -112,7 +112,6 @@ class SceneWriter:
             stream.write(json.dumps(asdict(row)) + "\n")
 
     def audited(self) -> list[dict[str, Any]]:
-        """Rows written so far."""
         return [json.loads(line) for line in self._audit.read_text(encoding="utf-8").splitlines()]
 
     def snapshot(

@@ -67,7 +67,7 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> Values:
 
 
 def _evidence(known: KnownVoxels) -> dict[str, Values]:
-    """Arrays of both files; last_seen in one byte is twice as fast."""
+    """Arrays of both files; one-byte last_seen is twice as fast."""
     balls = known.unrepresented
     return {
         "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < FIRST_REASON else np.uint16),
@@ -97,7 +97,7 @@ def read_states(path: Path) -> OccupancyGrid:
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
-    """Read the times at which voxels were last seen, and lost edges, alone.
+    """Read voxels' last views and lost edges alone.
 
     None for an older file. Raises InputError for another one.
     """
@@ -219,7 +219,7 @@ def _voxels(values: Array, name: str, kind: type[np.generic], header: Mapping[st
 
 
 def known_space(grid: OccupancyGrid, thresholds: OccupancyConfig) -> dict[str, object]:
-    """A grid's extent [m], share of each `VoxelState` (lower case), robot and human voxels."""
+    """A grid's extent [m], share of each `VoxelState`, robot and human voxels."""
     states = grid.states(thresholds.free_below, thresholds.occupied_above)
     counts = np.bincount(states.ravel(), minlength=len(VoxelState))
     return {

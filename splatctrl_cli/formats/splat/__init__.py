@@ -1,1 +1,1 @@
-"""The splat file formats, one a file."""
+"""The splat file formats."""

@@ -2,8 +2,8 @@
 
 ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma), ``rot_*``
 a quaternion w x y z, ``opacity`` a logit. ``f_dc_*`` and ``f_rest_*`` are harmonics; f_rest has all of red, then
-green, then blue. A ``label`` (uchar) follows only if some Gaussian is not an object, for readers of a fixed stride. A
-lone ``scale_0`` is for all axes.
+green, then blue. A ``label`` (uchar) follows only if some Gaussian is not an object. A lone ``scale_0`` is for all
+axes.
 """
 
 from collections.abc import Mapping
@@ -48,8 +48,8 @@ HEADER_COMMENTS = {
 def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write `gaussians`, with frame, units and `comments` in the header. Same input, same bytes.
 
-    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises InputError naming the index
-    of an invalid value, UsageError for a comment of several lines.
+    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises InputError for an invalid
+    value, UsageError for a comment of several lines.
     """
     check_gaussians("Gaussians to write", gaussians)
     has_labels = bool((gaussians.labels != Label.OBJECT).any())
@@ -109,7 +109,7 @@ def exact_centers(ply: PlyFile) -> Float64:
 
 
 def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
-    """Centres (N, 3) float32 [m]. Raises InputError if float32 moves, or moved, the splats too far.
+    """Centres (N, 3) float32 [m]. Raises InputError if rounding moves splats too far.
 
     The measure is `sigmas` (N,) or (N, 3) [m] and their box's length.
     """

@@ -1,8 +1,7 @@
 """Gaussians as glTF 2.0 in one binary file (``.glb``), with KHR_gaussian_splatting.
 
 A primitive of points has float32 centre, rotation (x y z w), sigmas (linear), opacity, harmonics of red, green, blue;
-COLOR_0 serves plain point readers. Values are in world; the node turns z up to glTF's y. The container is JSON and
-one buffer of tables.
+COLOR_0 serves plain point readers. Values are in world; the node turns z up to glTF's y.
 """
 
 import json
@@ -108,8 +107,7 @@ def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, w
 def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write `gaussians`; `comments` become the asset's extras. Same input, same bytes.
 
-    ``_LABEL`` is written if some Gaussian is not an object. Raises InputError naming the index
-    of an invalid value.
+    ``_LABEL`` is written if some Gaussian is not an object. Raises InputError for an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
     tables: dict[str, Array] = {  # the first has its range beside it

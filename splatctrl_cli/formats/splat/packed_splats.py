@@ -8,8 +8,7 @@
 header of 32 bytes, a table of two uint64 per attribute (bytes packed and unpacked), and a zstd stream each; empty
 harmonics may be left out.
 
-The format's axes are right, up, back. World axes are written unchanged, so that they read back; a y-up viewer shows a
-z-up world lying on its back.
+The format's axes are right, up, back; world axes are written unchanged, for reading back.
 """
 
 import gzip
@@ -43,8 +42,8 @@ ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("
 def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write what `.splat` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    A quaternion's largest component is made negative: -1 has a byte, +1 has none. Raises InputError naming the
-    index of an invalid value.
+    A quaternion's largest component is made negative: -1 has a byte, +1 has none. Raises InputError for an invalid
+    value.
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
@@ -88,7 +87,7 @@ def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
 def splat_bound(gaussians: GaussianSet) -> Differences:
     """Half a step of each byte: 1/510 of colour and opacity, 1/256 of quaternions.
 
-    Four components of 1/256 move a unit quaternion by at most 2/256, which turns by twice that: 0.9 degrees.
+    Four of 1/256 move a unit quaternion by at most 2/256, and turn by twice that: 0.9 degrees.
     """
     return Differences(center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0)
 
@@ -109,7 +108,7 @@ SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
 def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write what `.spz` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    Raises InputError naming the index of an invalid value.
+    Raises InputError for an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
     held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
@@ -163,8 +162,8 @@ def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
 def spz_bound(gaussians: GaussianSet) -> Differences:
     """Half a step of each value, with a margin for float32.
 
-    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511 are 1.2e-3 together. The fourth
-    follows and is at least 1/2, which at most doubles it; a rotation turns by twice that: 0.28 degrees.
+    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511 are 1.2e-3 together. The fourth is
+    at least 1/2, which at most doubles it; a rotation turns by twice that: 0.28 degrees.
     """
     return Differences(
         center=0.5001 * (2.0 ** -_fraction_bits(gaussians.centers)),

@@ -17,7 +17,7 @@ Comments = dict[str, str]
 
 
 def logit(opacities: Float32) -> Float64:
-    """log(p / (1 - p)) of (N,) in [0, 1], finite at 0 and 1 (restored by `sigmoid`)."""
+    """log(p / (1 - p)) of (N,) in [0, 1], finite at 0 and 1 (`sigmoid` restores these)."""
     inside = (opacities > 0) & (opacities < 1)
     p = np.where(inside, opacities, 0.5).astype(np.float64)
     return np.where(inside, np.log(p) - np.log1p(-p), np.where(opacities > 0.5, LOGIT_OF_ONE, LOGIT_OF_ZERO))
@@ -30,7 +30,7 @@ def sigmoid(logits: Float64) -> Float32:
 
 
 def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
-    """exp(x) as float32 [m]. Raises InputError naming the first splat outside the range of normal float32."""
+    """exp(x) as float32 [m]. Raises InputError for one outside normal float32."""
     values = np.exp(np.clip(logs, -700.0, 700.0))
     limits = np.finfo(np.float32)
     refuse(where, name, values, (values > limits.max) | (values < limits.tiny), "a radius that float32 holds [m]")
@@ -87,7 +87,7 @@ class Differences:
 def float32_bound(gaussians: GaussianSet) -> Differences:
     """A float32 format's bound: centres exact, one rounding of the rest.
 
-    A log sigma is at most 88 in size, so half a unit of its last place is 88 * 2^-24 = 5e-6 of sigma.
+    A log sigma is at most 88 in size: half a unit of its last place is 5e-6 of sigma.
     """
     largest_color = float(np.abs(gaussians.harmonics[:, 0]).max(initial=1.0))
     return Differences(center=0.0, sigma=6e-6, rotation=1e-4, color=1e-6 * largest_color, opacity=1e-6, harmonics=0.0)
@@ -124,11 +124,11 @@ def _angles(a: Float32, b: Float32) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class SplatFormat:
-    """A splat file format, in its module's ``ENTRIES``, for the program and its docs.
+    """A splat file format, in its module's ``ENTRIES``.
 
     `held`: the representable part of a set; `bound`: the largest rounding; `check` raises UsageError without its
-    library. `docs`: rows in docs/artefacts.md, cells between bars, an empty line between rows: suffix, what it is,
-    what it rounds to, what it does not hold.
+    library. `docs`: rows in docs/artefacts.md, an empty line between: suffix | what it is | what it rounds to | what
+    it cannot represent.
     """
 
     name: str

@@ -1,9 +1,8 @@
 """Splat files: 3D-GS PLY, conversion from and to Gaussians, any format by suffix.
 
-The PLY has the reference implementation's order without ``f_rest_*`` (degree-0 colour): ``x y z nx ny nz f_dc_0..2
-opacity scale_0..2 rot_0..3``, then ``label`` (uchar) and ``density`` (float). Normals are zeros, for readers that
-rely on the order. ``scale_*`` are three equal log(radius), ``rot`` is 1 0 0 0, ``opacity`` a logit, ``f_dc``
-``(colour - 0.5) / C0``.
+The PLY has the reference order without ``f_rest_*``: ``x y z nx ny nz f_dc_0..2 opacity scale_0..2 rot_0..3``, then
+``label`` (uchar) and ``density`` (float). Normals are zeros. ``scale_*`` are three equal log(radius), ``rot`` is 1 0
+0 0, ``opacity`` a logit, ``f_dc`` ``(colour - 0.5) / C0``.
 """
 
 from collections.abc import Mapping
@@ -55,7 +54,6 @@ HEADER_COMMENTS = {
 
 
 def as_gaussians(splats: SplatSet) -> GaussianSet:
-    """Convert to Gaussians, without density."""
     coefficients = (splats.colors.astype(np.float64) - 0.5) / SH_C0
     return GaussianSet(
         centers=splats.centers,
@@ -83,7 +81,7 @@ def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
 def nearest_splats(gaussians: GaussianSet) -> SplatSet:
     """Splats of the Gaussians' volume (geometric mean of sigmas), opacity and mean colour.
 
-    Loses orientation, flatness (flat Gaussians become thicker and narrower) and view-dependent colour.
+    Loses orientation, flatness and view-dependent colour.
     """
     return _round_splats(
         gaussians, np.exp(np.log(gaussians.scales.astype(np.float64)).mean(axis=1)).astype(np.float32)
@@ -109,8 +107,7 @@ def _is_stretched(gaussians: GaussianSet) -> Bool:
 def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None:
     """Write `splats`, with frame, units and `comments` in the header. Same input, same bytes.
 
-    Opacities 0 and 1 read back exactly. Raises InputError naming the index of an invalid value, UsageError for a
-    comment of several lines.
+    Opacities 0 and 1 read back exactly. Raises as `write_gaussian_ply`.
     """
     check_splats("splats to write", splats)
     rows = rows_of(as_gaussians(splats), DTYPE)
@@ -121,18 +118,15 @@ def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None
 def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
-    Ignores other properties (normals, higher harmonics, rotation); a missing label is 0 (object), a missing density 0
-    (not computed). Raises InputError if truncated, anisotropic, invalid or without a `REQUIRED` property.
+    Ignores other properties; a missing label is 0 (object), as is a density (not computed). Raises InputError if
+    truncated, anisotropic, invalid or without a `REQUIRED` property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return splats_of(ply), ply.pairs()
 
 
 def read_world_splats(path: Path) -> SplatSet:
-    """Read a PLY in metres and world; comments may omit both.
-
-    Raises as `read_ply` and `check_world`.
-    """
+    """Read a PLY in metres and world; comments may omit both. Raises as `read_ply` and `check_world`."""
     splats, comments = read_ply(path)
     check_world(path, comments)
     return splats
@@ -190,7 +184,6 @@ def splats_of(ply: PlyFile) -> SplatSet:
 
 
 def num_stretched(ply: PlyFile) -> int:
-    """Count rows with unequal scales."""
     scales = log_sigmas(ply)
     spread = scales.max(axis=1, initial=-np.inf) - scales.min(axis=1, initial=np.inf)
     return int(np.count_nonzero(spread > MAX_SCALE_SPREAD))
@@ -222,7 +215,7 @@ def format_of(path: Path) -> SplatFormat:
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
-    """Read any splat file and its comments; a SplatSet if all are round, of one colour each.
+    """Read any splat file and its comments; a SplatSet if all are round and of one colour each.
 
     Raises InputError if missing, truncated, unknown or invalid.
     """
@@ -272,7 +265,7 @@ def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:
 
 
 def read_spheres(path: Path) -> SplatSet:
-    """Read any splat file as spheres in the world, without harmonics above the constant one.
+    """Read any splat file as spheres in the world, with constant harmonics.
 
     Raises InputError as `read_splats`, and for splats not round, or in another unit or frame.
     """

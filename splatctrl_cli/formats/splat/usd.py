@@ -1,7 +1,7 @@
 """Gaussians as OpenUSD particle fields (UsdVol ParticleField3DGaussianSplat, OpenUSD 26.3 and later), in world.
 
-Sigmas and opacities are linear; harmonics go by Gaussian, then by coefficient. z is up; units are metres. Needs
-usd-core, a separate extra.
+Sigmas and opacities are linear; harmonics go by Gaussian, then coefficient. z is up; units are metres. Needs
+usd-core.
 """
 
 import errno
@@ -28,8 +28,8 @@ NAME = "field"  # of the file while the library has it: it goes by the suffix
 def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *, suffix: str) -> None:
     """Write `gaussians` as ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
 
-    Primvar ``label`` is written if some Gaussian is not an object. Raises InputError naming the index
-    of an invalid value; UsageError without the library.
+    Primvar ``label`` is written if some Gaussian is not an object. Raises InputError for an invalid value, UsageError
+    without the library.
     """
     check_gaussians("Gaussians to write", gaussians)
     usd, geometry, volume, arrays, kinds = _library()
@@ -64,7 +64,7 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
 def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
     """Read a USD file's only particle field, in its own axes, and its data.
 
-    Transforms are not applied. Raises InputError if unreadable or without exactly one field; UsageError without the
+    Transforms are not applied. Raises InputError if unreadable or without exactly one field, UsageError without the
     library.
     """
     usd, geometry, *_ = _library()

@@ -21,7 +21,6 @@ FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include l
 
 @cache
 def source_digest() -> bytes:
-    """Digest of all files that kernels may include."""
     digest = hashlib.sha256()
     for folder in FOLDERS:
         for path in sorted(p for p in folder.iterdir() if p.suffix in {"", ".h", ".cu", ".cuh"} and p.is_file()):
@@ -101,27 +100,27 @@ class CudaDevice:
         return address
 
     def free(self, address: int) -> None:
-        """Free, after what is queued."""
+        """Free, after queued work."""
         self.wait()
         _check(driver.cuMemFree(address))
 
     def write(self, address: int, values: Array) -> None:
-        """Copy an array there, after what is queued."""
+        """Copy an array there, after queued work."""
         values = np.ascontiguousarray(values)
         _check(driver.cuMemcpyHtoDAsync(address, values.ctypes.data, values.nbytes, self._handle))
         self.wait()  # the array may be freed
 
     def read(self, address: int, out: Array) -> None:
-        """Copy from there, after what is queued."""
+        """Copy from there, after queued work."""
         _check(driver.cuMemcpyDtoHAsync(out.ctypes.data, address, out.nbytes, self._handle))
         self.wait()
 
     def copy(self, target: int, source: int, num_bytes: int) -> None:
-        """Copy within the device, after what is queued."""
+        """Copy within the device, after queued work."""
         _check(driver.cuMemcpyDtoDAsync(target, source, num_bytes, self._handle))
 
     def wait(self) -> None:
-        """Wait for what is queued."""
+        """Wait for queued work."""
         _check(driver.cuStreamSynchronize(self._handle))
 
     def record(self, launches: Sequence[Launch]) -> "CudaGraph":
@@ -136,7 +135,7 @@ class CudaDevice:
         return CudaGraph(graphs, self._stream)
 
     def queue(self, launches: Sequence[Launch], target: Any = None) -> None:
-        """Queue launches singly, for tools that inspect each, or in the `target` of a graph."""
+        """Queue launches singly, for inspection, or in the `target` of a graph."""
         for one in launches:
             config = LaunchConfig(grid=one.grid, block=one.block)
             if one.source not in self._codes:

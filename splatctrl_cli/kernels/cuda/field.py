@@ -1,6 +1,6 @@
 """Distance fields on a device, in grid cells and at points.
 
-Shapes: N spheres as C clusters (kernels/field.py), Q points, (X, Y, Z) cells.
+N spheres as C clusters (kernels/field.py), Q points, (X, Y, Z) cells.
 """
 
 from collections.abc import Collection, Mapping
@@ -48,10 +48,10 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Wanted results in (X, Y, Z) cells or (Q,) points [m].
+    """Results in (X, Y, Z) cells or (Q,) points [m].
 
     bound: exact distance minus margin; entry: nearest sphere's; kernels: exact where undefined; counts: by kernel,
-    cells where it is undefined, and where it exceeds the exact distance by more than `resolution`.
+    cells where it is undefined, or exceeds the exact distance by more than `resolution`.
     """
 
     distance: Float32
@@ -91,13 +91,12 @@ class DeviceField:
             self._tasks[name] = task
 
     def close(self) -> None:
-        """Free the memory."""
         for address, _ in self._rooms.values():
             self.device.free(address)
         self._rooms = {}
 
     def bake(self, span: GridSpan, wanted: Collection[str], *, margin: float = 0.0) -> Answers:
-        """Return `wanted` (fields of `Answers`) in a span; margin [m]: of bound."""
+        """`wanted` (fields of `Answers`) in a span; margin [m]: of bound."""
         grid = np.zeros((), GRID)
         grid["place"], grid["size"], grid["planes"] = (*span.origin, span.voxel), span.shape, (span.first, span.last)
         shape = span.shape_of_channel
@@ -105,7 +104,7 @@ class DeviceField:
         return self._answered("bake", {"grid": grid}, shape, num_warps, wanted, margin)
 
     def query(self, points: Float64, anchor: Float64, wanted: Collection[str] = ("gradient",)) -> Answers:
-        """Return `wanted` at points (Q, 3), Q > 0, in anchor's (3,) frame."""
+        """`wanted` at points (Q, 3), Q > 0, in anchor's (3,) frame."""
         address = self._put("points", points)
         asked: dict[str, Array | int] = {"points": address, "num_points": len(points), "anchor": anchor}
         return self._answered("query", asked, (len(points),), len(points), wanted, 0.0)

@@ -1,6 +1,6 @@
 """Iterations of the fit on a device, which keeps splats, Adam's state and views.
 
-Shapes: N splats, (H, W) pixels, K tiles of 16 x 16 pixels. If a list is too short, it grows, and the run repeats.
+N splats, (H, W) pixels, K tiles of 16 x 16 pixels. If a list is too short, it grows, and the run repeats.
 """
 
 from collections.abc import Callable, Sequence
@@ -75,7 +75,7 @@ def bytes_needed(
 class DeviceFit:
     """Optimiser of N splats on a device, for views of `sizes` (H, W) at first.
 
-    Raises OutOfMemory, which names what would fit, if there is no room.
+    Raises OutOfMemory, which names what would fit.
     """
 
     def __init__(
@@ -104,7 +104,6 @@ class DeviceFit:
         self._room("parts", 4 * NUM_SUMS * self.part_capacity)
 
     def close(self) -> None:
-        """Free the memory."""
         for address in [*self._addresses.values(), *self._images]:
             self.device.free(address)
         self._addresses, self._images, self._sizes = {}, {}, {}
@@ -165,7 +164,7 @@ class DeviceFit:
     def run(
         self, schedule: Sequence[int], weights: LossWeights, settings: OptimiserSettings, seed: int
     ) -> dict[int, LossTerms]:
-        """Run an iteration on each scheduled view; return losses at their last iteration.
+        """Run an iteration on each scheduled view; return their last losses.
 
         Iteration k draws noise with `seed` + k.
         """
@@ -265,7 +264,7 @@ class DeviceFit:
     def rewind(
         self, schedule: Sequence[int], weights: LossWeights | None, settings: OptimiserSettings | None, seed: int = 0
     ) -> None:
-        """Set a schedule before the next launches; weights and settings None: for rendering only."""
+        """Set a schedule before launches; weights and settings None: for rendering only."""
         run = np.zeros((), RUN)
         if settings is not None and weights is not None:
             w = weights
@@ -282,7 +281,7 @@ class DeviceFit:
         self._room("terms", max(8 * NUM_TERMS * len(self.views), LEAST_TABLE))
 
     def _fits(self) -> bool:
-        """Return True if all lists had room; else grow them."""
+        """True if all lists had room; else grow them."""
         counters = self._read("counters", (), COUNTERS)
         longest, most = int(counters["longest_list"]), int(counters["most_parts"])
         if longest:

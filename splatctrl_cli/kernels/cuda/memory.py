@@ -11,7 +11,7 @@ FIT, FIELD = "fit.cu", "field.cu"  # the sources of kernels
 
 
 class DeviceError(RuntimeError):
-    """The device is missing, unusable, or failed; `remedy` says what to do about it."""
+    """The device is missing, unusable, or failed; `remedy`: the user's action."""
 
     def __init__(self, message: str, *, remedy: str = "") -> None:
         super().__init__(message)
@@ -34,8 +34,6 @@ class Launch:
 
 
 class Graph(Protocol):
-    """Launches that run one after the other."""
-
     def run(self, num_times: int = 1) -> None:
         """Queue the launches `num_times`."""
 
