@@ -210,7 +210,7 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
     """No new obstacle comes within the margin of a fixed link's surface in two scenes in a row. New is 1 cm or more
-    (at its mount 3 cm) from all that stood there when a camera first looked; the old is a note.
+    (at its mount 3 cm) from all that stood there, in space that was free before; the old is a note.
     """
     broken = {
         name: (first, least)
