@@ -2,6 +2,8 @@
 
 import argparse
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import shtab
@@ -35,17 +37,18 @@ def run_completion(args: argparse.Namespace) -> int:
 
 
 def run_help(args: argparse.Namespace) -> int:
-    """Print a page, or every option of a command without one."""
+    """Print a page, every setting, or every option of a command without a page."""
     roots = Path(__file__).parents[1:3]  # of a wheel, of the repository
     folder = next(place / "docs" for place in roots if (place / "docs" / "README.md").is_file())
-    pages = {page.stem: page for page in folder.glob("*.md")}
     commands, topic = build_parser().actions, args.topic or "README"
     assert commands is not None
-    if topic not in {*pages, *commands.choices}:
-        names = sorted({*pages, *commands.choices})
-        remedy = did_you_mean(topic, names, f"give one of: {', '.join(names)}")
+    texts: dict[str, Callable[[], str]] = {name: one.format_full_help for name, one in commands.choices.items()}
+    texts["settings"] = lambda: "\n".join(template_of(resolved_settings(None, ())))
+    texts |= {page.stem: partial(page.read_text, encoding="utf-8") for page in folder.glob("*.md")}
+    if topic not in texts:
+        remedy = did_you_mean(topic, sorted(texts), f"give one of: {', '.join(sorted(texts))}")
         raise UsageError(f"help: no page {shown(topic)}", remedy=remedy)
-    text = pages[topic].read_text(encoding="utf-8") if topic in pages else commands.choices[topic].format_full_help()
+    text = texts[topic]()
     return Console(args).result({"topic": topic, "text": text}, text.splitlines())
 
 

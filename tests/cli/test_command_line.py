@@ -135,6 +135,12 @@ def test_help_prints_a_page_and_names_the_nearest_for_a_wrong_word(capsys: pytes
     assert capsys.readouterr().out == (ROOT / "docs" / "ci.md").read_text()
     assert main(["help"]) == 0
     assert capsys.readouterr().out == (ROOT / "docs" / "README.md").read_text()
+    assert main(["help", "settings"]) == 0
+    assert main(["config", "--template"]) == 0
+    help_page, template = capsys.readouterr().out.split("[scene]\n")[1:]
+    assert help_page.strip() == template.strip()
+    assert main(["help", "info"]) == 0
+    assert "--intrinsics" in capsys.readouterr().out
     assert main(["help", "replays"]) == 2
     assert capsys.readouterr().err == "splatctrl: help: no page 'replays'; did you mean replay?\n"
 
