@@ -17,6 +17,7 @@ from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.formats.scene import scene_writer
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.jobs.reconstruct import reconstruction
+from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
 from splatctrl_cli.jobs.running import progress
 from splatctrl_cli.jobs.running.progress import Wait, duration
 from splatctrl_cli.scene.fitter import SceneFitter
@@ -249,16 +250,24 @@ def test_resume_without_anything_to_go_on_from_starts_at_the_beginning(
 
 
 @pytest.mark.parametrize(
-    ("settings", "taken"),
+    ("settings", "news", "taken"),
     [
-        (["scene.snapshot_every=2"], [0, 2, 4]),
-        (["scene.snapshot_period=0.5"], [0, 3, 5]),
-        (["scene.snapshot_every=3", "scene.snapshot_period=0.3"], [0, 3, 5]),
+        (["scene.snapshot_every=2"], [], [0, 2, 4]),
+        (["scene.snapshot_period=0.5"], [], [0, 3, 5]),
+        (["scene.snapshot_every=3", "scene.snapshot_period=0.3"], [], [0, 3]),
+        (["scene.snapshot_every=3"], [4, 5], [0, 3, 4, 5]),
     ],
 )
-def test_snapshots_are_taken_by_count_and_by_time(
-    recording: Path, tmp_path: Path, settings: list[str], taken: list[int]
+def test_snapshots_are_taken_by_count_by_time_and_of_new_obstacles(
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    settings: list[str],
+    news: list[int],
+    taken: list[int],
 ) -> None:
+    """news: steps with a new obstacle."""
+    monkeypatch.setattr(KeptMaps, "shows_news", lambda _, fitter: fitter.num_steps - 1 in news)
     given = [word for setting in settings for word in ("--set", setting)]
     assert main([*command(recording, "log", tmp_path / "scene"), *given]) == 0
     scene = open_scene(tmp_path / "scene")
