@@ -177,8 +177,8 @@ class TwistTrack:
         age = (stamp_ns - self.stamp_ns[np.maximum(index, 0)]) * 1e-9
         return np.asarray((index >= 0) & (age <= timeout))
 
-    def asked(self, model: RobotModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
-        """A stamp's twist (6,) in world axes at q (J,), not capped."""
+    def in_world(self, model: RobotModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
+        """Twist (6,) at a stamp [ns] in world axes, with the arm at q (J,); not capped."""
         twist = self.at(stamp_ns, timeout)
         if self.axes is None:
             return twist
@@ -186,9 +186,9 @@ class TwistTrack:
         return np.concatenate([R @ twist[:3], R @ twist[3:]])
 
     def reference(self, model: RobotModel, config: ControlConfig, q: Float64, stamp_ns: int) -> Float64:
-        """`asked`, each part capped in norm."""
+        """`in_world`, each part capped in norm."""
         return reference_velocity(
-            self.asked(model, q, stamp_ns, config.twist_timeout),
+            self.in_world(model, q, stamp_ns, config.twist_timeout),
             gain=1.0,
             max_linear=config.max_linear_speed,
             max_angular=config.max_angular_speed,

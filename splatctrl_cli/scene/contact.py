@@ -8,14 +8,22 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.geometry import invert_transform, transform_points
-from splatctrl_cli.records import Bool, Label, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.labels import Seen, shown_kinds
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import Each, gap_seeds, world_points_at
-from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, farthest_within, nearest_within, pixels_of
+from splatctrl_cli.scene.self_mask import (
+    PixelKind,
+    SelfMask,
+    farthest_within,
+    nearest_within,
+    pixels_at,
+    pixels_of,
+    tolerance_at,
+)
 
 
 def is_in_contact(points_world: NDArray[np.floating], robot: RobotPosture) -> Bool:
@@ -79,6 +87,26 @@ def contact_seeds(
         each=each,
     )
     return replace(seeds, radii=0.5 * seeds.radii)
+
+
+def lasts_at_fixed_links(
+    robot: RobotPosture,
+    frames: Sequence[RgbdFrame],
+    lasting: Sequence[Bool],
+    config: OccupancyConfig,
+    points: Float32,
+) -> Bool:
+    """True for points (K, 3) [m], world, away from fixed links, or on a `lasting` pixel (H, W) of a frame.
+
+    Stereo gives pixels outside a link's outline the link's depth in some frames.
+    """
+    distance = robot.distance(points)
+    is_kept = (distance > fixed.ROBOT_REACH) | (distance >= robot.distance_to_moving(points))
+    for frame, pixels in zip(frames, lasting, strict=True):
+        pixel, z = pixels_at(frame, points)
+        depth = frame.depth.ravel()[pixel]
+        is_kept |= (pixel >= 0) & pixels.ravel()[pixel] & (np.abs(z - depth) <= tolerance_at(depth, config))
+    return np.asarray(is_kept)
 
 
 def hidden_objects(

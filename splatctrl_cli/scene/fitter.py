@@ -14,7 +14,7 @@ from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
-from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
+from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact, lasts_at_fixed_links
 from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
 from splatctrl_cli.scene.depth_holes import explain_unseen, lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
@@ -44,10 +44,8 @@ from splatctrl_cli.scene.self_mask import (
     audited,
     object_mask,
     of_label,
-    pixels_at,
     self_mask,
     settled,
-    tolerance_at,
     voted,
     without,
 )
@@ -163,12 +161,11 @@ class SceneFitter:
         self.buffer.parameters[hidden] = as_they_were[hidden]
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen, steady)
-        half, is_lasting = None, None  # of the first frames nothing lasts yet
-        if self.num_steps:
-            lasting = [
-                object_twice(f, before.get(f.camera), pixels) for f, pixels in zip(frames, steady, strict=True)
-            ]
-            half, is_lasting = self.num_steps % 2, partial(self._is_lasting, robot, views, lasting)
+        is_lasting = None  # of the first frames nothing lasts yet
+        if self.num_steps and robot is not None:
+            lasting = [object_twice(f, before.get(f.camera), each) for f, each in zip(frames, steady, strict=True)]
+            is_lasting = partial(lasts_at_fixed_links, robot, frames, lasting, config)
+        half = self.num_steps % 2 if self.num_steps else None
         filled += self._fill_gaps(views, masks, removed, half, is_lasting)
         self._keep_to_surface(robot, views, seen)
         if self.shell is not None:
@@ -405,24 +402,6 @@ class SceneFitter:
                 removed["evicted"] += int(is_evicted.sum())
             filled += self.buffer.fill(seeds, self.config.initial_opacity, label=label)
         return filled
-
-    def _is_lasting(
-        self, robot: RobotPosture | None, views: Sequence[View], lasting: Sequence[Bool], points: Float32
-    ) -> Bool:
-        """Points (K,) that a `lasting` pixel (H, W) shows, or not near unmoved links.
-
-        Stereo gives pixels outside an outline the link's depth in some frames.
-        """
-        if robot is None:
-            return np.ones(len(points), bool)
-        distance = robot.distance(points)
-        is_lasting = (distance > fixed.ROBOT_REACH) | (distance >= robot.distance_to_moving(points))
-        for view, pixels in zip(views, lasting, strict=True):
-            pixel, z = pixels_at(view.frame, points)
-            depth = view.frame.depth.ravel()[pixel]
-            is_there = np.abs(z - depth) <= tolerance_at(depth, self.occupancy.config)
-            is_lasting |= (pixel >= 0) & pixels.ravel()[pixel] & is_there
-        return np.asarray(is_lasting)
 
     def _standing_for(self, label: Label) -> Bool:
         is_robot: Bool = self.buffer.labels == Label.ROBOT

@@ -1,4 +1,4 @@
-"""What commands and replays share."""
+"""Fixtures of the tests of commands and replays."""
 
 from collections.abc import Iterator
 from pathlib import Path

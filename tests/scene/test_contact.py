@@ -13,7 +13,7 @@ from splatctrl_cli.config.fixed import CONTACT_REACH, ROBOT_REACH
 from splatctrl_cli.records import Box, Label, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Carried, Declarations
 from splatctrl_cli.scene import fitter as fitter_module
-from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects
+from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import kept_radii
 from splatctrl_cli.scene.posture import RobotPosture
@@ -87,22 +87,23 @@ def test_what_the_robot_hides_of_an_object_is_not_fitted_to_the_robot() -> None:
 def test_gaps_at_a_fixed_link_are_filled_where_a_surface_lasts(
     is_fixed: bool, place: tuple[float, float, float], lasts: bool, is_kept: bool
 ) -> None:
-    target, robot, view = robot_over_the_floor()
+    robot = ball(0.15)
+    view = seen_with(robot)
     assert robot.surface is not None
     base = replace(robot, surface=replace(robot.surface, fixed=("arm",) if is_fixed else ()))
     lasting = np.full(view.depth.shape, lasts)
-    found = target._is_lasting(base, [target.view(view)], [lasting], np.array([place], np.float32))
+    found = lasts_at_fixed_links(base, [view], [lasting], OccupancyConfig(), np.array([place], np.float32))
     assert found.tolist() == [is_kept]
 
 
 def test_the_first_map_is_filled_before_anything_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = list[np.ndarray]()
 
-    def record(self: SceneFitter, *given: Any) -> np.ndarray:
+    def record(*given: Any) -> np.ndarray:
         calls.append(given[2][0])
-        return np.zeros(len(given[3]), bool)
+        return np.zeros(len(given[4]), bool)
 
-    monkeypatch.setattr(SceneFitter, "_is_lasting", record)
+    monkeypatch.setattr(fitter_module, "lasts_at_fixed_links", record)
     target, robot, view = robot_over_the_floor()
     assert not calls
     target.step([view], robot)

@@ -198,7 +198,7 @@ def twist_figures(
         reference = track.reference(model, config, q, int(stamp))
         if known:
             num_known += 1
-            num_capped += not np.array_equal(reference, track.asked(model, q, int(stamp), config.twist_timeout))
+            num_capped += not np.array_equal(reference, track.in_world(model, q, int(stamp), config.twist_timeout))
         if step is not None:
             missed = model.frame_jacobian(q, frame) @ step.velocity - reference
             linear[i], angular[i] = np.linalg.norm(missed[:3]), np.linalg.norm(missed[3:])

@@ -64,7 +64,7 @@ def test_space_that_a_camera_saw_or_the_robot_was_in_is_known() -> None:
 
 @pytest.mark.parametrize(("free", "has_come"), [((1, 0, 0, 0), True), ((0, 0, 0, 0), False)])
 def test_an_obstacle_comes_to_a_fixed_link_where_space_was_free_before(free: Sequence[int], has_come: bool) -> None:
-    """Where space never was, a map fills a hole."""
+    """In space that was never free, splats fill a hole of the map instead."""
     model, q = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
     place, radius = beside_the_mount(model)
     far = (2.0, 2.0, 2.0)
