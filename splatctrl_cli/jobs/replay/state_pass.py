@@ -264,10 +264,10 @@ class ReplayRecord:
             return
         self._last_scene, before, seen = known, self._was_free, self._scene.seen_at(stamp)
         was_free = None
-        if seen is not None and seen.is_free is not None:
+        if seen is not None and before is not None:
+            was_free = partial(observed_at, before.view(np.uint8), seen.origin, seen.voxel)
+        if seen is not None and seen.is_free is not None:  # the final map has no states
             self._was_free = seen.is_free if before is None else before | seen.is_free
-            if before is not None:
-                was_free = partial(observed_at, before.view(np.uint8), seen.origin, seen.voxel)
         self.fixed_parts.look(known.distances["exact"], part.position[0], was_free)
 
     def _look_around(self, part: AuditTrace) -> None:

@@ -62,16 +62,21 @@ def test_space_that_a_camera_saw_or_the_robot_was_in_is_known() -> None:
     assert known_space(grid)(points).tolist() == [1, 1, 0, 0]
 
 
-@pytest.mark.parametrize(("free", "has_come"), [((1, 0, 0, 0), True), ((0, 0, 0, 0), False)])
-def test_an_obstacle_comes_to_a_fixed_link_where_space_was_free_before(free: Sequence[int], has_come: bool) -> None:
-    """In space that was never free, splats fill a hole of the map instead."""
+@pytest.mark.parametrize(
+    ("free", "has_come"), [((1, 0, 0, 0), True), ((0, 0, 0, 0), False), ((0, 0, None, None), False)]
+)
+def test_an_obstacle_comes_to_a_fixed_link_where_space_was_free_before(
+    free: Sequence[int | None], has_come: bool
+) -> None:
+    """In space that was never free, splats fill a hole of the map instead. None: a map without states."""
     model, q = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
     place, radius = beside_the_mount(model)
     far = (2.0, 2.0, 2.0)
     before, after = (splat_fields(plain_splats(centers, radius), Config(), 1) for centers in ([far], [far, place]))
 
     def seen_at(stamp_ns: int) -> Seen:
-        is_free = np.full((1, 1, 1), bool(free[stamp_ns // SECOND]))
+        now = free[stamp_ns // SECOND]
+        is_free = None if now is None else np.full((1, 1, 1), bool(now))
         return Seen(look=look_free, origin=np.array(place), voxel=0.1, is_free=is_free)
 
     scene = KnownScene(
