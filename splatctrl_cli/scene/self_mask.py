@@ -190,24 +190,27 @@ def settled(
 ) -> SelfMask:
     """Mask with each doubted piece decided: object or mixed.
 
-    It is an object if one of `others` measured half of it, or if there are none. others: of other cameras, and
-    settled ones of the last step.
+    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` measured half of it, or
+    if there are none. others: of other cameras, and settled ones of the last step.
     """
-    is_doubted = mask.kinds == PixelKind.DOUBTED
-    if not is_doubted.any():
+    doubted = (mask.kinds == PixelKind.DOUBTED).view(np.uint8)
+    v, u = np.nonzero(doubted)
+    if not len(v):
         return mask
-    num, piece, stats, _ = cv2.connectedComponentsWithStats(is_doubted.view(np.uint8), connectivity=8)
-    v, u = np.nonzero(is_doubted)
-    points = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, frame.depth[v, u]))
-    is_object, owner = np.full(num, not others), piece[v, u]
+    depth = np.ascontiguousarray(frame.depth)
+    points = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depth[v, u]))
+    is_object, steps = np.full(len(v), not others), np.full_like(depth, MASK_STEP)
+    votes, balance = np.zeros(depth.shape), np.empty(depth.shape)
     for other, its in others:
         pixel, z = pixels_at(other, points)
         measured = np.where(pixel >= 0, other.depth.ravel()[pixel], np.float32(0.0))
         agrees = np.isin(its.kinds.ravel()[pixel], (PixelKind.OBJECT, PixelKind.DOUBTED)) & (measured > 0)
         agrees &= np.abs(z - measured) <= tolerance_at(measured, config)
-        is_object |= np.bincount(owner, agrees, num) >= 0.5 * stats[:, cv2.CC_STAT_AREA]
+        votes[v, u] = np.where(agrees, 1.0, -1.0)
+        native.piece_areas(depth, steps, votes, doubted, doubted, balance)
+        is_object |= balance[v, u] >= 0
     kinds = mask.kinds.copy()
-    kinds[v, u] = np.where(is_object[owner], np.uint8(PixelKind.OBJECT), np.uint8(PixelKind.MIXED))
+    kinds[v, u] = np.where(is_object, np.uint8(PixelKind.OBJECT), np.uint8(PixelKind.MIXED))
     return replace(mask, kinds=kinds)
 
 

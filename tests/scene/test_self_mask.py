@@ -138,6 +138,18 @@ def test_what_is_behind_the_outline_counts_where_it_shows_beyond_the_width_of_an
     assert (kinds(depth)[60, end - columns : end] == kind).all()
 
 
+def test_a_doubted_pixel_is_not_confirmed_by_a_view_of_its_neighbour_behind() -> None:
+    """Two doubted pixels touch by a corner, 30 cm apart in depth; another frame measured the farther one alone."""
+    depth, kinds = np.zeros(SHOWN.shape), np.zeros(SHOWN.shape, np.uint8)
+    near, far = (60, 60), (61, 61)
+    depth[near], depth[far] = 0.9, 1.2
+    kinds[near] = kinds[far] = PixelKind.DOUBTED
+    mask = replace(masked(depth), kinds=kinds)
+    other, seen = np.where(depth == 1.2, depth, 0.0), np.where(depth == 1.2, kinds, 0).astype(np.uint8)
+    decided = settled(frame(depth), mask, [(frame(other), replace(mask, kinds=seen))], CONFIG).kinds
+    assert decided[near] == PixelKind.MIXED and decided[far] == PixelKind.OBJECT
+
+
 def test_depths_that_lie_between_the_robot_and_what_is_behind_are_no_part_of_either() -> None:
     """As a laser returns them at an outline, each another one, beside a surface that goes on."""
     depth, rim = np.minimum(ball_depth(), FLOOR), SHOWN ^ np.isfinite(ball_depth(radius=RADIUS + 0.006))
