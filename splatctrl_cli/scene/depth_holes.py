@@ -27,27 +27,39 @@ BESIDE_ROBOT = np.ones((9, 9), np.uint8)  # its outline is fattened, too
 MOST_POINTS = 1 << 18  # per batch: fine voxels and a large hole may need a hundred million
 
 
-def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
+def unanswered_points(
+    frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig, before: tuple[RgbdFrame, SelfMask] | None = None
+) -> Iterator[Float64]:
     """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
     Some repeat. Rays are about a voxel apart, from `min_range` to the depth of the nearest pixel with depth. Holes
-    up to `NARROW_HOLE` voxels wide do not count, nor those at the robot or its stereo shadow. robot_depth (H, W)
-    [m]: rendered, 0 = none.
+    up to `NARROW_HOLE` voxels wide do not count, nor those that a still camera did not show before. robot_depth
+    (H, W) [m]: rendered, 0 = none; before: the camera's last frame and its mask.
     """
-    is_blank = frame.depth <= 0
-    if not 0 < np.count_nonzero(is_blank) < is_blank.size:
-        return iter(())
-    is_shadow = is_blank & shadowed(frame.depth, frame.intrinsics.fx)
-    is_blank &= ~is_shadow
-    is_end = _with_shadow(cv2.dilate(robot_depth, BESIDE_ROBOT) > 0, is_shadow)
-    if frame.valid is not None:
-        is_end |= ~frame.valid
-    holes = _holes(is_blank, is_end)
+    holes = _holes(frame, robot_depth)
+    if before is not None and holes.any() and np.array_equal(before[0].T_world_camera, frame.T_world_camera):
+        _, groups = cv2.connectedComponents(holes.view(np.uint8), connectivity=8)
+        holes &= np.isin(groups, groups[holes & _holes(before[0], before[1].robot_depth)])
     if not holes.any():
         return iter(())
     behind = _nearest_depth(frame.depth)
     width = config.voxel * frame.intrinsics.fx / float(np.median(behind[holes]))
     return _on_rays(frame, _wide(holes, fixed.NARROW_HOLE * width), behind, max(int(width), 1), config)
+
+
+def _holes(frame: RgbdFrame, robot_depth: Float32) -> Bool:
+    """Pixels (H, W) without depth, in groups that meet neither the border, nor the robot, nor its stereo shadow."""
+    is_blank = frame.depth <= 0
+    if not 0 < np.count_nonzero(is_blank) < is_blank.size:
+        return np.zeros_like(is_blank)
+    is_shadow = is_blank & shadowed(frame.depth, frame.intrinsics.fx)
+    is_blank &= ~is_shadow
+    is_end = _with_shadow(cv2.dilate(robot_depth, BESIDE_ROBOT) > 0, is_shadow)
+    if frame.valid is not None:
+        is_end |= ~frame.valid
+    _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
+    open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
+    return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
 
 
 def _with_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
@@ -74,13 +86,6 @@ def _on_rays(
     for some in (slice(first, first + num) for first in range(0, len(u), num)):
         is_before = depths < behind[v[some], u[some]][:, None]
         yield transform_points(frame.T_world_camera, (rays[some, None] * depths[:, None])[is_before])
-
-
-def _holes(is_blank: Bool, is_end: Bool) -> Bool:
-    """Pixels (H, W) without depth, in groups that meet neither border nor `is_end`."""
-    _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
-    open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
-    return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
 
 
 def _nearest_depth(depth: Float32) -> Float32:

@@ -128,6 +128,7 @@ class SceneFitter:
             strict=True,
         )
         views = list(self._each(self.view, frames, masks))
+        last = {frame.camera: (frame, mask) for frame, mask in self.seen}
         seen = self.seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
             self.descent.background = self._behind(views)
@@ -135,7 +136,9 @@ class SceneFitter:
             found.unproven(without(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
         ]
         self.people.take_in(self.occupancy, proving)
-        unanswered = self._each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
+        unanswered = self._each(
+            lambda one: unanswered_points(one[0], one[1].robot_depth, config, last.get(one[0].camera)), seen
+        )
         for frame, found in zip(frames, rays, strict=True):
             self.occupancy.mark_unseen(found.points(frame, config, is_blank=False), Unseen.CONTRADICTED)
             self.occupancy.mark_unseen(found.points(frame, config, is_blank=True), Unseen.UNANSWERED)

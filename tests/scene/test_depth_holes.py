@@ -105,6 +105,21 @@ def test_other_gaps_are_no_holes(seen: RgbdFrame, robot: Float32) -> None:
     assert not len(points_of(seen, robot))
 
 
+@pytest.mark.parametrize(
+    ("before", "counts"),
+    [
+        pytest.param(frame(), False, id="new"),
+        pytest.param(dark(columns=slice(60, 80)), False, id="open before"),
+        pytest.param(dark(columns=slice(48, 58)), True, id="a part of it"),
+        pytest.param(replace(frame(), T_world_camera=frame(x=0.1).T_world_camera), True, id="another view"),
+    ],
+)
+def test_a_hole_counts_where_the_camera_showed_it_before(before: RgbdFrame, counts: bool) -> None:
+    """Between two people the background may be closed off for one image."""
+    found = list(unanswered_points(dark(), NOBODY, CONFIG, (before, object_mask(before))))
+    assert sum(map(len, found)) == (len(points_of(dark())) if counts else 0)
+
+
 def test_a_dark_block_is_where_all_cameras_look_in_vain() -> None:
     """The others see through the space above it."""
     one, three = unanswered(dark_block(0.0)), unanswered(dark_block(0.0), dark_block(-0.15), dark_block(0.15))
@@ -138,6 +153,19 @@ def test_a_fitted_scene_knows_it() -> None:
     stamps_ns, classes = fitter.known_voxels().seen.look(points)
     assert stamps_ns.tolist() == [-1, -1, -1]
     assert classes.tolist() == [EvidenceClass.UNANSWERED, EvidenceClass.OUTSIDE, EvidenceClass.OUTSIDE]
+
+
+def test_a_fitted_scene_knows_a_hole_from_its_second_image_on() -> None:
+    fitter = SceneFitter(SceneConfig(max_splats=300, first_iterations=1, iterations_per_step=1), CONFIG, WORKSPACE)
+    hole = dark_block(0.0)
+    joined = hole.depth.copy()
+    joined[INTRINSICS.height // 2, :] = 0.0  # joins the hole and the border
+    classes = []
+    for number, depth in enumerate((joined, hole.depth, hole.depth)):
+        fitter.step([replace(hole, depth=depth.copy(), stamp_ns=number * 100_000_000)])
+        _, found = fitter.known_voxels().seen.look(np.array([[0.0, 0.0, 0.5 * BLOCK]]))
+        classes.append(EvidenceClass(found[0]))
+    assert [kind == EvidenceClass.UNANSWERED for kind in classes] == [False, False, True]
 
 
 DEPTH = HEIGHT - 0.1  # [m] of the block, 0.2 m wide
