@@ -19,7 +19,7 @@ from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import camera_array
-from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_at, tolerance_at
 from splatctrl_cli.voxels import LostEdges, Unseen
 
 BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
@@ -105,14 +105,15 @@ def lost_edges(
 ) -> dict[str, LostEdges]:
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
-    Its depth is that of the nearest object next to it, its radius one pixel. Lone object pixels are noise. Balls
-    that a frame sees through by `see_through`, or that are as near to the robot, are left out.
+    Its depth is that of the nearest object next to it, its radius one pixel. Lone object pixels, and depths between
+    two surfaces, do not count. Balls that a frame sees through by `see_through`, or that are as near to the robot,
+    are left out.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
     found = dict[str, LostEdges]()
     for frame, mask in seen:
-        edges = _of_frame(frame, mask)
+        edges = _of_frame(frame, mask, config)
         edges = edges.select(~points.seen_through(edges.centers, cameras, surely, config.see_through))
         if robot is not None and len(edges.radii):
             edges = edges.select(robot.distance(edges.centers) > config.see_through)
@@ -120,8 +121,10 @@ def lost_edges(
     return found
 
 
-def _of_frame(frame: RgbdFrame, mask: SelfMask) -> LostEdges:
-    is_object = cv2.morphologyEx((mask.kinds == PixelKind.OBJECT).view(np.uint8), cv2.MORPH_OPEN, BESIDE) > 0
+def _of_frame(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> LostEdges:
+    is_object = mask.kinds == PixelKind.OBJECT
+    is_object &= ~is_mixed(frame.depth, is_object, tolerance_at(frame.depth, config), 2, frame.intrinsics.fx)
+    is_object = cv2.morphologyEx(is_object.view(np.uint8), cv2.MORPH_OPEN, BESIDE) > 0
     is_robot = (mask.kinds == PixelKind.ROBOT) | (mask.kinds == PixelKind.MIXED)
     beside = cv2.erode(np.where(is_object, frame.depth, np.float32(np.inf)), BESIDE)
     is_beside, is_outline = (

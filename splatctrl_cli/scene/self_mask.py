@@ -134,7 +134,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
         is_sure[v, u] &= gap > sure
     kinds[is_explained] = PixelKind.ROBOT
     is_object = kinds == PixelKind.OBJECT
-    kinds[beside & _is_mixed(depth, is_object, tolerance, edge // 2, frame.intrinsics.fx)] = PixelKind.MIXED
+    kinds[beside & is_mixed(depth, is_object, tolerance, edge // 2, frame.intrinsics.fx)] = PixelKind.MIXED
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0).astype(np.float64)
     is_object, is_edge = kinds == PixelKind.OBJECT, np.isfinite(nearest_at_edge)
     steps = surface_steps(is_object, depth, is_edge, edge, tolerance, config.depth_error)
@@ -155,7 +155,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     )
 
 
-def _is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, fx: float) -> Bool:
+def is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, fx: float) -> Bool:
     """True for object pixels (H, W) within `reach` pixels of a nearer object and a farther surface.
 
     Time-of-flight cameras mix their depths. The object is nearer than a surface tilted by `MASK_STEEP`.

@@ -210,6 +210,16 @@ def test_a_pixel_lost_between_two_surfaces_may_be_of_the_nearer() -> None:
     assert len(edges.radii) == 20 and at_the_block(edges).all()
 
 
+@pytest.mark.parametrize(("above", "has_edge"), [(0.15, False), (0.0, True), (0.3, True)])
+def test_a_depth_between_two_surfaces_has_no_edge(above: float, has_edge: bool) -> None:
+    """Beside a block of 30 cm one column at a height above the floor, as lasers mix depths, and one without depth."""
+    seen = frame(block=0.3)
+    column = int(np.flatnonzero(np.diff(seen.depth[30]) > 0.05)[0]) + 1
+    seen.depth[20:40, column] = HEIGHT - above
+    seen.depth[20:40, column + 1] = 0.0
+    assert bool(np.isclose(edges_of(seen).centers[:, 2], above, atol=0.01).any()) == has_edge
+
+
 def test_the_outline_is_not_where_another_camera_looks_past_it() -> None:
     """A camera that sees no block at all; one that sees it does not."""
     for beside, has_outline in (([], True), ([frame(x=0.15)], False), ([with_lost_edges(0.15)], True)):
