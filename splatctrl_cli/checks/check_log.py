@@ -31,7 +31,17 @@ from splatctrl_cli.checks.check_times import (
     time_findings,
 )
 from splatctrl_cli.checks.clock_offset import ImageMotion
-from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, needs, note, warning
+from splatctrl_cli.checks.finding import (
+    NOTE,
+    WARNING,
+    CheckReport,
+    Finding,
+    damage_findings,
+    error,
+    find_lacks,
+    judge,
+    note,
+)
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.recording.calibrated import correction_of
@@ -56,7 +66,7 @@ from splatctrl_cli.recording.log.messages import (
     num_invalid,
     read_image,
 )
-from splatctrl_cli.recording.log.registration import DepthToColor, TfTree
+from splatctrl_cli.recording.log.registration import TfTree, warp_depth
 from splatctrl_cli.recording.log.rig import Camera, build_cameras, camera_topics, check_mask_topics, missing
 from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.survey import Survey, survey
@@ -202,21 +212,17 @@ def reduced_frames(
 def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
     """Depth in the undistorted colour view, reduced."""
     depth, stride = kept.pixels, kept.stride
-    if camera.depth_to_color is not None:
+    if camera.depth_lens is not None and camera.T_color_depth is not None:
         stride = max(1, round(camera.intrinsics.height / kept.pixels.shape[0]))
-        warp = camera.depth_to_color
-        depth = DepthToColor(
-            depth_intrinsics=strided_lens(warp.depth_intrinsics, kept.stride),
-            color_intrinsics=strided_lens(camera.intrinsics, stride),
-            T_color_depth=warp.T_color_depth,
-        ).warp(depth)
-    elif camera.undistortion is not None:
-        depth = camera.undistortion.nearest(_enlarged(depth, kept))[::stride, ::stride]
+        own, target = strided_lens(camera.depth_lens.intrinsics, kept.stride), strided_lens(camera.intrinsics, stride)
+        depth = warp_depth(depth, own, target, camera.T_color_depth)
+    elif camera.maps is not None:
+        depth = camera.nearest(_enlarged(depth, kept))[::stride, ::stride]
     pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
     if color is not None and color.pixels.ndim == 3:
         pixels = color.pixels
-        if camera.undistortion is not None:
-            pixels = camera.undistortion.color(_enlarged(pixels, color))[:: color.stride, :: color.stride]
+        if camera.maps is not None:
+            pixels = camera.color(_enlarged(pixels, color))[:: color.stride, :: color.stride]
     if pixels.shape[:2] != depth.shape:
         pixels = np.zeros((*depth.shape, 3), np.uint8)
     return RgbdFrame(
@@ -247,7 +253,7 @@ def image_motion(
 
 def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     """Depth with colour, where both share a view."""
-    gray = dict(watch.images[topics.color].thumbnails if camera.depth_to_color is None else ())
+    gray = dict(watch.images[topics.color].thumbnails if camera.depth_lens is None else ())
     at, frames = sorted(gray), []
     poses = {frame.stamp_ns: frame.T_world_camera for frame in sorted(posed, key=lambda frame: frame.stamp_ns)}
     for stamp, depth in watch.images[topics.depth].thumbnails:
@@ -325,7 +331,7 @@ def check_log(
             t.rate(is_read=found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS))
             for name, t in sorted(watch.times.items())
         ],
-        needs=needs(
+        lacks=find_lacks(
             num_cameras=len(cameras),
             num_frames=max((images.count for images in watch.images.values()), default=0),
             states_lack=of_states.lack,
@@ -403,23 +409,16 @@ def _is_beside(watch: LogWatch, name: str, cameras: Sequence[CameraTopics]) -> b
 
 def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Collection[str]) -> list[Finding]:
     """Findings on image topics; notes if no camera uses them. unlike: topics with only depth's encoding."""
-    findings = []
+    findings, known = [], ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
     for name, images in sorted(watch.images.items()):
         its = list(image_findings(images))
         kinds = set(images.encodings)
         unread = sorted(kinds - set(DEPTH_ENCODINGS) - set(COLOR_CONVERSIONS))
-        if unread:
-            known = ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
-            its.append(
-                warning(
-                    "encoding",
-                    name,
-                    f"encoding {unread[0]!r} is not read",
-                    f"record another topic of this camera, or convert it; read: {known}",
-                )
-            )
+        remedy = f"record another topic of this camera, or convert it; read: {known}"
+        text = f"encoding {', '.join(map(repr, unread[:1]))} is not read"
+        its += judge(WARNING if unread else None, "encoding", name, text, remedy)
         if _is_beside(watch, name, cameras):
-            its = [replace(f, severity=Severity.NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
+            its = [replace(f, severity=NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
         elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded and name not in unlike:
             its += depth_findings(images)
         findings += its

@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.calibration.evidence import transform_of
 from splatctrl_cli.calibration.views import DepthView, landed, overlap_rows, surface_normals
 from splatctrl_cli.checks import limits
-from splatctrl_cli.checks.finding import Finding, error, warning
+from splatctrl_cli.checks.finding import ERROR, WARNING, Finding, error, judge, warning
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
 from splatctrl_cli.geometry import back_project, invert_transform, strided_lens, transform_points
 from splatctrl_cli.records import Bool, Float64, RgbdFrame, spread
@@ -144,17 +144,9 @@ def _overlap_findings(
     (fits, most), scale = max((_fitting(views, pairs, cameras, s), s) for s in tried)
     if most < limits.VIEWS_LANDED or plain > limits.VIEWS_TRUSTED * most or fits < limits.VIEWS_LEAST_FIT * most:
         return []
-    said = warning if is_sure else error
-    return [
-        said(
-            "views-scale",
-            "cameras",
-            f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times"
-            " it",
-            f"if so, {rescaled(used.values(), scale)}",
-            value=scale,
-        )
-    ]
+    text = f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times it"
+    remedy = f"if so, {rescaled(used.values(), scale)}"
+    return judge(WARNING if is_sure else ERROR, "views-scale", "cameras", text, remedy, value=scale)
 
 
 def rescaled(units: Iterable[float | None], factor: float) -> str:

@@ -170,7 +170,7 @@ def estimate_clock_offset(
     return _peak(offsets, np.array(scores), num, limits.OFFSET_CORRELATION, limits.OFFSET_SUM_ERROR * interval)
 
 
-def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
+def select_states(stamp_ns: Stamps, motion: ImageMotion) -> Index:
     """Indices (K,) of states, with ascending stamps (T,), that suffice for `estimate_clock_offset`.
 
     A long or dense log needs few.

@@ -14,8 +14,8 @@ from splatctrl_cli.checks.clock_offset import (
     ImageMotion,
     RobotPoints,
     estimate_clock_offset,
+    select_states,
     silhouettes,
-    states_asked,
 )
 from splatctrl_cli.checks.finding import Severity
 from splatctrl_cli.errors import InputError
@@ -220,7 +220,7 @@ def test_the_offset_is_found_from_few_states_of_a_dense_log(
         robot = RobotPoints(centers=centers[index], radii=points.radii[:8]) if has_robot else None
         return estimate_clock_offset(some, long, robot)
 
-    asked = states_asked(stamps, long)
+    asked = select_states(stamps, long)
     assert len(asked) < len(stamps) // 2
     assert found_from(asked) == found_from(np.arange(len(stamps)))
 

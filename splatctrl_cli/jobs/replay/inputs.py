@@ -12,7 +12,7 @@ from splatctrl_cli.checks.clock_offset import (
     ImageMotion,
     RobotPoints,
     estimate_clock_offset,
-    states_asked,
+    select_states,
 )
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
@@ -318,7 +318,7 @@ def clock_of(model: RobotModel, logged: LoggedStates, motion: ImageMotion) -> Cl
     states = logged.states
     if not motion.cameras or not logged.source.has_clock or not len(states):
         return None
-    asked = states.select(states_asked(states.stamp_ns, motion))
+    asked = states.select(select_states(states.stamp_ns, motion))
     centers = model.sphere_centers_batch(asked.position[: len(asked)])
     moving = model.moving_spheres
     return estimate_clock_offset(
