@@ -8,7 +8,7 @@ from typing import Any
 
 from splatctrl_cli.calibration.calibration_file import describe_calibration, is_calibration
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.summary import Grid, Summary, files_below, names_in
 from splatctrl_cli.formats.grid.grid_format import FORMAT, covers, header_facts
 from splatctrl_cli.formats.scene.scene_folder import run_value
@@ -273,8 +273,7 @@ def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
 
 def _probability(value: Any) -> float:
     number = float(value)
-    if not 0.0 < number < 1.0:
-        raise ValueError(f"{number}, expected a probability between 0 and 1")
+    refuse_if(not 0.0 < number < 1.0, f"{number}, expected a probability between 0 and 1", error=ValueError)
     return number
 
 

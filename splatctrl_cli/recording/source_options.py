@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 
 CALIBRATION = "--calibration "  # begins the name of a calibration among the files that were read
 NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # of a distortion, that OpenCV takes
@@ -83,5 +83,4 @@ def still_note(camera: str) -> str:
 def refuse_unknown_cameras(where: Path, asked: Iterable[str], known: Collection[str]) -> None:
     """Raise InputError for a requested camera not in the recording."""
     for name in asked:
-        if name not in known:
-            raise InputError(f"{where}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")
+        refuse_if(name not in known, f"{where}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")

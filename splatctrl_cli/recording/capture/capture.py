@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, npy_of
 from splatctrl_cli.formats.image_file import decode_file
@@ -39,10 +39,8 @@ FORMAT, VERSION = "splatctrl-capture", 1
 def check_header(file: Path, header: Mapping[str, Any]) -> None:
     """Raise InputError naming the first missing or wrong entry."""
     for name, is_right, expected in _ENTRIES:
-        if name not in header:
-            raise InputError(f"{file}: {name} is missing", remedy=AGAIN)
-        if not is_right(header[name]):
-            raise InputError(f"{file}: {name}: expected {expected}", remedy=AGAIN)
+        refuse_if(name not in header, f"{file}: {name} is missing", remedy=AGAIN)
+        refuse_if(not is_right(header[name]), f"{file}: {name}: expected {expected}", remedy=AGAIN)
 
 
 def _is_text(value: object) -> bool:
@@ -101,20 +99,26 @@ def read_capture_header(path: Path) -> dict[str, Any]:
     """Read capture.json. Raises InputError if not ours, or of another version."""
     file = path / "capture.json"
     with refuse_faults(f"{file}: cannot be read", ValueError, OSError, remedy=AGAIN):
-        header = json.loads(file.read_text(encoding="utf-8"))
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise InputError(f"{file}: not a splatctrl capture", remedy="expected what `splatctrl ingest` writes")
-    if header.get("version") != VERSION:
-        raise InputError(
-            f"{file}: expected version {VERSION}, got {header.get('version')}", remedy="use a newer splatctrl"
-        )
+        header: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    refuse_if(
+        not isinstance(header, dict) or header.get("format") != FORMAT,
+        f"{file}: not a splatctrl capture",
+        remedy="expected what `splatctrl ingest` writes",
+    )
+    refuse_if(
+        header.get("version") != VERSION,
+        f"{file}: expected version {VERSION}, got {header.get('version')}",
+        remedy="use a newer splatctrl",
+    )
     check_header(file, header)
     sums = FileSums(path)
     for name in ("capture.json", "frames.csv", "joints.npz"):
-        if not (path / name).is_file():
-            raise InputError(f"{path / name}: missing", remedy=AGAIN)
-        if sums.get(name) != sha256(path / name):
-            raise InputError(f"{path / name}: its checksum differs from SHA256SUMS", remedy=AGAIN)
+        refuse_if(not (path / name).is_file(), f"{path / name}: missing", remedy=AGAIN)
+        refuse_if(
+            sums.get(name) != sha256(path / name),
+            f"{path / name}: its checksum differs from SHA256SUMS",
+            remedy=AGAIN,
+        )
     return header
 
 
@@ -152,8 +156,11 @@ class FrameRows:
             lines = iter(lambda: stream.readline(_MOST_ROW), b"")
             rows = csv.reader((line.decode("utf-8") for line in lines), strict=True)
             names = tuple(next(rows, ()))
-            if names[: len(COLUMNS)] != COLUMNS or names[len(COLUMNS) :] not in ((), *zip(MASKS), MASKS):
-                raise InputError(f"{self._file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
+            refuse_if(
+                names[: len(COLUMNS)] != COLUMNS or names[len(COLUMNS) :] not in ((), *zip(MASKS), MASKS),
+                f"{self._file}: expected columns {', '.join(COLUMNS)}",
+                remedy=AGAIN,
+            )
             for values in filter(None, rows):
                 row = _checked(dict(zip(names, values, strict=True)))
                 if row["camera"] in self._cameras:
@@ -177,8 +184,7 @@ class FileSums:
     def __init__(self, folder: Path) -> None:
         """Raises InputError without the file."""
         file = folder / SUMS
-        if not file.is_file():
-            raise InputError(f"{file}: missing", remedy=f"the capture was not finished; {AGAIN}")
+        refuse_if(not file.is_file(), f"{file}: missing", remedy=f"the capture was not finished; {AGAIN}")
         keys, sums = array("Q"), bytearray()
         with file.open("rb") as stream:
             while line := stream.readline(_MOST_ROW):
@@ -328,10 +334,14 @@ class CaptureSource(FrameSource):
 
     def _checked(self, name: str) -> Path:
         file = self._path / name
-        if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise InputError(f"{file}: lies outside the capture", remedy=AGAIN)
-        if not file.is_file() or self._sums.get(name) != sha256(file):
-            raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=AGAIN)
+        refuse_if(
+            Path(name).is_absolute() or ".." in Path(name).parts, f"{file}: lies outside the capture", remedy=AGAIN
+        )
+        refuse_if(
+            not file.is_file() or self._sums.get(name) != sha256(file),
+            f"{file}: missing, or its checksum differs from SHA256SUMS",
+            remedy=AGAIN,
+        )
         return file
 
 
@@ -340,8 +350,9 @@ def robot_description_of(path: Path) -> list[RobotDescription]:
     file = path / ROBOT
     if not file.is_file():
         return []
-    if FileSums(path).get(ROBOT) != sha256(file):
-        raise InputError(f"{file}: its checksum differs from SHA256SUMS", remedy=AGAIN)
+    refuse_if(
+        FileSums(path).get(ROBOT) != sha256(file), f"{file}: its checksum differs from SHA256SUMS", remedy=AGAIN
+    )
     return [RobotDescription(where=ROBOT, text=file.read_bytes().decode("utf-8"))]
 
 
@@ -368,10 +379,10 @@ def _read_joints(path: Path) -> StateColumns:
         rows = {name: content.rows(name) for name in (*NEEDED[1:], *OPTIONAL) if name in (*NEEDED, *content.names)}
     except InputError as error:
         raise InputError(error.message, remedy=AGAIN) from None
-    if any(len(values) != len(stamps) for values in rows.values()):
-        raise InputError(
-            f"{file}: expected {len(stamps)} states in every array, got "
-            + ", ".join(f"{name} {len(values)}" for name, values in rows.items()),
-            remedy=AGAIN,
-        )
+    refuse_if(
+        any(len(values) != len(stamps) for values in rows.values()),
+        f"{file}: expected {len(stamps)} states in every array, got "
+        + ", ".join(f"{name} {len(values)}" for name, values in rows.items()),
+        remedy=AGAIN,
+    )
     return StateColumns(stamp_ns=stamps, **rows)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
-from splatctrl_cli.errors import InputError, UsageError, WriteError
+from splatctrl_cli.errors import UsageError, WriteError, refuse_if
 from splatctrl_cli.files.output import sha256, write_json, write_table
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.capture.capture import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
@@ -104,10 +104,11 @@ def read_identity(folder: Path) -> Mapping[str, Any] | None:
 
 def check_not_partial(folder: Path) -> None:
     """Raise InputError for an interrupted capture."""
-    if (folder / JOURNAL).is_file():
-        raise InputError(
-            f"{folder}: an ingest that was interrupted", remedy="continue it with the same command and --resume"
-        )
+    refuse_if(
+        (folder / JOURNAL).is_file(),
+        f"{folder}: an ingest that was interrupted",
+        remedy="continue it with the same command and --resume",
+    )
 
 
 def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
@@ -176,8 +177,7 @@ def write_capture(
                 num_resumed += 1
             if progress is not None:
                 progress(journal.num_entries)
-        if not journal.num_entries:
-            raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
+        refuse_if(not journal.num_entries, f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
         header = {
             "format": FORMAT,
             "version": VERSION,
@@ -242,10 +242,11 @@ def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
     """Make the frame's row of frames.csv without file names, and count the frame in `cameras`."""
-    if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
-        raise InputError(
-            f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
-        )
+    refuse_if(
+        stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera),
+        f"{stored.origin}: camera {stored.camera!r}: cannot name a folder",
+        remedy="rename the camera",
+    )
     intrinsics = vars(stored.intrinsics)
     camera = cameras.setdefault(
         stored.camera,
@@ -255,11 +256,11 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
             "num_frames": 0,
         },
     )
-    if any(camera[name] != value for name, value in intrinsics.items()):
-        raise InputError(
-            f"{stored.origin}: camera {stored.camera} changes its intrinsics; a capture holds one set of each camera",
-            remedy="leave --holdout to `reconstruct` and `score`",
-        )
+    refuse_if(
+        any(camera[name] != value for name, value in intrinsics.items()),
+        f"{stored.origin}: camera {stored.camera} changes its intrinsics; a capture holds one set of each camera",
+        remedy="leave --holdout to `reconstruct` and `score`",
+    )
     camera["num_frames"] += 1
     T = stored.T_world_camera
     pose = [repr(float(value)) for value in (*T[:3, 3], *quat_from_rotation(T[:3, :3]))]

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 from urllib.parse import quote
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import standing_in
@@ -54,8 +54,11 @@ class Bag1Log(RawLog):
         self.files = (path,)
         self._size = path.stat().st_size
         self._topics: dict[int, Topic] = {}
-        if next(self.records(Damage()), None) is None:
-            raise InputError(f"{path}: not a readable ROS 1 bag: no whole record", remedy="record or copy it again")
+        refuse_if(
+            next(self.records(Damage()), None) is None,
+            f"{path}: not a readable ROS 1 bag: no whole record",
+            remedy="record or copy it again",
+        )
         for record in self._connections():
             self._connect(record.fields, record.body, Damage())
 
@@ -355,8 +358,7 @@ class Db3Log(RawLog):
 
 def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
     found = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    if not {"topics", "messages"} <= found:
-        raise ValueError("no tables named topics and messages")
+    refuse_if(not {"topics", "messages"} <= found, "no tables named topics and messages", error=ValueError)
     definitions = {}
     if "message_definitions" in found:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"

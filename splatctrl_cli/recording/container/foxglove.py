@@ -21,6 +21,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
+from splatctrl_cli.errors import refuse_faults
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.container.raw_log import Topic
 
@@ -28,11 +29,14 @@ from splatctrl_cli.recording.container.raw_log import Topic
 @lru_cache(maxsize=16)
 def _pool(descriptor_set: bytes) -> Any:
     files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
-    try:
+    with refuse_faults(
+        "protobuf: the schema is not usable",
+        DecodeError,
+        DescriptorDatabaseConflictingDefinitionError,
+        error=ValueError,
+    ):
         for file in FileDescriptorSet.FromString(descriptor_set).file:
             files.Add(file)
-    except (DecodeError, DescriptorDatabaseConflictingDefinitionError) as error:
-        raise ValueError(f"protobuf: the schema is not usable: {error}") from None
     return DescriptorPool(files)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 import zstandard
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.summary import names_in
 from splatctrl_cli.formats.unpacking import (
     FREE_BYTES,
@@ -70,10 +70,8 @@ class UnpackedMessagesLog(JoinedLog):
 
 
 def _unpacked_message(data: bytes, budget: Budget) -> bytes:
-    try:
+    with refuse_faults(lambda _: "is not a zstd frame", zstandard.ZstdError, error=BadBlockError):
         size = zstandard.frame_content_size(data)
-    except zstandard.ZstdError:
-        raise BadBlockError("is not a zstd frame") from None
     if size >= 0:
         return budget.unpacked(data, "zstd", size)
     return budget.unpacked(data, "zstd", len(unpacked_start(data, "zstd", MAX_BLOCK)))
@@ -137,8 +135,7 @@ def open_raw_log(path: Path) -> RawLog:
     """
     if path.is_dir():
         return _open_folder(path)
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: the file is empty (0 bytes)", remedy="record or copy it again")
+    refuse_if(path.stat().st_size == 0, f"{path}: the file is empty (0 bytes)", remedy="record or copy it again")
     with path.open("rb") as stream:
         magic = stream.read(16)
     kind = next((kind for kind in CONTAINERS if magic.startswith(kind.magic)), None)
@@ -149,11 +146,11 @@ def open_raw_log(path: Path) -> RawLog:
         return UnpackedMessagesLog(path, (log,), log.container) if is_packed else log
     if magic.startswith(_ZSTD):
         return _open_compressed(path)
-    if path.suffix in SUFFIXES:
-        raise InputError(
-            f"{path}: does not begin like a {path.suffix} file (first bytes {magic[:8]!r})",
-            remedy="the file is damaged or has the wrong name",
-        )
+    refuse_if(
+        path.suffix in SUFFIXES,
+        f"{path}: does not begin like a {path.suffix} file (first bytes {magic[:8]!r})",
+        remedy="the file is damaged or has the wrong name",
+    )
     raise InputError(
         f"{path}: unknown kind of file", remedy="expected .mcap, .bag, .db3, a bag folder, X.capture/ or a .toml"
     )
@@ -173,13 +170,13 @@ def _open_folder(path: Path) -> RawLog:
     missing = [file.name for file in files if not file.is_file()]
     if missing:
         raise InputError(f"{path}: metadata.yaml names {missing[0]}, which is not there", remedy="copy the whole bag")
-    if not files:
-        raise InputError(f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
+    refuse_if(not files, f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
     mode, compression = str(told.get("compression_mode", "")).lower(), str(told.get("compression_format"))
-    if mode and compression != "zstd":
-        raise InputError(
-            f"{path}: compression {compression!r} is unknown, expected zstd", remedy="rewrite the bag with zstd"
-        )
+    refuse_if(
+        mode and compression != "zstd",
+        f"{path}: compression {compression!r} is unknown, expected zstd",
+        remedy="rewrite the bag with zstd",
+    )
     parts = tuple(open_raw_log(file) for file in files)
     kind = "mcap" if ".mcap" in files[0].suffixes else "sqlite3"
     return JoinedLog(path, parts, f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})", note=note)
@@ -205,10 +202,8 @@ def _open_compressed(path: Path) -> RawLog:
         note = unpack(path, file)
         with file.open("rb") as stream:
             start = stream.read(4)
-        if not start:
-            raise InputError(f"{path}: {note or 'holds nothing'}", remedy="copy it again")
-        if start == _ZSTD:
-            raise InputError(f"{path}: compressed twice", remedy="unpack it with zstd -d")
+        refuse_if(not start, f"{path}: {note or 'holds nothing'}", remedy="copy it again")
+        refuse_if(start == _ZSTD, f"{path}: compressed twice", remedy="unpack it with zstd -d")
         try:
             part = open_raw_log(file)
         except InputError as error:
@@ -230,8 +225,11 @@ def _metadata(path: Path) -> tuple[dict[str, Any], str]:
         return {}, ""
     try:
         told = dict(yaml.safe_load(file.read_text(encoding="utf-8"))["rosbag2_bagfile_information"])
-        if not all(isinstance(name, str) for name in told.get("relative_file_paths") or ()):
-            raise ValueError("a file's name is not text")
+        refuse_if(
+            not all(isinstance(name, str) for name in told.get("relative_file_paths") or ()),
+            "a file's name is not text",
+            error=ValueError,
+        )
     except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):  # an undecodable text is a ValueError
         return {}, f"{file.name}: is not the metadata of a ROS 2 bag; read without it, files by their numbers"
     return told, ""
@@ -309,8 +307,7 @@ def refuse_foreign(path: Path) -> None:
         is_named = path.suffix.lower() in kind.suffixes
         is_marked = bool(kind.magic) and ends.startswith(kind.magic) and kind.mark in ends
         holds = kind.entry and ((path / kind.entry).exists() or any(name.startswith(kind.entry) for name in names))
-        if is_named or is_marked or holds:
-            raise InputError(f"{path}: {kind.what}, which is not read", remedy=kind.remedy)
+        refuse_if(is_named or is_marked or holds, f"{path}: {kind.what}, which is not read", remedy=kind.remedy)
 
 
 def _ends(path: Path) -> bytes:

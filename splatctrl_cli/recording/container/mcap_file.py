@@ -17,6 +17,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics
 
+from splatctrl_cli.errors import refuse_faults
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE
 from splatctrl_cli.recording.container.raw_log import Damage
 
@@ -80,10 +81,10 @@ def parse_record(opcode: int, content: bytes) -> Any:
     """A record, None if not in `_KINDS`. Raises BadRecordError."""
     if opcode not in _KINDS:
         return None
-    try:
+    with refuse_faults(
+        lambda _: f"a record of {len(content)} bytes ends within a field", EndOfFile, error=BadRecordError
+    ):
         return _KINDS[opcode].read(_Fields(BytesIO(content)))
-    except EndOfFile:
-        raise BadRecordError(f"a record of {len(content)} bytes ends within a field") from None
 
 
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, start, end, unpacked size, crc; then the compression's name

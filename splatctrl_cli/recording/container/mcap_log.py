@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.formats.unpacking import BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import standing_in, stands_for
 from splatctrl_cli.recording.container.mcap_file import (
@@ -204,8 +205,11 @@ class McapLog(RawLog):
             if is_cut or len(chunk.records) < chunk.compressed_size:
                 return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
             records = self._budget.unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
-            if chunk.uncompressed_crc and self._whole is None and zlib.crc32(records) != chunk.uncompressed_crc:
-                raise BadBlockError("checksum differs")
+            refuse_if(
+                chunk.uncompressed_crc and self._whole is None and zlib.crc32(records) != chunk.uncompressed_crc,
+                "checksum differs",
+                error=BadBlockError,
+            )
         except (BadRecordError, BadBlockError) as error:
             if not is_cut:  # the cut has been counted
                 damage.add(f"{self.path.name}: the chunk at byte {offset} was left out: {error}")

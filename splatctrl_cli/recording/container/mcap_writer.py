@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_faults
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.records import MILLIMETRES, Float64, Intrinsics, JointState, RgbdFrame
 
@@ -176,11 +176,11 @@ REMEDY = "pip install 'splatctrl-cli[mcap]'"
 @contextmanager
 def foxglove_log(path: Path) -> Iterator["FoxgloveLog"]:
     """Open a log, complete and closed after the block. Raises UsageError without libraries."""
-    try:
+    with refuse_faults(
+        "an MCAP of Foxglove's schemas needs their libraries", ImportError, remedy=REMEDY, error=UsageError
+    ):
         register = import_module("mcap_protobuf.schema").register_schema
         import_module(f"{SCHEMAS}.PointCloud_pb2")
-    except ImportError as error:
-        raise UsageError(f"an MCAP of Foxglove's schemas needs their libraries: {error}", remedy=REMEDY) from None
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start(library="splatctrl")

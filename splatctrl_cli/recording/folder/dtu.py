@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.formats.image_file import decode_file, read_pfm, write_pfm
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import MILLIMETRES, Bool, Float32, Float64, Intrinsics, UInt8
@@ -81,10 +81,11 @@ def read_dtu(
         shrink=shrink,
         keeps_without_depth=False,
     )
-    if not found.views:
-        raise InputError(
-            f"{root}: scan '{scan}' has no depth", remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on"
-        )
+    refuse_if(
+        not found.views,
+        f"{root}: scan '{scan}' has no depth",
+        remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on",
+    )
     check_lengths(f"{root}: scan '{scan}'", found.views)
     return replace(found, files=(*found.files, *(_camera_file(root, number) for number in found.numbers)))
 
@@ -158,20 +159,20 @@ def check_lengths(where: str, views: Sequence[DtuView]) -> None:
     if not medians:
         return
     median, (low, high) = float(np.median(medians)), PLAUSIBLE_DEPTH
-    if not low <= median <= high:
-        raise InputError(
-            f"{where}: depth: expected {MILLIMETRES * low:g} to {MILLIMETRES * high:g} mm, got a median of"
-            f" {MILLIMETRES * median:.3g}",
-            remedy="give lengths in millimetres",
-        )
+    refuse_if(
+        not low <= median <= high,
+        f"{where}: depth: expected {MILLIMETRES * low:g} to {MILLIMETRES * high:g} mm, got a median of"
+        f" {MILLIMETRES * median:.3g}",
+        remedy="give lengths in millimetres",
+    )
     centers = np.array([view.T_world_camera[:3, 3] for view in views])
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if 0 < spread < LEAST_SPREAD * median:
-        raise InputError(
-            f"{where}: cameras: expected millimetres, as the depth's median of {MILLIMETRES * median:.0f} mm, got"
-            f" cameras within {MILLIMETRES * spread:.3g} mm of their middle",
-            remedy="give translations in millimetres",
-        )
+    refuse_if(
+        0 < spread < LEAST_SPREAD * median,
+        f"{where}: cameras: expected millimetres, as the depth's median of {MILLIMETRES * median:.0f} mm, got"
+        f" cameras within {MILLIMETRES * spread:.3g} mm of their middle",
+        remedy="give translations in millimetres",
+    )
 
 
 def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
@@ -197,12 +198,12 @@ def write_png(path: Path, image: UInt8) -> None:
 def scan_folders(root: Path) -> dict[str, Path]:
     """Image folders by scan. Raises InputError without Rectified."""
     rectified = root / "Rectified"
-    if not rectified.is_dir():
-        raise InputError(
-            f"{root}: expected a DTU folder with Cameras, Rectified and Depths_raw, or scans with cameras_sphere.npz,"
-            " got none",
-            remedy="give the folder that holds Rectified, or the scans in IDR's layout",
-        )
+    refuse_if(
+        not rectified.is_dir(),
+        f"{root}: expected a DTU folder with Cameras, Rectified and Depths_raw, or scans with cameras_sphere.npz,"
+        " got none",
+        remedy="give the folder that holds Rectified, or the scans in IDR's layout",
+    )
     return {path.name.removesuffix("_train"): path for path in sorted(rectified.iterdir()) if path.is_dir()}
 
 
@@ -214,17 +215,14 @@ def _images(folder: Path) -> dict[int, Path]:
             number = int(match[1]) - 1
             if number not in found or match[2] == str(LIGHT):
                 found[number] = path
-    if not found:
-        raise InputError(f"{folder}: expected images such as rect_001_3_r5000.png, got none")
+    refuse_if(not found, f"{folder}: expected images such as rect_001_3_r5000.png, got none")
     return dict(sorted(found.items()))
 
 
 def read_image(path: Path) -> UInt8:
     """RGB (H, W, 3), ignoring the orientation tag. Raises InputError if unreadable."""
     image = decode_file(path.read_bytes(), color=True) if path.is_file() else None
-    if image is None:
-        raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
-    return np.asarray(image, dtype=np.uint8)
+    return np.asarray(require(image, f"{path}: not an image that can be read", remedy="copy the file anew"), np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool:
@@ -232,10 +230,10 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
     image = read_image(path)
     if image.shape[1::-1] != size:
         width, height = size
-        if image.shape[1] * height != image.shape[0] * width:
-            raise InputError(
-                f"{path}: expected a mask of {width}x{height} or of that shape, got {image.shape[1]}x{image.shape[0]}"
-            )
+        refuse_if(
+            image.shape[1] * height != image.shape[0] * width,
+            f"{path}: expected a mask of {width}x{height} or of that shape, got {image.shape[1]}x{image.shape[0]}",
+        )
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     return np.asarray((image >= 128).all(axis=2))
 
@@ -265,18 +263,19 @@ def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
     Lengths have the file's unit; depth 0 is none.
     """
     words = path.read_text(encoding="utf-8", errors="replace").split()
-    try:
+    with refuse_faults(
+        lambda _: f"{path}: expected 'extrinsic' (4x4), 'intrinsic' (3x3) and a depth range, got another text",
+        ValueError,
+        remedy="copy the file again",
+    ):
         extrinsic = np.array(words[words.index("extrinsic") + 1 :][:16], dtype=np.float64).reshape(4, 4)
         rest = words[words.index("intrinsic") + 1 :]
         K, nearest = np.array(rest[:9], dtype=np.float64).reshape(3, 3), float(rest[9]) if rest[9:] else 0.0
-    except ValueError:
-        raise InputError(
-            f"{path}: expected 'extrinsic' (4x4), 'intrinsic' (3x3) and a depth range, got another text",
-            remedy="copy the file again",
-        ) from None
     R = extrinsic[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        raise InputError(f"{path}: extrinsic: expected a rotation in its first three columns")
+    refuse_if(
+        not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0,
+        f"{path}: extrinsic: expected a rotation in its first three columns",
+    )
     return K, extrinsic, nearest
 
 
@@ -328,8 +327,7 @@ def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
     depth = np.where(np.isfinite(depth) & (depth > 0), depth / np.float32(MILLIMETRES), np.float32(0))
     if visual.is_file():
         shown = cv2.cvtColor(read_image(visual), cv2.COLOR_RGB2GRAY)
-        if shown.shape != depth.shape:
-            raise InputError(f"{visual}: expected a grey image of {depth.shape[1]}x{depth.shape[0]}")
+        refuse_if(shown.shape != depth.shape, f"{visual}: expected a grey image of {depth.shape[1]}x{depth.shape[0]}")
         depth = np.where(shown > 10, depth, np.float32(0))
     width, height = size
     if depth.shape == (height, width):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_APART, UNIT_BASELINE, UNIT_DEPTH
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
@@ -107,17 +107,21 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
     loss.notes.extend(still_note(name) for name in options.camera_poses if any(v.lens.name == name for v in views))
     if not views:
         file = "" if description.poses is None else description.poses.file
-        if file and "*" not in file and not (description.root / file).is_file():
-            raise InputError(
-                f"{description.root / file}: no such file, and no other file has its poses",
-                remedy="copy it too, or give --camera-pose NAME=identity for a camera that stands still",
-            )
+        refuse_if(
+            file and "*" not in file and not (description.root / file).is_file(),
+            f"{description.root / file}: no such file, and no other file has its poses",
+            remedy="copy it too, or give --camera-pose NAME=identity for a camera that stands still",
+        )
         remedy = "check the clock or the numbers that images and poses share, or give --camera-pose"
         raise InputError(f"{description.path}: {file} has no pose for any image ({names[0]}, ...)", remedy=remedy)
     if held and all(view.camera == HOLDOUT for view in views):
         remedy = "leave some to train with"
-        if options.holdout is not None:
-            raise UsageError(f"--holdout: all {len(views)} views are held out", remedy=remedy)
+        refuse_if(
+            options.holdout is not None,
+            f"--holdout: all {len(views)} views are held out",
+            remedy=remedy,
+            error=UsageError,
+        )
         raise InputError(f"{description.path}: [split] holds all {len(views)} views out", remedy=remedy)
     return sorted(views, key=lambda view: (view.stamp_ns, view.name))
 
@@ -128,11 +132,11 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
     for view in description.listed:
         files = [path for path in (view.color, view.depth, view.valid) if path is not None]
         for path in files:
-            if not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)):
-                raise InputError(
-                    f"{description.path}: {path} is not in {description.root}",
-                    remedy="give the folder that holds all files",
-                )
+            refuse_if(
+                not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)),
+                f"{description.path}: {path} is not in {description.root}",
+                remedy="give the folder that holds all files",
+            )
         missing = [path for path in files if not path.is_file()]
         absent += missing[:1]
         present += [] if missing else [view]
@@ -170,11 +174,11 @@ def _scale(description: Description, view: ListedView, options: SourceOptions) -
     if options.depth_scale is not None:
         return options.depth_scale
     scale = description.depth.scale if view.depth_scale is None else view.depth_scale
-    if not 0 < scale < np.inf:
-        raise InputError(
-            f"{description.path}: depth of {view.name}: expected metres per count, got {scale}",
-            remedy="correct the file, or give --depth-scale",
-        )
+    refuse_if(
+        not 0 < scale < np.inf,
+        f"{description.path}: depth of {view.name}: expected metres per count, got {scale}",
+        remedy="correct the file, or give --depth-scale",
+    )
     return scale
 
 
@@ -184,18 +188,19 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
     colors = dict(find_files(description.root, frames.color))
     depths = dict(find_files(description.root, frames.depth))
     for pattern, found in ((frames.color, colors), (frames.depth, depths)):
-        if not found:
-            raise InputError(
-                f"{description.path}: no file matches {description.root / pattern}", remedy="correct [frames] or root"
-            )
+        refuse_if(
+            not found,
+            f"{description.path}: no file matches {description.root / pattern}",
+            remedy="correct [frames] or root",
+        )
     masks = _masks(description, list(colors), loss)
     names = [name for name in colors if name in depths]
-    if not names:
-        raise InputError(
-            f"{description.path}: no colour file has a depth file of the same name"
-            f" ({next(iter(colors))!r}, {next(iter(depths))!r}, ...)",
-            remedy="the * of [frames] color and depth must stand for the same text",
-        )
+    refuse_if(
+        not names,
+        f"{description.path}: no colour file has a depth file of the same name"
+        f" ({next(iter(colors))!r}, {next(iter(depths))!r}, ...)",
+        remedy="the * of [frames] color and depth must stand for the same text",
+    )
     loss.unpaired_color += len(colors) - len(names)
     loss.unpaired_depth += len(depths) - len(names)
     poses = {} if camera.name in options.camera_poses else _poses(description, {name: colors[name] for name in names})
@@ -212,11 +217,11 @@ def _masks(description: Description, names: list[str], loss: LossReport) -> dict
     if not pattern:
         return {}
     masks = dict(find_files(description.root, pattern))
-    if not any(name in masks for name in names):
-        raise InputError(
-            f"{description.path}: no file of {description.root / pattern} is named like a colour image",
-            remedy="the * of [frames] human_mask and color must stand for the same text",
-        )
+    refuse_if(
+        not any(name in masks for name in names),
+        f"{description.path}: no file of {description.root / pattern} is named like a colour image",
+        remedy="the * of [frames] human_mask and color must stand for the same text",
+    )
     num_without = sum(name not in masks for name in names)
     if num_without:
         loss.notes.append(f"{num_without} of {len(names)} colour images have no mask")
@@ -225,11 +230,8 @@ def _masks(description: Description, names: list[str], loss: LossReport) -> dict
 
 def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float64]:
     table, root = description.poses, description.root
-    if table is None:
-        raise InputError(
-            f"{description.path}: [poses] is missing",
-            remedy="describe them, or give --camera-pose NAME=identity for a camera that stands still",
-        )
+    remedy = "describe them, or give --camera-pose NAME=identity for a camera that stands still"
+    table = require(table, f"{description.path}: [poses] is missing", remedy=remedy)
     if table.format == "matrix-files":
         files = dict(find_files(root, table.file))
         if "" in files:  # a camera that does not move
@@ -273,13 +275,8 @@ def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
     if view.stamp_ns is not None:
         return view.stamp_ns
     if stamps.names:
-        stamp_ns = stamp_of_text(view.name)
-        if stamp_ns is None:
-            raise InputError(
-                f"{description.path}: stamps.names: expected seconds, got {view.name!r}",
-                remedy="see splatctrl help input",
-            )
-        return stamp_ns
+        said = f"{description.path}: stamps.names: expected seconds, got {view.name!r}"
+        return require(stamp_of_text(view.name), said, remedy="see splatctrl help input")
     if stamps.rate is not None:
         return round(_number(view.name) * SECOND_NS / stamps.rate)
     return position * SECOND_NS

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import UNIT_BASELINE
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.summary import names_in
 from splatctrl_cli.formats.arrays import DAMAGE, npy_of
@@ -35,7 +35,7 @@ from splatctrl_cli.recording.folder.idr import idr_scans
 from splatctrl_cli.recording.folder.layout import Layout, images_of
 from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
 from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
-from splatctrl_cli.recording.log.registration import DepthToColor, Lens, Undistortion, undistortion_of
+from splatctrl_cli.recording.log.registration import Lens, correct_lens
 from splatctrl_cli.recording.log.stored_frame import (
     FrameSource,
     StoredFrame,
@@ -183,10 +183,10 @@ class ImageFolderSource(FrameSource):
         human = None if view.human is None else self._human(view.human, lens)
         valid = self._valid(view, lens)
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
-        is_counts = lens.depth_to_color is None and not (
+        is_counts = lens.depth_lens is None and not (
             view.depth is None or _is_float(self._description.depth.encoding, view.depth)
         )
-        is_plain = lens.undistortion is None
+        is_plain = lens.maps is None
         return StoredFrame(
             stamp_ns=view.stamp_ns,
             camera=view.camera,
@@ -216,30 +216,18 @@ class ImageFolderSource(FrameSource):
         return data if is_png(data) else None
 
     def _lens(self, view: View) -> Lens:
-        table = view.lens
+        table, depth_camera = view.lens, self._description.depth_camera
         if table.name not in self._lenses:
-            undistortion, depth_camera = _undistortion(table), self._description.depth_camera
-            lens = Lens(
-                intrinsics=table.intrinsics if undistortion is None else undistortion.intrinsics,
-                undistortion=undistortion,
-            )
+            lens = _corrected(table)
             if depth_camera is not None:
-                bent = _undistortion(depth_camera)
-                lens = replace(
-                    lens,
-                    depth_to_color=DepthToColor(
-                        depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
-                        color_intrinsics=lens.intrinsics,
-                        T_color_depth=self._description.T_color_depth,
-                        undistortion=bent,
-                    ),
-                )
+                T_color_depth = self._description.T_color_depth
+                lens = replace(lens, depth_lens=_corrected(depth_camera), T_color_depth=T_color_depth)
             self._lenses[table.name] = lens
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
         """Pixels that the lens saw and the mask keeps (None: all)."""
-        seen = None if lens.undistortion is None else lens.undistortion.valid
+        seen = lens.valid
         if view.valid is None:
             return seen
         mask = self._human(view.valid, lens)
@@ -252,7 +240,7 @@ class ImageFolderSource(FrameSource):
         if pixels is None:
             self._damaged.append(f"{path}: not an image that can be read")
             return None
-        return lens.labels(human_mask(pixels, lens.intrinsics, str(path)))
+        return lens.nearest(human_mask(pixels, lens.intrinsics, str(path)))
 
     def _depth(self, view: View, lens: Lens) -> Float32 | None:
         """(H, W) [m] at colour's pixels, 0 = no return; None if unreadable."""
@@ -279,11 +267,11 @@ class ImageFolderSource(FrameSource):
         counts = decode_file(path.read_bytes(), color=False)
         if counts is None:
             return None
-        if counts.dtype != np.uint16 or counts.ndim != 2:
-            raise InputError(
-                f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes",
-                remedy="see splatctrl help input",
-            )
+        refuse_if(
+            counts.dtype != np.uint16 or counts.ndim != 2,
+            f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes",
+            remedy="see splatctrl help input",
+        )
         if table.encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)
         counts = np.where(counts == table.invalid, np.uint16(0), counts)
@@ -296,8 +284,8 @@ def _is_float(encoding: str, path: ImageFile) -> bool:
     return encoding == "float32" or path.suffix == ".npy"
 
 
-def _undistortion(camera: CameraTable) -> Undistortion | None:
-    return undistortion_of(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, np.float64))
+def _corrected(camera: CameraTable) -> Lens:
+    return correct_lens(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, np.float64))
 
 
 def _float_pixels(path: ImageFile) -> NDArray[np.float32] | None:
@@ -316,11 +304,11 @@ def _float_pixels(path: ImageFile) -> NDArray[np.float32] | None:
 
 
 def _check_size(path: ImageFile, pixels: NDArray[Any], camera: CameraTable) -> None:
-    if pixels.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"{path}: expected {camera.width}x{camera.height} as described, got {pixels.shape[1]}x{pixels.shape[0]}",
-            remedy="correct the size, or describe the depth camera in [depth_camera]",
-        )
+    refuse_if(
+        pixels.shape[:2] != (camera.height, camera.width),
+        f"{path}: expected {camera.width}x{camera.height} as described, got {pixels.shape[1]}x{pixels.shape[0]}",
+        remedy="correct the size, or describe the depth camera in [depth_camera]",
+    )
 
 
 def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
@@ -363,11 +351,11 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
     """Open a dataset's folder. Raises InputError for an unknown layout."""
     check_not_partial(folder)
     layout = layout_of(folder)
-    if layout is None and ((folder / "Rectified").is_dir() or idr_scans(folder)):
-        raise InputError(
-            f"{folder}: a DTU data set, which only reconstruct and score read",
-            remedy='give it as --dtu (in a suite dtu = "{recording}")',
-        )
+    refuse_if(
+        layout is None and ((folder / "Rectified").is_dir() or idr_scans(folder)),
+        f"{folder}: a DTU data set, which only reconstruct and score read",
+        remedy='give it as --dtu (in a suite dtu = "{recording}")',
+    )
     if layout is None:
         names = ", ".join(known.name for known in LAYOUTS)
         raise unknown_folder(

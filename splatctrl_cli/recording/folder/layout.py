@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.formats.image_file import decode_file, image_head
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
@@ -96,8 +96,7 @@ class Pairs:
     unpaired: tuple[int, int]
 
     def __post_init__(self) -> None:
-        if not self.views:
-            raise InputError(f"{self.path}: no colour image has a depth image", remedy=_WHOLE)
+        refuse_if(not self.views, f"{self.path}: no colour image has a depth image", remedy=_WHOLE)
 
     def moved(self, change: Callable[[Float64], Float64]) -> "Pairs":
         """Apply `change` to each known pose."""
@@ -205,11 +204,11 @@ def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[floa
 def read_K(path: Path) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy of a text file's 3x3 matrix."""
     values = read_numbers(path)
-    if len(values) != 9:
-        raise InputError(
-            f"{path}: expected a 3x3 matrix, got {len(values)} numbers",
-            remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
-        )
+    refuse_if(
+        len(values) != 9,
+        f"{path}: expected a 3x3 matrix, got {len(values)} numbers",
+        remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+    )
     return values[0], values[4], values[2], values[5]
 
 
@@ -224,16 +223,13 @@ def image_size(path: ImageFile) -> tuple[int, int]:
     """Columns and rows. Raises InputError if it is no image."""
     if isinstance(path, ImagePart):
         return path.size
-    try:
+    with refuse_faults(lambda error: f"{path}: {error.strerror}", OSError, remedy=_WHOLE):
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}", remedy=_WHOLE) from None
     if (head := image_head(data)) is not None:
         return head.width, head.height
-    pixels = decode_file(data, color=False)
-    if pixels is None:
-        raise InputError(f"{path}: not an image that can be read", remedy=_WHOLE)
-    return int(pixels.shape[1]), int(pixels.shape[0])
+    said = f"{path}: not an image that can be read"
+    height, width, *_ = require(decode_file(data, color=False), said, remedy=_WHOLE).shape
+    return int(width), int(height)
 
 
 def images_of(folder: Path) -> dict[str, Path]:

@@ -19,6 +19,7 @@ folder with ``depth`` in its name.
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.recording.folder.dtu import fitted_intrinsics, read_camera_file
 from splatctrl_cli.recording.folder.folder_description import (
@@ -90,8 +91,7 @@ def _frames(folder: Path) -> Path | None:
 
 
 def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder", remedy="download lowres_wide and lowres_depth")
+    refuse_if(not folder.is_dir(), f"{folder}: no such folder", remedy="download lowres_wide and lowres_depth")
     return [(stamp_ns, path) for path in images_of(folder).values() if (stamp_ns := _stamp_ns(path)) is not None]
 
 
@@ -123,10 +123,11 @@ def _arkit_lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
             remedy="download lowres_wide_intrinsics",
         )
     values = read_numbers(pincams[near])
-    if len(values) != 6 or not np.isfinite(values).all():
-        raise InputError(
-            f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {values}", remedy="copy the file again"
-        )
+    refuse_if(
+        len(values) != 6 or not np.isfinite(values).all(),
+        f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {values}",
+        remedy="copy the file again",
+    )
     width, height, fx, fy, cx, cy = values
     return CameraTable(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy)
 
@@ -145,11 +146,9 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
     for sensor in _sensors(folder):
         path = folder / f"{Path(FILE).stem}{sensor}.json"
         color_folder = next((f for name in COLOR_FOLDERS if (f := folder / f"{name}{sensor}").is_dir()), None)
-        if color_folder is None:
-            raise InputError(
-                f"{folder}: expected a folder rgb{sensor} or gray{sensor}, got none", remedy="unpack the whole scene"
-            )
-        colors, depths = images_of(color_folder), images_of(folder / f"depth{sensor}")
+        said = f"{folder}: expected a folder rgb{sensor} or gray{sensor}, got none"
+        colors = images_of(require(color_folder, said, remedy="unpack the whole scene"))
+        depths = images_of(folder / f"depth{sensor}")
         views += _views(path, sensor, colors, depths)
         files.append(path)
         num_colors, num_depths = num_colors + len(colors), num_depths + len(depths)
@@ -171,8 +170,11 @@ def _sensors(folder: Path) -> list[str]:
 
 def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, Path]) -> list[ListedView]:
     content = read_json(path)
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected an object by image number, got {type(content).__name__}", remedy=_REMEDY)
+    refuse_if(
+        not isinstance(content, dict),
+        f"{path}: expected an object by image number, got {type(content).__name__}",
+        remedy=_REMEDY,
+    )
     entries = {int(key): entry for key, entry in content.items() if key.isdigit()}
     lenses: list[CameraTable] = []
     views, prefix = [], sensor.removeprefix("_")
@@ -182,7 +184,13 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
         if name not in depths or entry is None:
             continue
         where = f"{path}: image {int(name)}"
-        try:
+        with refuse_faults(
+            partial("{}: expected BOP's fields, got no usable {}".format, where),
+            KeyError,
+            TypeError,
+            ValueError,
+            remedy=_REMEDY,
+        ):
             fx, _, cx, _, fy, cy, _, _, _ = (float(value) for value in entry["cam_K"])
             lens = CameraTable(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, name=prefix or CAMERA)
             view = ListedView(
@@ -193,8 +201,6 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
                 camera=named_lens(lenses, lens, where),
                 depth_scale=float(entry["depth_scale"]) * MILLIMETRE,
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{where}: expected BOP's fields, got no usable {error}", remedy=_REMEDY) from None
         views.append(view)
     return views
 
@@ -257,10 +263,11 @@ def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and "depth" not in path.name.lower()]
     found = [{stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)]
     most = max(found, key=len)
-    if not most:
-        raise InputError(
-            f"{folder}: no image is named like a camera file ({min(stems)}_cam.txt)", remedy="copy the images too"
-        )
+    refuse_if(
+        not most,
+        f"{folder}: no image is named like a camera file ({min(stems)}_cam.txt)",
+        remedy="copy the images too",
+    )
     return most
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.recording.folder.folder_description import CameraTable, Description, ListedView, PosesTable
 from splatctrl_cli.recording.folder.layout import Layout, image_size, marked, named_lens
 from splatctrl_cli.recording.folder.poses import read_nerfstudio
@@ -50,8 +50,7 @@ def with_transforms(description: Description) -> Description:
     content, matrices = read_nerfstudio(path)
     lenses: list[CameraTable] = []
     views = [_view(content, entry, path, lenses, description, matrices) for entry in content["frames"]]
-    if not views:
-        raise InputError(f"{path}: no frames", remedy="give a transforms.json with frames")
+    refuse_if(not views, f"{path}: no frames", remedy="give a transforms.json with frames")
     bare = [view.name for view in views if view.depth is None]
     if bare and len(bare) < len(views):
         raise InputError(
@@ -59,11 +58,11 @@ def with_transforms(description: Description) -> Description:
             remedy="add it, or leave the frame out",
         )
     if description.frames is not None:
-        if len(lenses) > 1:
-            raise InputError(
-                f"{path}: {len(lenses)} different sets of intrinsics beside [frames]",
-                remedy="leave [frames] out, or give [camera]",
-            )
+        refuse_if(
+            len(lenses) > 1,
+            f"{path}: {len(lenses)} different sets of intrinsics beside [frames]",
+            remedy="leave [frames] out, or give [camera]",
+        )
         return replace(description, camera=views[0].camera)
     stems = [Path(view.name).stem for view in views]
     is_short = len(set(stems)) == len(stems)  # else the path without suffix
@@ -91,13 +90,17 @@ def _view(
     depth = _only(entry, ("depth_file_path", "depth_path"), path)
     scale = _only(said, ("depth_unit_scale_factor", "integer_depth_scale"), path)
     mask = entry.get("mask_path")
-    try:
+    with refuse_faults(
+        lambda error: f"{path}: {name}: expected numbers, got {error}",
+        TypeError,
+        ValueError,
+        ZeroDivisionError,
+        remedy="correct the file",
+    ):
         applied = float(content.get("applied_scale", 1.0))
         matrix = matrices[name].copy()
         matrix[:3, 3] *= 1.0 / applied
         unit = None if scale is None else float(scale)
-    except (TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(f"{path}: {name}: expected numbers, got {error}", remedy="correct the file") from None
     return ListedView(
         name=name,
         color=color,
@@ -127,16 +130,24 @@ def _image(path: Path) -> Path:
 
 def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
     model = str(said.get("camera_model") or ("OPENCV_FISHEYE" if said.get("is_fisheye") else "OPENCV"))
-    if model not in _MODELS:
-        raise InputError(
-            f"{path}: camera_model: expected one of {', '.join(_MODELS)}, got {model!r}",
-            remedy="undistort the images",
-        )
-    if "is_fisheye" in said and bool(said["is_fisheye"]) != (model == "OPENCV_FISHEYE"):
-        raise InputError(
-            f"{path}: camera_model is {model}, but is_fisheye is {said['is_fisheye']}", remedy="correct one of them"
-        )
-    try:
+    refuse_if(
+        model not in _MODELS,
+        f"{path}: camera_model: expected one of {', '.join(_MODELS)}, got {model!r}",
+        remedy="undistort the images",
+    )
+    refuse_if(
+        "is_fisheye" in said and bool(said["is_fisheye"]) != (model == "OPENCV_FISHEYE"),
+        f"{path}: camera_model is {model}, but is_fisheye is {said.get('is_fisheye')}",
+        remedy="correct one of them",
+    )
+    with refuse_faults(
+        lambda error: f"{path}: no usable {error} in the intrinsics",
+        KeyError,
+        TypeError,
+        ValueError,
+        ZeroDivisionError,
+        remedy="give [camera] and [frames] in a description",
+    ):
         distortion = [float(said.get(key, 0.0)) for key in _COEFFICIENTS[model]]
         further = sorted(key for key in _ALL if key not in _COEFFICIENTS[model] and float(said.get(key, 0.0)))
         if further:
@@ -157,10 +168,6 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
             distortion=distortion,
             distortion_model=_MODELS[model],
         )
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(
-            f"{path}: no usable {error} in the intrinsics", remedy="give [camera] and [frames] in a description"
-        ) from None
 
 
 ENTRIES = (

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config.fixed import CLOUD_POINTS, CLOUD_RESIDUAL
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.formats.image_file import MOST_PIXELS
 from splatctrl_cli.geometry import invert_transform, project, transform_from, transform_points
 from splatctrl_cli.libraries import of_extra
@@ -122,11 +122,11 @@ def read(path: Path, options: SourceOptions) -> Description:
             )
         )
     if all(tuple(head.viewpoint) == _UNSET for head in heads) and CAMERA not in options.camera_poses:
-        if len(files) > 1:
-            raise InputError(
-                f"{path}: no poses: VIEWPOINT is the origin in all {len(files)} clouds",
-                remedy="write poses as VIEWPOINT, or give --camera-pose camera=identity where it stands still",
-            )
+        refuse_if(
+            len(files) > 1,
+            f"{path}: no poses: VIEWPOINT is the origin in all {len(files)} clouds",
+            remedy="write poses as VIEWPOINT, or give --camera-pose camera=identity where it stands still",
+        )
         notes.append("VIEWPOINT is the origin: the camera's own frame is the world")
     others = sorted({name for head in heads for name in head.fields} - {"x", "y", "z", "rgb", "rgba"})
     notes += [f"fields {', '.join(others)} are not used"] if others else []
@@ -151,8 +151,11 @@ def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[
         height, width = points.shape[:2]
         camera = pinhole_of(points)
         if given is not None:
-            if len(given) > 4:
-                raise UsageError(f"--intrinsics: expected FX,FY,CX,CY for {path.name}, got distortion coefficients")
+            refuse_if(
+                len(given) > 4,
+                f"--intrinsics: expected FX,FY,CX,CY for {path.name}, got distortion coefficients",
+                error=UsageError,
+            )
             fx, fy, cx, cy = given
             camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
         fits.append((residual(points, camera), is_world, camera))
@@ -189,20 +192,26 @@ def _head(path: Path) -> Any:
         said = _library().MetaData.parse_header(lines)
     except _DAMAGE as error:
         raise _unreadable(path, error) from None
-    if said.height <= 1:
-        raise InputError(
-            f"{path}: not organised: {said.width} points in one row",
-            remedy="record clouds before any filter, in the rows and columns of the image, NaN where nothing is seen",
-        )
-    if not 0 < said.width * said.height <= MOST_PIXELS or said.points != said.width * said.height:
-        raise InputError(f"{path}: {said.points} points of {said.width}x{said.height}", remedy=_AGAIN)
-    if not np.linalg.norm(said.viewpoint[3:]) > 0.5:
-        raise InputError(f"{path}: VIEWPOINT: expected a quaternion, got {said.viewpoint[3:]}", remedy=_AGAIN)
-    if not {"rgb", "rgba"} & set(said.fields):
-        raise InputError(
-            f"{path}: no colour: expected a field rgb or rgba, got {' '.join(said.fields)}",
-            remedy="save clouds with colour (PCL: PointXYZRGB, PointXYZRGBL)",
-        )
+    refuse_if(
+        said.height <= 1,
+        f"{path}: not organised: {said.width} points in one row",
+        remedy="record clouds before any filter, in the rows and columns of the image, NaN where nothing is seen",
+    )
+    refuse_if(
+        not 0 < said.width * said.height <= MOST_PIXELS or said.points != said.width * said.height,
+        f"{path}: {said.points} points of {said.width}x{said.height}",
+        remedy=_AGAIN,
+    )
+    refuse_if(
+        not np.linalg.norm(said.viewpoint[3:]) > 0.5,
+        f"{path}: VIEWPOINT: expected a quaternion, got {said.viewpoint[3:]}",
+        remedy=_AGAIN,
+    )
+    refuse_if(
+        not {"rgb", "rgba"} & set(said.fields),
+        f"{path}: no colour: expected a field rgb or rgba, got {' '.join(said.fields)}",
+        remedy="save clouds with colour (PCL: PointXYZRGB, PointXYZRGBL)",
+    )
     return said
 
 

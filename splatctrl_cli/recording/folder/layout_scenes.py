@@ -20,11 +20,12 @@ SensReader.
 """
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
@@ -168,16 +169,17 @@ def _redwood_lens(folder: Path) -> CameraTable:
     for file in (parent / name for parent in (folder, folder.parent) for name in INTRINSICS):
         if file.is_file():
             content = read_json(file)
-            try:
+            with refuse_faults(
+                partial("{}: expected width, height and intrinsic_matrix (9 numbers), got no {}".format, file),
+                KeyError,
+                TypeError,
+                ValueError,
+                remedy="write it with Open3D, or give --intrinsics camera=FX,FY,CX,CY",
+            ):
                 fx, _, _, _, fy, _, cx, cy, _ = (float(value) for value in content["intrinsic_matrix"])  # by columns
                 return CameraTable(
                     width=int(content["width"]), height=int(content["height"]), fx=fx, fy=fy, cx=cx, cy=cy
                 )
-            except (KeyError, TypeError, ValueError) as error:
-                raise InputError(
-                    f"{file}: expected width, height and intrinsic_matrix (9 numbers), got no {error}",
-                    remedy="write it with Open3D, or give --intrinsics camera=FX,FY,CX,CY",
-                ) from None
     raise InputError(
         f"{folder}: no {INTRINSICS[0]} in it or above it",
         remedy="give --intrinsics camera=FX,FY,CX,CY (Redwood's default: 525,525,319.5,239.5)",

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     DepthTable,
@@ -129,11 +129,11 @@ def _lens(folder: Path, series: str, image: ImageFile) -> CameraTable:
     calibration = folder / "calibration.txt"
     if calibration.is_file():
         values = read_numbers(calibration)
-        if len(values) != 4:
-            raise InputError(
-                f"{calibration}: expected fx fy cx cy, got {len(values)} numbers",
-                remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
-            )
+        refuse_if(
+            len(values) != 4,
+            f"{calibration}: expected fx fy cx cy, got {len(values)} numbers",
+            remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+        )
         return pinhole(values, image)
     if series:
         lens, distortion = SERIES[series]
@@ -174,8 +174,9 @@ def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
 
 def _poses(path: Path) -> list[Float64]:
     values = read_numbers(path)
-    if len(values) % 12:
-        raise InputError(f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again")
+    refuse_if(
+        len(values) % 12, f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again"
+    )
     rows = np.array(values).reshape(-1, 3, 4)
     return list(np.concatenate([rows, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))], axis=1))
 

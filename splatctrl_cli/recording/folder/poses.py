@@ -11,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import POSE_TOLERANCE_NS
 from splatctrl_cli.config.ranges import MAX_PLACE
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.geometry import invert_transform, pose_at, quat_from_rotation, transform_from
 from splatctrl_cli.recording.log.registration import TfTree
 from splatctrl_cli.records import Float64
@@ -43,14 +43,15 @@ def rigid(matrix: Float64, where: str) -> Float64:
     Raises InputError for scale, shear, mirror or NaN.
     """
     is_finite = matrix.shape == (4, 4) and bool((np.abs(matrix) < MAX_PLACE).all())
-    if not is_finite or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW:
-        raise InputError(
-            f"{where}: expected a rigid transform (4x4), got one with scale, shear or NaN",
-            remedy="correct the matrix",
-        )
+    refuse_if(
+        not is_finite or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW,
+        f"{where}: expected a rigid transform (4x4), got one with scale, shear or NaN",
+        remedy="correct the matrix",
+    )
     U, _, Vt = np.linalg.svd(matrix[:3, :3])
-    if np.linalg.det(U @ Vt) < 0:
-        raise InputError(f"{where}: expected a rotation, got a mirror image", remedy="check [poses] axes")
+    refuse_if(
+        np.linalg.det(U @ Vt) < 0, f"{where}: expected a rotation, got a mirror image", remedy="check [poses] axes"
+    )
     return pose_at(matrix[:3, 3], U @ Vt)
 
 
@@ -72,8 +73,11 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
     for index in range(0, len(lines), 5):
         where = f"{path}: pose {index // 5}"
         head = lines[index].split()
-        if len(head) != 3 or not head[0].isdigit():
-            raise InputError(f"{where}: expected three integers, got {lines[index]!r}", remedy=_CORRECT)
+        refuse_if(
+            len(head) != 3 or not head[0].isdigit(),
+            f"{where}: expected three integers, got {lines[index]!r}",
+            remedy=_CORRECT,
+        )
         poses[str(int(head[0]))] = _matrix(lines[index + 1 : index + 5], where)
     return poses
 
@@ -120,8 +124,9 @@ def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
         content = json.loads(path.read_text(encoding="utf-8"))
         matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
     for name, matrix in matrices.items():
-        if matrix.shape != (4, 4):
-            raise InputError(f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy=_CORRECT)
+        refuse_if(
+            matrix.shape != (4, 4), f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy=_CORRECT
+        )
     return content, matrices
 
 
@@ -190,8 +195,9 @@ def _lines(path: Path) -> list[str]:
 
 def _matrix(lines: list[str], where: str) -> Float64:
     rows = [_numbers(line.split(), where) for line in lines]
-    if len(rows) != 4 or any(len(row) != 4 for row in rows):
-        raise InputError(f"{where}: expected a 4x4 matrix", remedy=_CORRECT)
+    refuse_if(
+        len(rows) != 4 or any(len(row) != 4 for row in rows), f"{where}: expected a 4x4 matrix", remedy=_CORRECT
+    )
     return np.array(rows)
 
 

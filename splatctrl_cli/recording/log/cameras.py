@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.formats.image_file import JPEG
 from splatctrl_cli.libraries import is_installed
 from splatctrl_cli.recording.container.log_formats import told_formats
@@ -344,24 +344,25 @@ def pose_topics(survey: Survey) -> list[str]:
 def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame: str) -> str:
     """The posed frame. Raises InputError if it does not place the camera."""
     where = f"{log.path}: --camera-pose {camera}={given.topic}"
-    if given.topic not in pose_topics(survey):
-        raise InputError(
-            f"{where}: no poses on that topic",
-            remedy=f"expected {', '.join(name.rpartition('/')[2] for name in POSE_TYPES)}; pose topics there:"
-            f" {', '.join(pose_topics(survey)) or 'none'}",
-        )
+    refuse_if(
+        given.topic not in pose_topics(survey),
+        f"{where}: no poses on that topic",
+        remedy=f"expected {', '.join(name.rpartition('/')[2] for name in POSE_TYPES)}; pose topics there:"
+        f" {', '.join(pose_topics(survey)) or 'none'}",
+    )
     _, first_child, *_ = next(_poses(log, survey, given.topic, Damage()), ("", ""))
     child = given.frame or first_child or frame
     tf = survey.tf
-    if child != frame and not tf.connects(child, frame):
-        raise InputError(
-            f"{where}: poses frame {child!r}, which tf does not join to the camera's frame {frame!r}",
-            remedy=f"record /tf_static, or give --camera-pose {camera}={given.topic}@{frame} if it poses the camera",
-        )
-    if tf.root_of(child) != child:
-        raise InputError(
-            f"{where}: tf has frame {child!r} in {tf.root_of(child)!r} already", remedy="leave the option out"
-        )
+    refuse_if(
+        child != frame and not tf.connects(child, frame),
+        f"{where}: poses frame {child!r}, which tf does not join to the camera's frame {frame!r}",
+        remedy=f"record /tf_static, or give --camera-pose {camera}={given.topic}@{frame} if it poses the camera",
+    )
+    refuse_if(
+        tf.root_of(child) != child,
+        f"{where}: tf has frame {child!r} in {tf.root_of(child)!r} already",
+        remedy="leave the option out",
+    )
     return child
 
 
@@ -383,11 +384,11 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
             )
     for child in sorted(set(found.values())):
         topics = sorted(name for name, posed in found.items() if posed == child)
-        if len(topics) > 1:
-            raise InputError(
-                f"{log.path}: {len(topics)} odometries place frame {child!r}: {', '.join(topics)}",
-                remedy=f"choose one with --camera-pose NAME={topics[0]}",
-            )
+        refuse_if(
+            len(topics) > 1,
+            f"{log.path}: {len(topics)} odometries place frame {child!r}: {', '.join(topics)}",
+            remedy=f"choose one with --camera-pose NAME={topics[0]}",
+        )
     for name, child in found.items():
         survey.tf.note(f"poses of frame {child!r} are those of {name}: tf does not say where it is")
     return found

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.geometry import invert_transform, transform_from
 from splatctrl_cli.recording.container.foxglove import DEFINITIONS, TEXT, as_ros, read_foxglove
 from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
@@ -77,16 +77,16 @@ class MessageDecoder:
         if topic.encoding == VIDEO:
             return _unpack_image(message.data)
         store = None if is_foxglove(topic) else self._store(topic)
-        try:
+        with refuse_faults(
+            f"{topic.name}: a {topic.schema or topic.type_name} that does not decode",
+            Exception,
+            error=UndecodableMessageError,
+        ):  # generated code over foreign bytes: there is no list of what it raises
             if store is None:
                 return read_foxglove(topic.schema, topic.encoding, topic.definition, message.data)
             read = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
             decoded = read(message.data[:-4] if has_unit(message) else message.data, topic.schema or topic.type_name)
             return as_ros(topic.schema, decoded) if topic.schema else decoded
-        except Exception as error:  # generated code over foreign bytes: there is no list of what it raises
-            raise UndecodableMessageError(
-                f"{topic.name}: a {topic.schema or topic.type_name} that does not decode: {error}"
-            ) from None
 
     def _store(self, topic: Topic) -> Any:
         if topic not in self._stores and topic not in self._refused:
@@ -150,11 +150,13 @@ def _type_store(topic: Topic) -> Any:
         return _foxglove_store()
     if not topic.definition:
         return get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
-    if len(topic.definition) > _MOST_TEXT:  # it would take much memory or time to compile
-        raise ValueError(f"{len(topic.definition)} characters, at most {_MOST_TEXT} are read")
+    refuse_if(
+        len(topic.definition) > _MOST_TEXT,
+        f"{len(topic.definition)} characters, at most {_MOST_TEXT} are read",
+        error=ValueError,
+    )  # it would take much memory or time to compile
     largest = max((int("".join(sizes)[:12]) for sizes in _ARRAY.findall(topic.definition)), default=0)
-    if largest > _MOST_ITEMS:
-        raise ValueError(f"an array of {largest} items, at most {_MOST_ITEMS} are read")
+    refuse_if(largest > _MOST_ITEMS, f"an array of {largest} items, at most {_MOST_ITEMS} are read", error=ValueError)
     return _store_of(topic.definition, topic.definition_format, topic.schema or topic.type_name)
 
 
@@ -186,8 +188,11 @@ def _check_fields(store: Any) -> None:
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}
         for key, description in standard[name][1]:
-            if there.get(key) != _kind(description):
-                raise ValueError(f"{name} lacks the field {key} of the standard")
+            refuse_if(
+                there.get(key) != _kind(description),
+                f"{name} lacks the field {key} of the standard",
+                error=ValueError,
+            )
 
 
 @lru_cache(maxsize=1)
@@ -228,8 +233,11 @@ class RealSense:
             t, r = message.translation, message.rotation
             quat_xyzw = np.array([r.x, r.y, r.z, r.w], dtype=np.float64)
             position = np.array([t.x, t.y, t.z], dtype=np.float64)
-            if not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quat_xyzw) < 2.0):
-                raise ValueError(f"{topic}: not a rigid transform")
+            refuse_if(
+                not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quat_xyzw) < 2.0),
+                f"{topic}: not a rigid transform",
+                error=ValueError,
+            )
             self.extrinsics.setdefault(extrinsics[1], {})[extrinsics[2]] = transform_from(position, quat_xyzw)
         elif units:
             self.depth_units[units[1]] = _unit(message.data, topic)
@@ -279,8 +287,7 @@ def device_of(topic: str) -> str:
 def _unit(value: float, topic: str) -> float:
     """Metres per count; 0.001 was written as a float32."""
     unit = float(f"{float(value):.6g}")
-    if not 0 < unit < 1:
-        raise ValueError(f"{topic}: expected metres per count, got {unit}")
+    refuse_if(not 0 < unit < 1, f"{topic}: expected metres per count, got {unit}", error=ValueError)
     return unit
 
 

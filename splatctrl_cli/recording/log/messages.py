@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.formats.image_file import JPEG, PNG, decode_file, image_head
 from splatctrl_cli.recording.log.decoder import IMAGE, UndecodableMessageError, UnreadFormError, stamp_ns
 from splatctrl_cli.records import MILLIMETRE, Float32, UInt8
@@ -182,16 +183,28 @@ def _packed(form: str, data: bytes) -> _Packed:
     says_depth, head, file = "compressedDepth" in form, data[:_DEPTH_HEAD], data[_DEPTH_HEAD:]
     plain, behind = _Packed(form, data), _Packed(form, file, True, head)
     if plain.recorded in DEPTH_ENCODINGS or says_depth:
-        if data.startswith(JPEG) or (says_depth and file.startswith(JPEG)):
-            raise UnreadFormError(f"depth in a JPEG ({form}): JPEG loses depth: record PNG")
-        if plain.is_rvl and not says_depth:
-            raise UnreadFormError(f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl")
+        refuse_if(
+            data.startswith(JPEG) or (says_depth and file.startswith(JPEG)),
+            f"depth in a JPEG ({form}): JPEG loses depth: record PNG",
+            error=UnreadFormError,
+        )
+        refuse_if(
+            plain.is_rvl and not says_depth,
+            f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl",
+            error=UnreadFormError,
+        )
     if says_depth and data.startswith(PNG):
-        if plain.recorded == "32FC1":
-            raise UnreadFormError(f"compressed depth ({form}): 32FC1 without the 12 bytes that say what a count is")
+        refuse_if(
+            plain.recorded == "32FC1",
+            f"compressed depth ({form}): 32FC1 without the 12 bytes that say what a count is",
+            error=UnreadFormError,
+        )
         return _Packed(form, data, True, remark=f"compressed depth ({form}): its PNG begins at byte 0, not 12")
-    if says_depth and not plain.is_rvl and not file.startswith(PNG) and _is_rvl(file):
-        raise UnreadFormError(f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl")
+    refuse_if(
+        says_depth and not plain.is_rvl and not file.startswith(PNG) and _is_rvl(file),
+        f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl",
+        error=UnreadFormError,
+    )
     if not says_depth and file.startswith(PNG):
         return behind._replace(remark=f"compressed image ({form}): a PNG behind 12 bytes, read as compressedDepth")
     return behind if says_depth else plain
@@ -245,22 +258,27 @@ def raw_pixels(message: Any) -> NDArray[Any]:
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     name = f"image {width}x{height} {message.encoding}"
-    if message.encoding not in _LAYOUT and width * height > 1 << 31:
-        raise UndecodableMessageError(f"{name}: too large for an image")
+    refuse_if(
+        message.encoding not in _LAYOUT and width * height > 1 << 31,
+        f"{name}: too large for an image",
+        error=UndecodableMessageError,
+    )
     if message.encoding not in _LAYOUT:
         return np.zeros((height, width, 0), dtype=np.uint8)  # kind "other": described, never used
     if message.encoding == _NV24:
         return _nv24(message, name)
     channels, code = _LAYOUT[message.encoding]
     is_planar = message.encoding in _PLANAR
-    if is_planar and (width % 2 or height % 2):
-        raise UndecodableMessageError(f"{name}: expected even sizes")
+    refuse_if(is_planar and (width % 2 or height % 2), f"{name}: expected even sizes", error=UndecodableMessageError)
     num_rows = height * 3 // 2 if is_planar else height
     dtype = np.dtype((">" if message.is_bigendian else "<") + code)
     row = width * channels * dtype.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
-    if width == 0 or height == 0 or step < row or data.size < step * (num_rows - 1) + row:
-        raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
+    refuse_if(
+        width == 0 or height == 0 or step < row or data.size < step * (num_rows - 1) + row,
+        f"{name}: {data.size} bytes with a row step of {step} do not hold it",
+        error=UndecodableMessageError,
+    )
     step = row if num_rows == 1 else step  # a single row may announce any step: nothing follows it
     padded = np.zeros(step * num_rows, dtype=np.uint8)
     padded[: min(data.size, padded.size)] = data[: padded.size]
@@ -275,8 +293,11 @@ def _nv24(message: Any, name: str) -> UInt8:
     """RGB (H, W, 3), BT.601 limited range, as OpenCV's nv12."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
-    if not 0 < width * height * 3 == data.size or step not in {width, 2 * width, 3 * width}:
-        raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
+    refuse_if(
+        not 0 < width * height * 3 == data.size or step not in {width, 2 * width, 3 * width},
+        f"{name}: {data.size} bytes with a row step of {step} do not hold it",
+        error=UndecodableMessageError,
+    )
     y = data[: width * height].reshape(height, width).astype(np.float32)
     u, v = np.moveaxis(data[width * height :].reshape(height, width, 2).astype(np.float32) - 128.0, 2, 0)
     luma = 1.164 * (y - 16.0)
@@ -334,10 +355,11 @@ def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None
         return pixels, "32FC1", None
     if pixels.ndim == 3 and (pixels.dtype != np.uint8 or pixels.shape[2] != 3):
         return _decoded(packed, color=True), "rgb8", data
-    if pixels.dtype != np.uint8:
-        raise UndecodableMessageError(
-            f"compressed image ({form}): pixels of {pixels.dtype}, neither colour nor depth"
-        )
+    refuse_if(
+        pixels.dtype != np.uint8,
+        f"compressed image ({form}): pixels of {pixels.dtype}, neither colour nor depth",
+        error=UndecodableMessageError,
+    )
     return pixels, "mono8" if pixels.ndim == 2 else "bgr8", data
 
 
@@ -360,13 +382,14 @@ def _compressed_depth(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]
 
 
 def _rvl_counts(data: bytes) -> NDArray[np.uint16]:
-    try:
+    with refuse_faults("compressed depth", ValueError, struct.error, error=UndecodableMessageError):
         width, height = struct.unpack_from("<ii", data)
-        if not (width > 0 and height > 0 and width * height <= _MOST_PIXELS):
-            raise ValueError(f"RVL: an image of {width}x{height}")
+        refuse_if(
+            not (width > 0 and height > 0 and width * height <= _MOST_PIXELS),
+            f"RVL: an image of {width}x{height}",
+            error=ValueError,
+        )
         return decode_rvl(data[8:], width * height).reshape(height, width)
-    except (ValueError, struct.error) as error:
-        raise UndecodableMessageError(f"compressed depth: {error}") from None
 
 
 def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
@@ -391,8 +414,11 @@ def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
     image = np.zeros(num_pixels, dtype=np.uint16)
     coded = np.concatenate([numbers[first : first + length] for _, first, length in runs] or [numbers[:0]])
     depth = np.cumsum((coded >> 1) ^ -(coded & 1))
-    if depth.size and not (depth.min() >= 0 and depth.max() <= 65535):
-        raise ValueError("RVL: values outside 0 to 65535")
+    refuse_if(
+        depth.size and not (depth.min() >= 0 and depth.max() <= 65535),
+        "RVL: values outside 0 to 65535",
+        error=ValueError,
+    )
     start = 0
     for first_pixel, _, length in runs:
         image[first_pixel : first_pixel + length] = depth[start : start + length]
@@ -408,8 +434,9 @@ def _numbers(data: bytes) -> NDArray[np.int64]:
         return np.zeros(0, dtype=np.int64)
     starts = np.concatenate([[0], ends[:-1] + 1])
     place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
-    if place.max() > 10:  # a number of more than 33 bits
-        raise ValueError("RVL: a number of more than 33 bits")
+    refuse_if(
+        place.max() > 10, "RVL: a number of more than 33 bits", error=ValueError
+    )  # a number of more than 33 bits
     return np.asarray(np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << (3 * place), starts), dtype=np.int64)
 
 

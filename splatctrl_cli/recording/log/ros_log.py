@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.spilled_rows import RowFile, scratch_folder
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
@@ -217,8 +217,11 @@ class RosLogSource(FrameSource):
                 f"{log.path}: nothing usable before the damage ({found.damage.notes[0]})",
                 remedy="copy the file again",
             )
-        if not found.num_messages:
-            raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
+        refuse_if(
+            not found.num_messages,
+            f"{log.path}: the log holds no messages",
+            remedy="record it again, or give another file",
+        )
         try:
             self._rig = build_cameras(log, found, options)
         except InputError as error:
@@ -298,11 +301,11 @@ class RosLogSource(FrameSource):
     def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
         """Numbers and stamps without repeats; counts repeated and missing images."""
         stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
-        if len(stamps) > 1 and not stamps.any():
-            raise InputError(
-                f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
-                remedy="give --stamps log to take the times of logging",
-            )
+        refuse_if(
+            len(stamps) > 1 and not stamps.any(),
+            f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
+            remedy="give --stamps log to take the times of logging",
+        )
         kept = first_of_each(stamps)
         num_gaps, num_images, period_ns = dropped(stamps)
         self._loss.duplicate_images += len(stamps) - len(kept)
@@ -343,7 +346,7 @@ class RosLogSource(FrameSource):
                 lost.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
                 continue
             where = f"{self._log.path}: topic {camera.human_topic}"
-            human = [camera.labels(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]
+            human = [camera.nearest(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]
             if depth.compressed is None:
                 lost.num_invalid += num_invalid(depth.pixels)
             stored = _stored_frame(planned, color, depth, human[0] if human else None, messages)
@@ -366,27 +369,26 @@ def _images(
         read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
         for message, lazily in zip(messages, kept, strict=False)
     ]
-    depth = camera.depth_to_color
-    expected = (camera.intrinsics, camera.intrinsics if depth is None else depth.depth_intrinsics)
+    expected = (camera.intrinsics, (camera.depth_lens or camera).intrinsics)
     for image, k in zip(images, expected, strict=False):
-        if (image.width, image.height) != (k.width, k.height):
-            raise UndecodableMessageError(
-                f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}"
-            )
+        refuse_if(
+            (image.width, image.height) != (k.width, k.height),
+            f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}",
+            error=UndecodableMessageError,
+        )
     return images
 
 
 def _keeps_files(camera: Camera) -> tuple[bool, bool]:
     """True for colour and depth whose files a capture keeps."""
-    is_plain = camera.undistortion is None
-    return is_plain, is_plain and camera.depth_to_color is None
+    return camera.maps is None, camera.maps is None and camera.depth_lens is None
 
 
 def _stored_frame(
     planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, messages: Sequence[RawMessage]
 ) -> StoredFrame:
     camera = planned.camera
-    is_counts = depth.is_counts and camera.depth_to_color is None
+    is_counts = depth.is_counts and camera.depth_lens is None
     keeps_color, keeps_depth = _keeps_files(camera)
     return StoredFrame(
         stamp_ns=planned.stamp_ns,

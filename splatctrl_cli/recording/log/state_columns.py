@@ -7,7 +7,7 @@ from typing import Any, Self, overload
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, blocks_of, of_columns, ranges, selected
 from splatctrl_cli.records import Float64, Index, JointState, Posture, Stamps
 
@@ -127,8 +127,7 @@ class ColumnWriter:
         self._shapes = shapes
         self._files = {name: RowFile(shapes[name], of_column) for name, of_column in blocks.items()}
         self._num, *others = {len(file) for file in self._files.values()} or {0}  # states that are in the files
-        if others:
-            raise ValueError(f"{', '.join(self._files)}: columns of several lengths")
+        refuse_if(others, f"{', '.join(self._files)}: columns of several lengths", error=ValueError)
         self._waiting: list[Mapping[str, Float64 | None]] = []
 
     def __len__(self) -> int:
@@ -168,10 +167,10 @@ class StateCollector:
 
     def add(self, state: JointState) -> None:
         """Add a state. Raises InputError for another number of joints."""
-        if np.shape(state.position) != (self._num_joints,):
-            raise InputError(
-                f"joint state {len(self._stamps)}: expected {self._num_joints} joints, got {np.size(state.position)}"
-            )
+        refuse_if(
+            np.shape(state.position) != (self._num_joints,),
+            f"joint state {len(self._stamps)}: expected {self._num_joints} joints, got {np.size(state.position)}",
+        )
         self._stamps.append(state.stamp_ns)
         self._columns.add({name: getattr(state, name) for name in COLUMNS})
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.errors import refuse_if, require
 from splatctrl_cli.files.spilled_rows import Rows
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.log.decoder import JOINT_STATE, UndecodableMessageError, stamp_ns
@@ -98,10 +99,11 @@ def _franka(message: Any, log_time_ns: int) -> RawJoints:
 def _controller(message: Any, log_time_ns: int) -> RawJoints:
     """Filled `feedback` and `reference`, else the older `actual` and `desired` (control_msgs)."""
     names = tuple(str(name) for name in message.joint_names)
-    actual = _filled(message, ("feedback", "actual"), len(names))
-    wanted = _filled(message, ("reference", "desired"), len(names))
-    if actual is None:
-        raise UndecodableMessageError(f"a controller state of {len(names)} joints without positions")
+    actual, wanted = (
+        _filled(message, fields, len(names)) for fields in (("feedback", "actual"), ("reference", "desired"))
+    )
+    said = f"a controller state of {len(names)} joints without positions"
+    actual = require(actual, said, error=UndecodableMessageError)
     commanded = _NONE if wanted is None else _array(wanted.velocities)
     position, velocity = _array(actual.positions), _array(actual.velocities)
     return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
@@ -122,8 +124,11 @@ def _checked(
     log_time_ns: int,
     T_base_ee: Float64 | None,
 ) -> RawJoints:
-    if len(position) != len(names):
-        raise UndecodableMessageError(f"{what} with {len(names)} names and {len(position)} positions")
+    refuse_if(
+        len(position) != len(names),
+        f"{what} with {len(names)} names and {len(position)} positions",
+        error=UndecodableMessageError,
+    )
     is_odd = len(velocity) not in (0, len(names))
     return RawJoints(
         stamp_ns=stamp_ns(message.header),
@@ -144,8 +149,11 @@ def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
     states = []
     for point in message.points:
         since, position, velocity = point.time_from_start, _array(point.positions), _array(point.velocities)
-        if len(position) != len(names):
-            raise UndecodableMessageError(f"a trajectory of {len(names)} joints with {len(position)} positions")
+        refuse_if(
+            len(position) != len(names),
+            f"a trajectory of {len(names)} joints with {len(position)} positions",
+            error=UndecodableMessageError,
+        )
         after_ns = int(since.sec) * 1_000_000_000 + int(since.nanosec)
         states.append(
             RawJoints(
@@ -185,8 +193,11 @@ class JointStream:
         self._columns = ColumnWriter(
             {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}, columns or {}
         )
-        if columns and len(self._columns) != len(self):
-            raise ValueError(f"columns of other lengths than {len(self)}")
+        refuse_if(
+            columns and len(self._columns) != len(self),
+            f"columns of other lengths than {len(self)}",
+            error=ValueError,
+        )
 
     def __len__(self) -> int:
         return len(self._stamps)

@@ -20,7 +20,7 @@ from splatctrl_cli.config.fixed import (
     TURNS_LEAST,
     TURNS_SHARE,
 )
-from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError
+from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, refuse_if
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, ranges
 from splatctrl_cli.recording.log.decoder import JOINT_STATE
 from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
@@ -75,11 +75,11 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
             loss.notes.append(f"{topic.topic.name}: the log has no definition of {kind}: its states are not read")
     if options.joint_topic is not None:
         chosen = [t for t in found if t.topic.name == options.joint_topic]
-        if not chosen:
-            raise InputError(
-                f"joint topic {options.joint_topic}: not a topic of the log with joint states",
-                remedy=f"use one of: {', '.join(t.topic.name for t in found) or 'none there'}",
-            )
+        refuse_if(
+            not chosen,
+            f"joint topic {options.joint_topic}: not a topic of the log with joint states",
+            remedy=f"use one of: {', '.join(t.topic.name for t in found) or 'none there'}",
+        )
         return chosen
     return [t for t in found if t.topic.type_name != TRAJECTORY] or found
 
@@ -190,11 +190,12 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
                 remedy=f"give --joint-topic {base.where} or --joint-topic {other.where}",
             )
     num = _num_turns(base, names)
-    if num >= max(TURNS_FEWEST, TURNS_SHARE * len(base.states)):
-        raise NotEvaluableError(
-            f"{base.where}: two publishers take turns: {num} of {len(base.states)} states jump away and back at once",
-            remedy="let one node publish the topic (ros2 topic info -v names them), and record again",
-        )
+    refuse_if(
+        num >= max(TURNS_FEWEST, TURNS_SHARE * len(base.states)),
+        f"{base.where}: two publishers take turns: {num} of {len(base.states)} states jump away and back at once",
+        remedy="let one node publish the topic (ros2 topic info -v names them), and record again",
+        error=NotEvaluableError,
+    )
 
 
 def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
@@ -283,11 +284,11 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]
 
     names = ", ".join(other.names)
-    if not keep.any():
-        raise InputError(
-            f"{track.where} and {other.where}: mixed clocks: at no state of {track.where} is {names} known",
-            remedy="give another --joint-topic, or record both by one clock",
-        )
+    refuse_if(
+        not keep.any(),
+        f"{track.where} and {other.where}: mixed clocks: at no state of {track.where} is {names} known",
+        remedy="give another --joint-topic, or record both by one clock",
+    )
     loss.notes.append(f"{track.where}: {names} of {other.where} are interpolated at its {len(stamps)} states")
     if not keep.all():
         lost = f"{int((~keep).sum())} of {len(stamps)} states left out"
@@ -325,11 +326,11 @@ def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossRepor
     if is_unset.all():
         loss.notes.append(f"{where}: no state has a stamp; the times of logging are used")
         return log_ns
-    if is_unset.any() and stamp_ns[~is_unset].min() > CLOCK_MIXED * 1e9:  # a simulation may begin at 0
-        raise InputError(
-            f"{where}: mixed clocks: {int(is_unset.sum())} of {len(stamp_ns)} states have no stamp",
-            remedy="leave them out of the log, or give another --joint-topic",
-        )
+    refuse_if(
+        is_unset.any() and stamp_ns[~is_unset].min() > CLOCK_MIXED * 1e9,
+        f"{where}: mixed clocks: {int(is_unset.sum())} of {len(stamp_ns)} states have no stamp",
+        remedy="leave them out of the log, or give another --joint-topic",
+    )  # a simulation may begin at 0
     late = np.asarray((log_ns - stamp_ns) * 1e-9, dtype=np.float64)
     _check_steps(late, where, loss)
     median = float(np.median(late))

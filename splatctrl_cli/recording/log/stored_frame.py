@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_DEPTH
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.spilled_rows import Table, blocks_of, ranges
 from splatctrl_cli.formats.arrays import npy_head, npy_of
 from splatctrl_cli.formats.image_file import JPEG, PNG
@@ -155,15 +155,24 @@ def npy_bytes(depth: Float32) -> bytes:
 def _blocks(path: Path) -> Iterator[Float64]:
     with path.open("rb") as stream:
         shape, is_by_columns, dtype = npy_head(stream)
-        if dtype != np.dtype("<f8") or is_by_columns or not shape:
-            raise ValueError(f"{path.name}: expected rows of float64, got {dtype} {shape}")
-        if 8 * prod(shape) != path.stat().st_size - stream.tell():
-            raise ValueError(f"{path.name}: does not hold the {shape[0]} rows that it announces")
+        refuse_if(
+            dtype != np.dtype("<f8") or is_by_columns or not shape,
+            f"{path.name}: expected rows of float64, got {dtype} {shape}",
+            error=ValueError,
+        )
+        refuse_if(
+            8 * prod(shape) != path.stat().st_size - stream.tell(),
+            f"{path.name}: does not hold the {shape[0]} rows that it announces",
+            error=ValueError,
+        )
         for first, last in ranges(shape[0]):
             size = (last - first) * prod(shape[1:])
             values = np.frombuffer(stream.read(8 * size), dtype)  # no map: a file that shrinks would kill the program
-            if values.size != size:
-                raise ValueError(f"{path.name}: ends after {first + values.size} of {shape[0]} rows")
+            refuse_if(
+                values.size != size,
+                f"{path.name}: ends after {first + values.size} of {shape[0]} rows",
+                error=ValueError,
+            )
             yield values.reshape(last - first, *shape[1:])
 
 

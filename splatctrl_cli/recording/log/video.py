@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if, require
 from splatctrl_cli.libraries import is_installed, of_extra
 from splatctrl_cli.recording.container.log_formats import AZURE_KINECT, open_raw_log, refuse_foreign
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
@@ -193,15 +193,14 @@ class VideoFileLog(RawLog):
     def __init__(self, path: Path) -> None:
         self.path = path
         beside = next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None)
-        if beside is None:
-            raise InputError(
-                f"{path}: no stamps beside it",
-                remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
-                + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
-            )
+        beside = require(
+            beside,
+            f"{path}: no stamps beside it",
+            remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
+            + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
+        )
         self._av = of_extra(LIBRARY, EXTRA, "video files")
-        self.files = (path, beside)
-        self._stamps = _read_stamps(beside)
+        self.files, self._stamps = (path, beside), _read_stamps(beside)
         self._topic = Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)
 
     def topics(self) -> tuple[Topic, ...]:
@@ -218,17 +217,20 @@ class VideoFileLog(RawLog):
             num += 1
         for note in found.notes:
             damage.add(note)
-        if num != len(self._stamps) and not found.count:
-            raise InputError(
-                f"{self.path}: {num} images, but {len(self._stamps)} stamps in {self.files[1].name}",
-                remedy="write a stamp for each image of the file",
-            )
+        refuse_if(
+            num != len(self._stamps) and not found.count,
+            f"{self.path}: {num} images, but {len(self._stamps)} stamps in {self.files[1].name}",
+            remedy="write a stamp for each image of the file",
+        )
 
     def _frames(self, damage: Damage) -> Iterator[Any]:
         try:
             with self._av.open(str(self.path)) as container:
-                if not container.streams.video:
-                    raise InputError(f"{self.path}: a file without video", remedy="give the colour camera's video")
+                refuse_if(
+                    not container.streams.video,
+                    f"{self.path}: a file without video",
+                    remedy="give the colour camera's video",
+                )
                 for frame in container.decode(video=0):
                     if frame.is_corrupt:
                         damage.add(f"{self.path.name}: an image at {frame.time} s is damaged")
@@ -259,17 +261,16 @@ def _read_stamps(path: Path) -> Stamps:
         lines, rows = lines[1:], rows[1:]
     elif rows and len(rows[0]) > 1:
         column = -1
-    if column < 0 or not rows:
-        raise InputError(
-            f"{path}: expected a stamp a line, or columns whose first line names one time or stamp",
-            remedy="write the images' times alone, in seconds",
-        )
-    values = []
-    for row, line in zip(rows, lines, strict=True):
-        value = _number(row[column]) if column < len(row) else None
-        if value is None:
-            raise InputError(f"{path}: expected a time, got {line[:80]!r}", remedy="correct the line")
-        values.append(value)
+    refuse_if(
+        column < 0 or not rows,
+        f"{path}: expected a stamp a line, or columns whose first line names one time or stamp",
+        remedy="write the images' times alone, in seconds",
+    )
+    found = [_number(row[column]) if column < len(row) else None for row in rows]
+    values = [value for value in found if value is not None]
+    if len(values) < len(rows):
+        line = lines[found.index(None)]
+        raise InputError(f"{path}: expected a time, got {line[:80]!r}", remedy="correct the line")
     digits = len(str(abs(int(values[0]))))
     unit_ns = next(unit for most, unit in _UNITS_NS if digits <= most)
     return np.array([round(value * unit_ns) for value in values], dtype=np.int64)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.recording.calibrated import calibrated
 from splatctrl_cli.recording.capture.capture import CaptureSource, is_capture
@@ -81,11 +81,11 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
         options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
         raw, file = described_track(path)
         return _of_table(path, (path, file), raw, LossReport())
-    if path.suffix.lower() in ARRAY_FILES:
-        raise InputError(
-            f"{path}: a file of arrays, of which none is known to be joint states",
-            remedy="describe them in a .toml and give that (splatctrl help replay, Logs)",
-        )
+    refuse_if(
+        path.suffix.lower() in ARRAY_FILES,
+        f"{path}: a file of arrays, of which none is known to be joint states",
+        remedy="describe them in a .toml and give that (splatctrl help replay, Logs)",
+    )
     if is_lerobot(path):
         options.refuse(_NOT_FOR_TABLES, "a LeRobot dataset", path)
         raw, file = dataset_track(path)
@@ -123,11 +123,11 @@ def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[st
 
 def _libfranka(path: Path, joints: Sequence[str]) -> StateSource:
     table = read_csv(path)
-    if not is_libfranka(table):
-        raise InputError(
-            f"{path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
-            remedy="describe the columns in a .toml and give that (splatctrl help replay, Logs)",
-        )
+    refuse_if(
+        not is_libfranka(table),
+        f"{path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
+        remedy="describe the columns in a .toml and give that (splatctrl help replay, Logs)",
+    )
     raw = libfranka_track(table)
     names = with_prefix(raw.names, joints)
     loss = LossReport(notes=["times are those of the robot, in ms since it was switched on"])
@@ -138,8 +138,7 @@ def _libfranka(path: Path, joints: Sequence[str]) -> StateSource:
 
 def _of_table(path: Path, files: Sequence[Path], raw: RawTrack, loss: LossReport) -> StateSource:
     states = cleaned(raw, loss)
-    if not states:
-        raise InputError(f"{path}: expected joint states, got none that is finite", remedy="check the file")
+    refuse_if(not states, f"{path}: expected joint states, got none that is finite", remedy="check the file")
     return StateSource(path.name, files, raw.names, states, loss)
 
 
@@ -183,10 +182,11 @@ def read_twists(path: Path, topic: str) -> LoggedTwists:
     """
     if path.suffix == ".toml":
         return _read_described(path, topic)
-    if not path.is_file() and not is_bag_folder(path):
-        raise InputError(
-            f"{path}: expected a log to take the twists {topic} from", remedy="give the log that it was made of"
-        )
+    refuse_if(
+        not path.is_file() and not is_bag_folder(path),
+        f"{path}: expected a log to take the twists {topic} from",
+        remedy="give the log that it was made of",
+    )
     return _read_logged(path, topic)
 
 
@@ -223,36 +223,40 @@ def _read_logged(path: Path, topic: str) -> LoggedTwists:
 
 
 def _read_described(path: Path, name: str) -> LoggedTwists:
-    if name != TABLE or not has_table(path, TABLE):
-        raise InputError(f"{path}: expected a table [{TABLE}], got {name}", remedy=f"{_SEE}, and name it so")
+    refuse_if(
+        name != TABLE or not has_table(path, TABLE),
+        f"{path}: expected a table [{TABLE}], got {name}",
+        remedy=f"{_SEE}, and name it so",
+    )
     table = read_table(TwistsTable, path, TABLE, beside=("states",))
-    if table.time_unit not in TIME_UNITS_NS or (len(table.linear), len(table.angular)) != (3, 3):
-        raise InputError(
-            f"{path}: {TABLE}: expected linear and angular of 3 columns and time_unit of {', '.join(TIME_UNITS_NS)}",
-            remedy=_SEE,
-        )
+    refuse_if(
+        table.time_unit not in TIME_UNITS_NS or (len(table.linear), len(table.angular)) != (3, 3),
+        f"{path}: {TABLE}: expected linear and angular of 3 columns and time_unit of {', '.join(TIME_UNITS_NS)}",
+        remedy=_SEE,
+    )
     columns = columns_of(path, TABLE, table.file)
     stamps, found = columns.read(
         table.time, TIME_UNITS_NS[table.time_unit], {"twist": [*table.linear, *table.angular]}, table.epoch_ns
     )
     twists = found["twist"][: len(found["twist"])]
-    if twists.shape != (len(stamps), 6):
-        raise InputError(f"{path}: {TABLE}: expected 6 columns of {len(stamps)} rows, got {twists.shape[::-1]}")
+    refuse_if(
+        twists.shape != (len(stamps), 6),
+        f"{path}: {TABLE}: expected 6 columns of {len(stamps)} rows, got {twists.shape[::-1]}",
+    )
     return _checked(f"{path}: {TABLE}", stamps, twists, [table.frame] * len(stamps), [])
 
 
 def _checked(where: str, stamps: Stamps, twists: Float64, frames: list[str], notes: list[str]) -> LoggedTwists:
-    if len(set(frames)) > 1:
-        raise InputError(
-            f"{where}: expected twists in one frame, got {', '.join(sorted(set(frames)))}",
-            remedy="record one frame's only",
-        )
+    refuse_if(
+        len(set(frames)) > 1,
+        f"{where}: expected twists in one frame, got {', '.join(sorted(set(frames)))}",
+        remedy="record one frame's only",
+    )
     is_finite = np.isfinite(twists).all(axis=1)
     if not is_finite.all():
         notes.append(f"{int((~is_finite).sum())} twists with NaN or infinity: left out")
         stamps, twists = stamps[is_finite], twists[is_finite]
-    if not len(stamps):
-        raise InputError(f"{where}: expected twists, got none that is finite", remedy="check the recording")
+    refuse_if(not len(stamps), f"{where}: expected twists, got none that is finite", remedy="check the recording")
     order = np.argsort(stamps, kind="stable")
     stamps, twists = stamps[order], twists[order]
     is_last = np.append(np.diff(stamps) > 0, True)
