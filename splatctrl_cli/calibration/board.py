@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8, spread
 
@@ -60,11 +60,12 @@ def board_of(text: str) -> Board:
     """Parse ``COLUMNSxROWS:SQUARE``. Raises UsageError for another form."""
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2}):(\d*\.?\d+)", text)
     columns, rows, square = (int(match[1]), int(match[2]), float(match[3])) if match else (0, 0, 0.0)
-    if not (min(columns, rows) >= 3 and 0.002 <= square <= 1.0):
-        raise UsageError(
-            f"--board {text}: expected inner corners, 3 to 99 each way, and the edge of a square, 0.002 to 1 m",
-            remedy="give it as 9x6:0.025, for 10x7 squares of 25 mm",
-        )
+    refuse_if(
+        not (min(columns, rows) >= 3 and 0.002 <= square <= 1.0),
+        f"--board {text}: expected inner corners, 3 to 99 each way, and the edge of a square, 0.002 to 1 m",
+        remedy="give it as 9x6:0.025, for 10x7 squares of 25 mm",
+        error=UsageError,
+    )
     return Board(columns=columns, rows=rows, square=square)
 
 
@@ -215,13 +216,14 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
                 placed[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ found.X
         except NotEvaluableError as error:
             reasons.append(error.message.removeprefix("calibrate: "))
-    if not placed:
-        raise NotEvaluableError(
-            "calibrate: the board is tied to no robot: "
-            + ("; ".join(dict.fromkeys(reasons)) or "it stands still, and no camera that moves sees it"),
-            remedy="let the gripper hold the board, or a camera on the wrist see it stand still, from ten sides; or"
-            " leave --urdf out",
-        )
+    refuse_if(
+        not placed,
+        "calibrate: the board is tied to no robot: "
+        + ("; ".join(dict.fromkeys(reasons)) or "it stands still, and no camera that moves sees it"),
+        remedy="let the gripper hold the board, or a camera on the wrist see it stand still, from ten sides; or"
+        " leave --urdf out",
+        error=NotEvaluableError,
+    )
     while missing := [camera for camera in rig.recorded if camera not in placed]:
         votes = {camera: _votes(camera, by_camera, placed, T_world_board, rig, stands) for camera in missing}
         best = max(missing, key=lambda camera: len(votes[camera]))
@@ -250,13 +252,14 @@ def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> No
     ratios = [s.depth_ratio for its in by_camera.values() for s in its if s.depth_ratio is not None]
     ratio = float(np.median(ratios)) if ratios else 1.0
     low, high = fixed.CALIBRATION_BOARD_DEPTH
-    if not low < ratio < high:
-        raise NotEvaluableError(
-            f"calibrate: the squares of the board measure about {1e3 * ratio * board.square:.0f} mm by the cameras'"
-            f" depth, expected {1e3 * board.square:g}",
-            remedy=f"measure a square: --board {board}:{ratio * board.square:.3f}; or the depth unit is wrong"
-            " (--depth-scale)",
-        )
+    refuse_if(
+        not low < ratio < high,
+        f"calibrate: the squares of the board measure about {1e3 * ratio * board.square:.0f} mm by the cameras'"
+        f" depth, expected {1e3 * board.square:g}",
+        remedy=f"measure a square: --board {board}:{ratio * board.square:.3f}; or the depth unit is wrong"
+        " (--depth-scale)",
+        error=NotEvaluableError,
+    )
 
 
 def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool:
@@ -280,19 +283,19 @@ def _carried(arm: Arm, sightings: Sequence[Sighting]) -> HandEye:
             fits.append(hand_eye([(invert_transform(at), seen) for at, seen in poses if at is not None]))
         except NotEvaluableError as error:
             reasons.append(error.message)
-    if not fits:
-        raise NotEvaluableError(reasons[-1])
+    refuse_if(not fits, reasons[-1], error=NotEvaluableError)
     best = min(fits, key=lambda fit: fit.distance)
     _check_fit(best, f"the board before {sightings[0].camera}, on the link that fits best,")
     return best
 
 
 def _check_fit(found: HandEye, what: str) -> None:
-    if found.distance > fixed.CALIBRATION_BOARD_FIT:
-        raise NotEvaluableError(
-            f"calibrate: {what} does not move with the robot: {1e3 * found.distance:.0f} mm off (expected"
-            f" {1e3 * fixed.CALIBRATION_BOARD_FIT:.0f})"
-        )
+    refuse_if(
+        found.distance > fixed.CALIBRATION_BOARD_FIT,
+        f"calibrate: {what} does not move with the robot: {1e3 * found.distance:.0f} mm off (expected"
+        f" {1e3 * fixed.CALIBRATION_BOARD_FIT:.0f})",
+        error=NotEvaluableError,
+    )
 
 
 def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
@@ -303,11 +306,12 @@ def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
     NotEvaluableError for too few pairs, or rotation about fewer than two axes.
     """
     pairs = spread(pairs, fixed.CALIBRATION_FRAMES)
-    if len(pairs) < fixed.CALIBRATION_BOARD_VIEWS:
-        raise NotEvaluableError(
-            f"calibrate: too few views of the board by one camera: {len(pairs)} (expected"
-            f" {fixed.CALIBRATION_BOARD_VIEWS})"
-        )
+    refuse_if(
+        len(pairs) < fixed.CALIBRATION_BOARD_VIEWS,
+        f"calibrate: too few views of the board by one camera: {len(pairs)} (expected"
+        f" {fixed.CALIBRATION_BOARD_VIEWS})",
+        error=NotEvaluableError,
+    )
     for is_last in (False, True):
         X = _hand_eye(pairs)
         ends = [A @ X @ B for A, B in pairs]
@@ -330,12 +334,13 @@ def _hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> Float64:
         np.array([cv2.Rodrigues(T[:3, :3])[0].ravel() for T in some]) for some in (lefts, rights)
     )
     spreads = np.linalg.svd(turned_left, compute_uv=False) / np.sqrt(len(turned_left))
-    if spreads[1] < fixed.CALIBRATION_BOARD_TURN:
-        raise NotEvaluableError(
-            "calibrate: the robot hardly turns the board, or the camera that sees it, about two axes:"
-            f" {np.degrees(spreads[1]):.1f} degrees about the second (expected"
-            f" {np.degrees(fixed.CALIBRATION_BOARD_TURN):.0f})"
-        )
+    refuse_if(
+        spreads[1] < fixed.CALIBRATION_BOARD_TURN,
+        "calibrate: the robot hardly turns the board, or the camera that sees it, about two axes:"
+        f" {np.degrees(spreads[1]):.1f} degrees about the second (expected"
+        f" {np.degrees(fixed.CALIBRATION_BOARD_TURN):.0f})",
+        error=NotEvaluableError,
+    )
     U, _, Vt = np.linalg.svd(turned_left.T @ turned_right)
     X = np.eye(4)
     R = X[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt

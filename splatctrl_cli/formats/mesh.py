@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Float64, Index
 
@@ -38,22 +38,22 @@ def load_mesh(path: Path) -> TriangleMesh:
     Vertices at one place are merged. COLLADA is scaled by its unit; its up axis is ignored, as in RViz. Bytes after a
     binary STL's faces are ignored, with a note. Raises InputError if unreadable, without triangles, or not finite.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: expected a mesh, got no such file")
+    refuse_if(not path.is_file(), f"{path}: expected a mesh, got no such file")
     kind = path.suffix.lower()
     source, note = _opened(path) if kind in {".stl", ".obj", ".off"} else (path, "")
-    try:
+    with refuse_faults(
+        lambda error: f"{path}: expected a mesh, got {type(error).__name__}: {error}",
+        Exception,
+        remedy="give an OBJ, STL, PLY, GLB or COLLADA file",
+    ):  # trimesh raises whatever the reader of the format raises
         loaded = trimesh.load(source, file_type=kind[1:], force="mesh", process=False)
         scale = _collada_unit(path) if kind == ".dae" else 1.0
-    except Exception as error:  # trimesh raises whatever the reader of the format raises
-        raise InputError(
-            f"{path}: expected a mesh, got {type(error).__name__}: {error}",
-            remedy="give an OBJ, STL, PLY, GLB or COLLADA file",
-        ) from None
-    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise InputError(f"{path}: expected a mesh, got no triangle", remedy="give a mesh with faces, not a cloud")
-    if not np.isfinite(loaded.vertices).all():
-        raise InputError(f"{path}: expected finite vertices, got some that are not")
+    refuse_if(
+        not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces),
+        f"{path}: expected a mesh, got no triangle",
+        remedy="give a mesh with faces, not a cloud",
+    )
+    refuse_if(not np.isfinite(loaded.vertices).all(), f"{path}: expected finite vertices, got some that are not")
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
     loaded.update_faces(loaded.nondegenerate_faces())
     return TriangleMesh(
@@ -74,11 +74,11 @@ def _opened(path: Path) -> tuple[BytesIO | Path, str]:
             rest = len(content) - end
             words = f"{path.name}: {rest} bytes after its {num} faces are ignored" if rest else ""
             return BytesIO(content[:end]), words
-        if b"facet" not in content.lower():
-            raise InputError(
-                f"{path}: expected {end} bytes for {num} faces, got {len(content)}",
-                remedy="copy or write the file again",
-            )
+        refuse_if(
+            b"facet" not in content.lower(),
+            f"{path}: expected {end} bytes for {num} faces, got {len(content)}",
+            remedy="copy or write the file again",
+        )
     try:
         content.decode()
     except UnicodeDecodeError:

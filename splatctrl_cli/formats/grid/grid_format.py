@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.files.summary import Grid, Summary
-from splatctrl_cli.records import DistanceGrid, Float64, Values
+from splatctrl_cli.records import DistanceGrid, Values
 
 FORMAT = "splatctrl distance grid"
 VERSION = 2
@@ -59,17 +59,6 @@ CHANNELS: Mapping[str, Channel] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridHead:
-    """A grid file's head: origin (3,) float64 and voxel [m], cells along x, y, z."""
-
-    origin: Float64
-    voxel: float
-    shape: Shape
-    channels: tuple[str, ...]
-    header: dict[str, object]
-
-
 def file_header(grid: DistanceGrid) -> dict[str, object]:
     """The header with format and version."""
     return {**grid.header, "format": FORMAT, "version": VERSION}
@@ -96,22 +85,26 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
 
     Raises InputError without sdf, or for an unknown name, dtype or shape.
     """
-    if not {"sdf"} <= arrays.keys() <= CHANNELS.keys():
-        raise InputError(
-            f"{name}: expected the channel sdf and any of {', '.join(list(CHANNELS)[1:])}, "
-            f"got {', '.join(arrays) or 'none'}",
-            remedy="give a grid that sdf-bake wrote",
-        )
+    refuse_if(
+        not {"sdf"} <= arrays.keys() <= CHANNELS.keys(),
+        f"{name}: expected the channel sdf and any of {', '.join(list(CHANNELS)[1:])}, "
+        f"got {', '.join(arrays) or 'none'}",
+        remedy="give a grid that sdf-bake wrote",
+    )
     cells = arrays["sdf"][1]
-    if len(cells) != 3 or min(cells) < 1:
-        raise InputError(f"{name}: sdf: expected (X, Y, Z) cells, got {cells}", remedy="bake it again")
+    refuse_if(
+        len(cells) != 3 or min(cells) < 1,
+        f"{name}: sdf: expected (X, Y, Z) cells, got {cells}",
+        remedy="bake it again",
+    )
     shape = (cells[0], cells[1], cells[2])
     for channel, got in arrays.items():
         wanted = (CHANNELS[channel].dtype, CHANNELS[channel].shape(shape))
-        if got != wanted:
-            raise InputError(
-                f"{name}: {channel}: expected {wanted[0]} {wanted[1]}, got {got[0]} {got[1]}", remedy="bake it again"
-            )
+        refuse_if(
+            got != wanted,
+            f"{name}: {channel}: expected {wanted[0]} {wanted[1]}, got {got[0]} {got[1]}",
+            remedy="bake it again",
+        )
     return shape
 
 
@@ -198,18 +191,14 @@ def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
     return {key: header[key] for key in FIELD_FACTS if header.get(key) is not None}
 
 
-def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
+def summary_of(path: Path, kind: str, grid: DistanceGrid) -> Summary:
     table = Grid(
         name="channels",
         header=("channel", "dtype", "unit"),
-        rows=[[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels],
+        rows=[[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in grid.channels],
     )
-    return Summary(
-        path=str(path),
-        kind=kind,
-        facts={**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)},
-        grids=(table,),
-    )
+    facts = {**covers(grid.origin, grid.voxel, grid.channels["sdf"].shape), **header_facts(grid.header)}
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(table,))
 
 
 def json_value(text: object) -> object:
@@ -252,17 +241,19 @@ class GridSlabs:
 
         counts: the baker's so far. Raises InputError if channels or shapes differ from the plan.
         """
-        if slab.keys() != set(self.plan.channels):
-            raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")
+        refuse_if(
+            slab.keys() != set(self.plan.channels),
+            f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}",
+        )
         num = len(slab[self.plan.channels[0]])
         for name in self.plan.channels:
             wanted = (CHANNELS[name].dtype, self._shape(name, num))
             values = slab[name]
-            if (values.dtype.str, values.shape) != wanted or num + self.num_layers > self.plan.shape[0]:
-                raise InputError(
-                    f"slab: {name} at layer {self.num_layers} of {self.plan.shape[0]}: expected {wanted}, "
-                    f"got {(values.dtype.str, values.shape)}"
-                )
+            refuse_if(
+                (values.dtype.str, values.shape) != wanted or num + self.num_layers > self.plan.shape[0],
+                f"slab: {name} at layer {self.num_layers} of {self.plan.shape[0]}: expected {wanted}, "
+                f"got {(values.dtype.str, values.shape)}",
+            )
             self._write_channel(name, values)
         self.num_layers += num
         self.counts = counts or {}
@@ -273,11 +264,11 @@ class GridSlabs:
 
     def grid(self, header: Mapping[str, object]) -> DistanceGrid:
         """Open as read-only memory maps. Raises InputError before it is whole."""
-        if not self.is_whole():
-            raise InputError(
-                f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
-                remedy="continue the bake",
-            )
+        refuse_if(
+            not self.is_whole(),
+            f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
+            remedy="continue the bake",
+        )
         channels: dict[str, Values] = {
             name: np.lib.format.open_memmap(self.folder / f"{name}.npy", mode="r") for name in self.plan.channels
         }
@@ -339,8 +330,7 @@ def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
             found = np.lib.format.open_memmap(path, mode="r").shape
         except (OSError, ValueError):  # not there, or cut
             found = ()
-        if found != size:
-            raise InputError(f"{path}: expected {size}, got no such array", remedy="bake without --resume")
+        refuse_if(found != size, f"{path}: expected {size}, got no such array", remedy="bake without --resume")
     return GridSlabs(folder, plan, num_layers, counts)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_faults, refuse_if
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.grid.grid_format import CHUNK, GridFormat, check_grid
 from splatctrl_cli.libraries import trimesh
@@ -29,10 +29,12 @@ def iso_surface(grid: DistanceGrid) -> Any:
     Raises NotEvaluableError if no cube crosses 0.
     """
     shape, values = check_grid(grid), grid.channels["sdf"]
-    if min(shape) < 2:
-        raise NotEvaluableError(
-            f"surface: expected at least 2 cells along each axis, got {shape}", remedy="bake a larger --box"
-        )
+    refuse_if(
+        min(shape) < 2,
+        f"surface: expected at least 2 cells along each axis, got {shape}",
+        remedy="bake a larger --box",
+        error=NotEvaluableError,
+    )
     step = max(1, CHUNK // max(1, values.nbytes // shape[0]))
     vertices, faces, count = [], [], 0
     lowest, highest = np.inf, -np.inf
@@ -104,13 +106,13 @@ def describe_mesh(path: Path, _head: bytes) -> Summary | None:
     """Summarise a ``.obj`` or ``.stl``, read whole."""
     if path.suffix.lower() not in {".obj", ".stl"}:
         return None
-    try:
+    with refuse_faults(
+        f"{path}: not a readable mesh", Exception, remedy="the file is damaged"
+    ):  # whatever its parsers meet
         mesh = trimesh.load_mesh(path, process=False)
         mesh.merge_vertices()  # .stl has three a triangle
         facts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "is_watertight": bool(mesh.is_watertight)}
         lower, upper = np.round(mesh.bounds, 6).tolist()
-    except Exception as error:  # whatever its parsers meet
-        raise InputError(f"{path}: not a readable mesh: {error}", remedy="the file is damaged") from None
     return Summary(path=str(path), kind="mesh", facts={**facts, "lower": lower, "upper": upper})
 
 

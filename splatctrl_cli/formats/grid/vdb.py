@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
@@ -73,10 +73,10 @@ def openvdb() -> Any:
     try:
         import openvdb as module
     except ImportError:
-        try:
+        with refuse_faults(
+            "OpenVDB: its Python module cannot be imported", ImportError, remedy=_REMEDY, error=UsageError
+        ):
             import pyopenvdb as module
-        except ImportError as error:
-            raise UsageError(f"OpenVDB: its Python module cannot be imported: {error}", remedy=_REMEDY) from None
     return module
 
 
@@ -99,14 +99,14 @@ def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
     another or a damaged file.
     """
     with path.open("rb") as stream:
-        if stream.read(8) != MAGIC:
-            raise InputError(f"{path}: expected an OpenVDB file, got another", remedy="the file is damaged")
+        refuse_if(
+            stream.read(8) != MAGIC, f"{path}: expected an OpenVDB file, got another", remedy="the file is damaged"
+        )
         with refuse_faults(
             f"{path}: not a readable OpenVDB file", ValueError, struct.error, remedy="the file is damaged"
         ):
             version, _, _, has_offsets = _unpack(stream, "<3I?")
-            if version < 222 or not has_offsets:
-                raise ValueError(f"file version {version}")
+            refuse_if(version < 222 or not has_offsets, f"file version {version}", error=ValueError)
             stream.read(_UUID_LENGTH)
             _metadata(stream)
             grids = []
@@ -126,8 +126,7 @@ def _unpack(stream: BinaryIO, layout: str) -> tuple[Any, ...]:
 def _text(stream: BinaryIO) -> str:
     (length,) = _unpack(stream, "<I")
     text = stream.read(length)
-    if len(text) != length:
-        raise ValueError("it is cut")
+    refuse_if(len(text) != length, "it is cut", error=ValueError)
     return text.decode("utf-8", errors="replace")
 
 

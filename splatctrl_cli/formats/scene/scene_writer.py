@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import Parts, flush, sha256, write_durably, write_table
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL, SHELL_FILE, Snapshot
@@ -88,10 +88,11 @@ class SceneWriter:
         kept |= {path for s in self.snapshots for path in (s.path, s.occupancy_path)}
         kept |= {self.folder / name for name in checkpoint.parts or {}}
         missing = sorted(path.name for path in kept if not path.is_file())
-        if missing or self._audit.stat().st_size < checkpoint.audit_bytes:
-            raise InputError(
-                f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it", remedy=START_OVER
-            )
+        refuse_if(
+            missing or self._audit.stat().st_size < checkpoint.audit_bytes,
+            f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it",
+            remedy=START_OVER,
+        )
         written = Parts(folder=self.folder, digests=checkpoint.parts, remedy=START_OVER)
         for path in sorted(kept - {self._audit, self.folder / CHECKPOINT}):
             written.checked(path)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.records import Array, Label, UInt8, Values
 from splatctrl_cli.voxels import (
@@ -193,12 +193,12 @@ def _last_seen(stored: Array, header: Mapping[str, Any], num_steps: int) -> Arra
 
 def _balls(arrays: Arrays, voxel: float) -> Balls:
     centers, labels = arrays["unrepresented"], arrays["unrepresented_labels"]
-    if centers.dtype != np.float32 or labels.dtype != np.uint8 or centers.shape != (labels.size, 3):
-        raise ValueError(
-            f"unrepresented: expected float32 (K, 3) and uint8 (K,), got {centers.shape}, {labels.shape}"
-        )
-    if not np.isfinite(centers).all():
-        raise ValueError("unrepresented: expected finite centres")
+    refuse_if(
+        centers.dtype != np.float32 or labels.dtype != np.uint8 or centers.shape != (labels.size, 3),
+        f"unrepresented: expected float32 (K, 3) and uint8 (K,), got {centers.shape}, {labels.shape}",
+        error=ValueError,
+    )
+    refuse_if(not np.isfinite(centers).all(), "unrepresented: expected finite centres", error=ValueError)
     return Balls.of_voxels(centers, voxel, labels)
 
 
@@ -206,15 +206,21 @@ def _edges(arrays: Arrays) -> LostEdges:
     if "edges" not in arrays:
         return NO_EDGES
     edges = arrays["edges"]
-    if edges.dtype != np.float32 or edges.shape != (edges.size // 4, 4) or not np.isfinite(edges).all():
-        raise ValueError(f"edges: expected finite float32 (K, 4), got {edges.dtype} {edges.shape}")
+    refuse_if(
+        edges.dtype != np.float32 or edges.shape != (edges.size // 4, 4) or not np.isfinite(edges).all(),
+        f"edges: expected finite float32 (K, 4), got {edges.dtype} {edges.shape}",
+        error=ValueError,
+    )
     return LostEdges(centers=edges[:, :3], radii=edges[:, 3])
 
 
 def _voxels(values: Array, name: str, kind: type[np.generic], header: Mapping[str, Any]) -> Array:
     wanted = (np.dtype(kind), tuple(header["shape"]))
-    if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
-        raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
+    refuse_if(
+        (values.dtype, values.shape) != wanted or len(values.shape) != 3,
+        f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}",
+        error=ValueError,
+    )
     return values
 
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import (
     SH_C0,
@@ -60,8 +60,9 @@ def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str])
 def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """Read a ``.splat``, without comments. Raises InputError if truncated or invalid."""
     content = read_bytes(path)
-    if len(content) % ROW.itemsize:
-        raise InputError(f"{path}: expected a multiple of 32 bytes, one row per splat, got {len(content)}")
+    refuse_if(
+        len(content) % ROW.itemsize, f"{path}: expected a multiple of 32 bytes, one row per splat, got {len(content)}"
+    )
     rows = np.frombuffer(content, dtype=ROW)
     check_finite(str(path), len(rows), {"center": rows["center"], "sigma": rows["sigma"]})
     quats = (rows["quat_wxyz"].astype(np.float64) - 128.0) / 128.0
@@ -191,21 +192,27 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
 
 def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
     """Number of Gaussians, fraction bits, bytes per attribute; size: the file's."""
-    if len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC:
-        raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}")
+    refuse_if(
+        len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC,
+        f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}",
+    )
     _, version, num, degree, bits, flags, _ = HEADER.unpack_from(head)
     if version not in versions:
         known = "2 or 3 in gzip and 4 in plain"
         raise InputError(f"{path}: .spz version: expected {known}, got {version}", remedy="write it as version 3")
-    if degree > 3 or bits > 23:
-        raise InputError(f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}")
-    if flags & ~WAS_ANTIALIASED:
-        raise InputError(
-            f"{path}: has vendor extensions (flags {flags:#x}), expected none", remedy="write it without them"
-        )
+    refuse_if(
+        degree > 3 or bits > 23, f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}"
+    )
+    refuse_if(
+        flags & ~WAS_ANTIALIASED,
+        f"{path}: has vendor extensions (flags {flags:#x}), expected none",
+        remedy="write it without them",
+    )
     widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
-    if num * sum(widths) > FREE_BYTES + SPZ_RATIO * size:
-        raise InputError(f"{path}: announces {num} splats, more than a file of {size} bytes holds")
+    refuse_if(
+        num * sum(widths) > FREE_BYTES + SPZ_RATIO * size,
+        f"{path}: announces {num} splats, more than a file of {size} bytes holds",
+    )
     return num, bits, widths
 
 
@@ -233,17 +240,19 @@ def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], by
 def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
     num_streams, place = content[HEADER.size - 1], int.from_bytes(content[HEADER.size : HEADER.size + 4], "little")
     start = place + 16 * num_streams
-    if num_streams not in (len(sizes), 5 if sizes[5] == 0 else 6) or not PLAIN_HEADER <= place <= len(content) - 16:
-        raise InputError(f"{path}: .spz version 4: expected 6 streams after {PLAIN_HEADER} bytes, got {num_streams}")
+    refuse_if(
+        num_streams not in (len(sizes), 5 if sizes[5] == 0 else 6) or not PLAIN_HEADER <= place <= len(content) - 16,
+        f"{path}: .spz version 4: expected 6 streams after {PLAIN_HEADER} bytes, got {num_streams}",
+    )
     table = np.frombuffer(content[place:start].ljust(16 * num_streams, b"\0"), "<u8").reshape(-1, 2).tolist()
-    if (expected := start + sum(packed for packed, _ in table)) != len(content):
-        raise InputError(
-            f"{path}: expected {expected} bytes, got {len(content)}", remedy="copy or write the file again"
-        )
+    refuse_if(
+        (expected := start + sum(packed for packed, _ in table)) != len(content),
+        f"{path}: expected {expected} bytes, got {len(content)}",
+        remedy="copy or write the file again",
+    )
     parts = [b""] * len(sizes)
     for index, (packed, size) in enumerate(table):
-        if size != sizes[index]:
-            raise InputError(f"{path}: stream {index}: expected {sizes[index]} bytes unpacked, got {size}")
+        refuse_if(size != sizes[index], f"{path}: stream {index}: expected {sizes[index]} bytes unpacked, got {size}")
         with refuse_faults(f"{path}: stream {index}", BadBlockError, remedy="copy or write the file again"):
             parts[index] = unpacked(content[start : start + packed], "zstd", size, size)
         start += packed
@@ -256,8 +265,7 @@ def _fraction_bits(centers: Float32) -> int:
     bits = FRACTION_BITS
     while largest * 2.0**bits > 2**23 - 1:
         bits -= 1
-    if bits < 0:
-        raise InputError(f".spz: expected coordinates up to 8388 km, got {largest:g} m")
+    refuse_if(bits < 0, f".spz: expected coordinates up to 8388 km, got {largest:g} m")
     return bits
 
 

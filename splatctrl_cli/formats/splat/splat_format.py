@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.records import Array, Bool, Float32, Float64, Floats, GaussianSet
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
@@ -57,8 +57,7 @@ def refuse(where: str, name: str, values: Array, is_bad: Bool, expected: str) ->
 def check_finite(where: str, num: int, groups: Mapping[str, Array]) -> None:
     """Raise InputError at the first non-finite value, or for an array without `num` rows."""
     for name, values in groups.items():
-        if len(values) != num:
-            raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")
+        refuse_if(len(values) != num, f"{where}: {name}: expected {num} values, got {len(values)}")
         is_finite = np.isfinite(values.reshape(num, -1 if num else 1)).all(axis=1)
         refuse(where, name, values, np.asarray(~is_finite), "finite")
 

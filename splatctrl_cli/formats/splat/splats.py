@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.ply import PlyFile, read_table, write_table
 from splatctrl_cli.formats.splat.gaussian_ply import (
@@ -69,12 +69,12 @@ def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
     """Convert round Gaussians. Raises InputError counting stretched and view-dependent ones."""
     num_stretched = int(np.count_nonzero(_is_stretched(gaussians)))
     num_coloured = int(np.count_nonzero(gaussians.harmonics[:, 1:].any(axis=(1, 2))))
-    if num_stretched or num_coloured:
-        raise InputError(
-            f"{where}: expected isotropic splats, got {num_stretched} of {len(gaussians)} whose scales differ and "
-            f"{num_coloured} whose colour depends on the view",
-            remedy="'splatctrl export --isotropic' writes the nearest isotropic set",
-        )
+    refuse_if(
+        num_stretched or num_coloured,
+        f"{where}: expected isotropic splats, got {num_stretched} of {len(gaussians)} whose scales differ and "
+        f"{num_coloured} whose colour depends on the view",
+        remedy="'splatctrl export --isotropic' writes the nearest isotropic set",
+    )
     return _round_splats(gaussians, gaussians.scales[:, 0])
 
 
@@ -137,27 +137,30 @@ def check_world(path: Path, comments: Mapping[str, str]) -> None:
     check_no_shell(path, comments)
     for key, known in (("units", METRES), ("frame", ("world",))):
         said = comments.get(key)
-        if said is not None and said.lower() not in known:
-            raise InputError(
-                f"{path}: comment '{key}: {said}': expected {known[0]}",
-                remedy="distances are in metres in the world: transform the splats, and correct the comment",
-            )
+        refuse_if(
+            said is not None and said.lower() not in known,
+            f"{path}: comment '{key}: {said}': expected {known[0]}",
+            remedy="distances are in metres in the world: transform the splats, and correct the comment",
+        )
 
 
 def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
     """Raise InputError for a shell, which is only rendered."""
-    if SHELL.keys() & comments.keys():
-        raise InputError(
-            f"{path}: the shell beyond the robot's reach, which is rendered only and has no distances",
-            remedy="give the scene's folder, or its splats.ply",
-        )
+    refuse_if(
+        SHELL.keys() & comments.keys(),
+        f"{path}: the shell beyond the robot's reach, which is rendered only and has no distances",
+        remedy="give the scene's folder, or its splats.ply",
+    )
 
 
 def read_shell(path: Path) -> SplatSet:
     """Read a shell. Raises as `read_ply`, and InputError for other splats."""
     splats, comments = read_ply(path)
-    if not SHELL.keys() <= comments.keys():
-        raise InputError(f"{path}: expected a shell, got other splats", remedy="reconstruct the scene again")
+    refuse_if(
+        not SHELL.keys() <= comments.keys(),
+        f"{path}: expected a shell, got other splats",
+        remedy="reconstruct the scene again",
+    )
     return splats
 
 
@@ -208,10 +211,8 @@ FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(_
 
 def format_of(path: Path) -> SplatFormat:
     """The suffix's format, PLY without one. Raises UsageError if unknown."""
-    found = FORMATS.get(path.suffix.lower() or ".ply")
-    if found is None:
-        raise UsageError(f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}")
-    return found
+    said = f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}"
+    return require(FORMATS.get(path.suffix.lower() or ".ply"), said, error=UsageError)
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
