@@ -149,7 +149,7 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
             if not unseen:
                 break
     changes: list[Correction | Perturbation | None] = [correction, perturbation]
-    for change in filter(None, changes):
+    for change in (change for change in changes if change is not None):
         source = ChangedSource(source, change, round(options.pose_tolerance_s * SECOND_NS))
     return source
 

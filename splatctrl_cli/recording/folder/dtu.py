@@ -64,13 +64,13 @@ def read_dtu(
     quarter). Depth of another size is sampled, not blended; a smaller one sets only the pixels it was made for. Drops
     views without depth. Raises InputError naming the file.
     """
-    scan, folder = chosen_scan(root, scan_folders(root), scan)
+    scan, folder = choose_scan(root, scan_folders(root), scan)
 
     def camera(number: int, size: tuple[int, int]) -> tuple[Intrinsics, Float64]:
         path = _camera_file(root, number)
         K, T_camera_world, _ = read_camera_file(path)
         T_camera_world[:3, 3] /= MILLIMETRES
-        return fitted_intrinsics(K, size, path), invert_transform(T_camera_world)
+        return fit_intrinsics(K, size, path), invert_transform(T_camera_world)
 
     found = read_views(
         scan,
@@ -90,14 +90,12 @@ def read_dtu(
     return replace(found, files=(*found.files, *(_camera_file(root, number) for number in found.numbers)))
 
 
-def chosen_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tuple[str, Path]:
+def choose_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tuple[str, Path]:
     """The scan of that name, or the only one. Raises InputError with the choices."""
-    if scan is None and len(folders) == 1:
-        scan = next(iter(folders))
-    if scan is None or scan not in folders:
-        got = "several scans" if scan is None else f"no scan '{scan}'"
-        raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(folders) or 'none is there'}")
-    return scan, folders[scan]
+    name = next(iter(folders)) if scan is None and len(folders) == 1 else scan or ""
+    got = "several scans" if scan is None else f"no scan '{scan}'"
+    remedy = f"give --scan, one of: {', '.join(folders) or 'none is there'}"
+    return name, require(folders.get(name), f"{root}: {got}", remedy=remedy)
 
 
 def read_views(
@@ -240,21 +238,16 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
 
 def _mask_file(folder: Path, number: int) -> Path:
     """``007.png`` or the like in the folder (RegNeRF) or ``mask`` (IDR)."""
-    for place in (folder, folder / "mask"):
-        for path in sorted(place.glob("*.png")):
-            if path.stem.isdecimal() and int(path.stem) == number:
-                return path
-    raise InputError(
-        f"{folder}: expected a mask {number:03d}.png, got none", remedy="give the folder of this scan's masks"
-    )
+    files = (path for place in (folder, folder / "mask") for path in sorted(place.glob("*.png")))
+    found = next((path for path in files if path.stem.isdecimal() and int(path.stem) == number), None)
+    missing = f"{folder}: expected a mask {number:03d}.png, got none"
+    return require(found, missing, remedy="give the folder of this scan's masks")
 
 
 def _camera_file(root: Path, number: int) -> Path:
     candidates = [root / "Cameras" / part / f"{number:08d}_cam.txt" for part in ("train", ".")]
-    for path in candidates:
-        if path.is_file():
-            return path
-    raise InputError(f"{candidates[-1]}: missing", remedy="every image needs its camera file")
+    found = next(filter(Path.is_file, candidates), None)
+    return require(found, f"{candidates[-1]}: missing", remedy="every image needs its camera file")
 
 
 def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
@@ -279,41 +272,35 @@ def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
     return K, extrinsic, nearest
 
 
-def fitted_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
+def fit_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     """Fit K to an image of `size` (width, height), whichever common size it is for.
 
     Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves it to (u + 0.5) scale -
-    0.5, as in `shrunk`. MVSNet's cameras for 640x512, and for a quarter, are instead multiples of those for 1600x1200
+    0.5, as in `shrink_view`. MVSNet's cameras for 640x512, and for a quarter, are instead multiples of those for 1600x1200
     (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders agree.
     """
     width, height = size
-    shift, crop = 0.0, (0, 0)
-    if _is_centered(K, width, height):
-        scale = 1.0
-    elif _is_centered(K, width / 4, height / 4):
-        scale = 4.0
-    elif _is_centered(K, *RAW) and size == CROPPED:
-        scale, crop = 0.5, CROP
-    elif _is_centered(K, *RAW) and width * RAW[1] == height * RAW[0]:
-        scale = width / RAW[0]
-        shift = 0.5 * scale - 0.5
-    else:
-        raise InputError(
-            f"{path}: principal point ({K[0, 2]:g}, {K[1, 2]:g}) fits no image of {width}x{height}, nor a quarter of "
-            f"it, nor 1600x1200"
-        )
-    return Intrinsics(
-        fx=float(K[0, 0] * scale),
-        fy=float(K[1, 1] * scale),
-        cx=float(K[0, 2] * scale + shift - crop[0]),
-        cy=float(K[1, 2] * scale + shift - crop[1]),
-        width=width,
-        height=height,
+    ratio = width / RAW[0]
+    sizes: list[tuple[float, float, float, float, tuple[int, int]]] = [  # columns, rows, scale, shift, crop
+        (width, height, 1.0, 0.0, (0, 0)),
+        (width / 4, height / 4, 4.0, 0.0, (0, 0)),
+        *([(*RAW, 0.5, 0.0, CROP)] if size == CROPPED else []),
+        *([(*RAW, ratio, 0.5 * ratio - 0.5, (0, 0))] if width * RAW[1] == height * RAW[0] else []),
+    ]
+    for columns, rows, scale, shift, crop in sizes:
+        if abs(K[0, 2] / columns - 0.5) < 0.1 and abs(K[1, 2] / rows - 0.5) < 0.1:
+            return Intrinsics(
+                fx=float(K[0, 0] * scale),
+                fy=float(K[1, 1] * scale),
+                cx=float(K[0, 2] * scale + shift - crop[0]),
+                cy=float(K[1, 2] * scale + shift - crop[1]),
+                width=width,
+                height=height,
+            )
+    raise InputError(
+        f"{path}: principal point ({K[0, 2]:g}, {K[1, 2]:g}) fits no image of {width}x{height}, nor a quarter of it,"
+        f" nor 1600x1200"
     )
-
-
-def _is_centered(K: Float64, width: float, height: float) -> bool:
-    return bool(abs(K[0, 2] / width - 0.5) < 0.1 and abs(K[1, 2] / height - 0.5) < 0.1)
 
 
 def _depth_file(root: Path, scan: str, number: int) -> Path | None:

@@ -20,8 +20,7 @@ HOLDOUT_CAMERA = "holdout"
 def view_numbers(words: Sequence[str]) -> list[int]:
     """Parse view numbers such as ``2`` and ``5``. Raises UsageError for other words."""
     bad = [word for word in words if not word.isdigit()]
-    if bad:
-        raise UsageError(f"--holdout: expected view numbers such as 2,5, got {bad[0]!r}")
+    refuse_if(bad, f"--holdout: expected view numbers such as 2,5, got {''.join(bad[:1])!r}", error=UsageError)
     return [int(word) for word in words]
 
 
@@ -54,7 +53,7 @@ class DtuSource:
             scan,
             masks,
             depths,
-            lambda view: shrunk(view, _factor(view, protocol) if downscale is None else downscale),
+            lambda view: shrink_view(view, _factor(view, protocol) if downscale is None else downscale),
         )
         self.scan, self.name = found.name, f"{root.name}/{found.name}"
         self._files = found.files
@@ -119,7 +118,7 @@ class DtuSource:
         }
 
 
-def shrunk(view: DtuView, factor: int) -> DtuView:
+def shrink_view(view: DtuView, factor: int) -> DtuView:
     """Merge every `factor` x `factor` pixels: mean colour, the middle's depth, the first's mask.
 
     Colour and mask follow RegNeRF (regnerf/internal/datasets.py, downsample). Pixel (0, 0) has its centre at (0, 0):
@@ -164,8 +163,12 @@ def _factor(view: DtuView, protocol: ScoreProtocol | None) -> int:
 
 def _held_out(numbers: tuple[int, ...], holdout: frozenset[int], root: Path) -> Split:
     outside = sorted(holdout - set(numbers))
-    if outside:
-        raise UsageError(f"--holdout {outside[0]}: {root} has no such view", remedy=f"views: {_span(numbers)}")
+    refuse_if(
+        outside,
+        f"--holdout {min(outside, default=0)}: {root} has no such view",
+        remedy=f"views: {_span(numbers)}",
+        error=UsageError,
+    )
     refuse_if(
         holdout and len(holdout) == len(numbers),
         f"--holdout: all {len(numbers)} views of {root} are held out",

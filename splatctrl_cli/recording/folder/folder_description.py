@@ -110,21 +110,16 @@ class ImagePart:
         """The file's name with the number."""
         return f"{self.file.name}#{self.number}"
 
-    def is_file(self) -> bool:
-        return self.file.is_file()
-
-    def absolute(self) -> Path:
-        return self.file.absolute()
-
-    def relative_to(self, root: Path) -> Path:
-        """The whole file, from a folder."""
-        return self.file.relative_to(root)
-
     def __str__(self) -> str:
         return str(self.file.with_name(self.name))
 
 
 ImageFile = Path | ImagePart
+
+
+def whole_file(image: ImageFile) -> Path:
+    """The file that an image is, or is a part of."""
+    return image.file if isinstance(image, ImagePart) else image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,15 +275,13 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         stamps=_optional(StampsTable, content, "stamps", path) or StampsTable(),
         split=_optional(SplitTable, content, "split", path) or SplitTable(),
     )
-    choices: list[tuple[str, str, tuple[str, ...]]] = [
-        ("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
+    poses = description.poses
+    choices = [
+        *([] if poses is None else [("poses.format", poses.format, FORMATS)]),
+        *([] if poses is None else [("poses.convention", poses.convention, CONVENTIONS)]),
+        *([] if poses is None else [("poses.axes", poses.axes, AXES)]),
+        ("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS),
     ]
-    if (poses := description.poses) is not None:
-        choices[:0] = [
-            ("poses.format", poses.format, FORMATS),
-            ("poses.convention", poses.convention, CONVENTIONS),
-            ("poses.axes", poses.axes, AXES),
-        ]
     for key, value, allowed in choices:
         refuse_if(
             value not in allowed, f"{path}: {key}: expected one of {', '.join(allowed)}, got {value!r}", remedy=_HELP
@@ -301,7 +294,7 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         f"{path}: depth.scale: expected metres per count, got {description.depth.scale}",
         remedy=_HELP,
     )
-    if description.poses is None or description.poses.format != "nerfstudio":
+    if poses is None or poses.format != "nerfstudio":
         for name in ("camera", "frames"):
             refuse_if(getattr(description, name) is None, f"{path}: [{name}] is missing", remedy=_HELP)
     return description

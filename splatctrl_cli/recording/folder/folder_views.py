@@ -16,6 +16,7 @@ from splatctrl_cli.recording.folder.folder_description import (
     ImageFile,
     ListedView,
     PosesTable,
+    whole_file,
 )
 from splatctrl_cli.recording.folder.poses import (
     READERS,
@@ -51,7 +52,7 @@ class View:
     depth_scale: float
     valid: Path | None = None
 
-    def in_unit(self, metres: float) -> "View":
+    def convert(self, metres: float) -> "View":
         """Scale pose and depth to metres; metres: per length of the recording."""
         T = self.T_world_camera.copy()
         T[:3, 3] *= metres
@@ -130,7 +131,7 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
     """Keep views with files; others count as unpaired. Raises InputError for a file outside."""
     root, present, absent = description.root.absolute(), [], []
     for view in description.listed:
-        files = [path for path in (view.color, view.depth, view.valid) if path is not None]
+        files = [whole_file(path) for path in (view.color, view.depth, view.valid) if path is not None]
         for path in files:
             refuse_if(
                 not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)),
@@ -140,8 +141,12 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
         missing = [path for path in files if not path.is_file()]
         absent += missing[:1]
         present += [] if missing else [view]
-        loss.unpaired_color += view.depth in missing and view.color not in missing
-        loss.unpaired_depth += view.color in missing and view.depth not in missing
+        has_color, has_depth = (
+            whole_file(view.color) not in missing,
+            view.depth is None or whole_file(view.depth) not in missing,
+        )
+        loss.unpaired_color += has_color and not has_depth
+        loss.unpaired_depth += has_depth and not has_color
     if absent:
         loss.notes.append(f"{len(absent)} of {len(description.listed)} views lack a file ({absent[0]}, ...)")
     if not present:

@@ -23,7 +23,7 @@ from splatctrl_cli.recording.folder.dtu import (
     DtuView,
     Shrink,
     check_lengths,
-    chosen_scan,
+    choose_scan,
     read_views,
     write_png,
 )
@@ -35,12 +35,9 @@ PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
 
 def idr_scans(root: Path) -> dict[str, Path]:
     """Scan folders by name: `root`, or its children."""
-    folders = [root] if is_idr(root) else sorted(p for p in root.glob("*") if is_idr(p))
-    return {path.name.removeprefix("dtu_"): path for path in folders}
-
-
-def is_idr(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in CAMERAS)
+    folders = (root, *sorted(root.glob("*")))
+    scans = [path for path in folders if any((path / name).is_file() for name in CAMERAS)]
+    return {path.name.removeprefix("dtu_"): path for path in (scans[:1] if root in scans else scans)}
 
 
 def read_idr(
@@ -50,7 +47,7 @@ def read_idr(
 
     `shrink` maps each view. A view without a depth map has depth 0. Raises InputError naming the file.
     """
-    scan, folder = chosen_scan(root, idr_scans(root), scan)
+    scan, folder = choose_scan(root, idr_scans(root), scan)
     path = next(folder / name for name in CAMERAS if (folder / name).is_file())
     projections = _projections(path)
     images = _numbered(folder / "image", len(projections))

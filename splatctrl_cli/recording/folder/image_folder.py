@@ -29,6 +29,7 @@ from splatctrl_cli.recording.folder.folder_description import (
     ImageFile,
     read_description,
     read_rig,
+    whole_file,
 )
 from splatctrl_cli.recording.folder.folder_views import UNITS, View, find_files, length_unit, views_of
 from splatctrl_cli.recording.folder.idr import idr_scans
@@ -118,7 +119,7 @@ class ImageFolderSource(FrameSource):
             unit = length_unit(median, apart)
             if unit == 1.0:
                 return ""
-            self._views = [view.in_unit(unit) for view in self._views]
+            self._views = [view.convert(unit) for view in self._views]
             words = (
                 f"lengths are taken as {UNITS[unit]}: the median depth is {median:.4g}, and the cameras are up to"
                 f" {apart:.4g} apart"
@@ -159,7 +160,7 @@ class ImageFolderSource(FrameSource):
             lens = None if len(self._descriptions) == 1 else description.camera
             views = [view for view in self._views if lens is None or view.lens == lens]
             of_views = ((view.color, view.depth, view.human, view.valid) for view in views)
-            files = [path for paths in of_views for path in paths if path is not None]
+            files = [whole_file(path) for paths in of_views for path in paths if path is not None]
             if description.poses is not None:
                 files.extend(path for _, path in find_files(description.root, description.poses.file))
             named = {str(path.relative_to(description.root)): path.absolute() for path in files}

@@ -29,7 +29,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
 from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.geometry import invert_transform, pose_at
-from splatctrl_cli.recording.folder.dtu import fitted_intrinsics, read_camera_file
+from splatctrl_cli.recording.folder.dtu import fit_intrinsics, read_camera_file
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     DepthTable,
@@ -40,13 +40,13 @@ from splatctrl_cli.recording.folder.folder_description import (
 from splatctrl_cli.recording.folder.layout import (
     CAMERA,
     Layout,
-    Pairs,
-    described,
+    add_lens,
+    describe,
+    find_marks,
     image_size,
     images_of,
-    marked,
-    named_lens,
-    paired_by_stamp,
+    list_views,
+    pair_stamps,
     read_json,
 )
 from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, read_rows, stamp_of_text
@@ -62,21 +62,16 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
     root = _frames(folder)
     assert root is not None
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
-    pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, Trajectory(_poses(root / TRAJECTORY)).at, options)
+    pairs = pair_stamps(root / TRAJECTORY, colors, depths, Trajectory(_poses(root / TRAJECTORY)).at, options)
     lenses: list[CameraTable] = []
     pincams = {
         stamp: path
         for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))
         if (stamp := _stamp_ns(path))
     }
-    return described(
-        replace(
-            pairs,
-            views=[
-                replace(view, camera=named_lens(lenses, _arkit_lens(pincams, view), str(root)))
-                for view in pairs.views
-            ],
-        ),
+    views = (replace(v, camera=add_lens(lenses, _arkit_lens(pincams, v), str(root))) for v in pairs.listed)
+    return describe(
+        replace(pairs, listed=tuple(views)),
         root,
         options,
         poses=PosesTable(format="rotation-vectors", file=TRAJECTORY),
@@ -153,8 +148,8 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
         files.append(path)
         num_colors, num_depths = num_colors + len(colors), num_depths + len(depths)
     name = FILE if len(files) == 1 else f"{Path(FILE).stem}*.json"
-    return described(
-        Pairs(path=files[0], views=views, unpaired=(num_colors - len(views), num_depths - len(views))),
+    return describe(
+        list_views(files[0], views, num_colors, num_depths),
         folder,
         options,
         poses=PosesTable(format="bop", file=files[0].name if len(files) == 1 else name, convention="world_to_camera"),
@@ -198,7 +193,7 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
                 color=color,
                 depth=depths[name],
                 matrix=_pose(entry),
-                camera=named_lens(lenses, lens, where),
+                camera=add_lens(lenses, lens, where),
                 depth_scale=float(entry["depth_scale"]) * MILLIMETRE,
             )
         views.append(view)
@@ -242,13 +237,13 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
         (K, T_camera_world, _), depth = cameras[stem], depths.get(int(stem) if stem.isdigit() else -1)
         if depth is None and depths:
             continue
-        k = fitted_intrinsics(K, image_size(color), files[stem])
+        k = fit_intrinsics(K, image_size(color), files[stem])
         T_camera_world[:3, 3] *= unit
         lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
-        lens = named_lens(lenses, lens, str(files[stem]))
+        lens = add_lens(lenses, lens, str(files[stem]))
         views.append(ListedView(name=stem, color=color, depth=depth, matrix=T_camera_world, camera=lens))
-    return described(
-        Pairs(path=folder, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views))),
+    return describe(
+        list_views(folder, views, len(colors), len(depths)),
         folder,
         options,
         poses=PosesTable(format="matrix-files", file=_CAMERAS, convention="world_to_camera"),
@@ -313,7 +308,7 @@ BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1
     Layout(
         name="MVSNet scene",
         order=10,
-        matches=marked(_CAMERAS),
+        matches=find_marks(_CAMERAS),
         read=read_mvsnet,
         docs="""
 MVSNet scene (DTU, BlendedMVS, Tanks and Temples, colmap2mvsnet) | `cams/*_cam.txt`, images | world to camera |

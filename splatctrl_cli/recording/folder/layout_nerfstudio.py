@@ -14,7 +14,7 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.recording.folder.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.recording.folder.layout import Layout, image_size, marked, named_lens
+from splatctrl_cli.recording.folder.layout import Layout, add_lens, find_marks, image_size
 from splatctrl_cli.recording.folder.poses import read_nerfstudio
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -52,11 +52,11 @@ def with_transforms(description: Description) -> Description:
     views = [_view(content, entry, path, lenses, description, matrices) for entry in content["frames"]]
     refuse_if(not views, f"{path}: no frames", remedy="give a transforms.json with frames")
     bare = [view.name for view in views if view.depth is None]
-    if bare and len(bare) < len(views):
-        raise InputError(
-            f"{path}: {bare[0]}: depth_file_path is missing ({len(bare)} of {len(views)} frames)",
-            remedy="add it, or leave the frame out",
-        )
+    refuse_if(
+        0 < len(bare) < len(views),
+        f"{path}: {''.join(bare[:1])}: depth_file_path is missing ({len(bare)} of {len(views)} frames)",
+        remedy="add it, or leave the frame out",
+    )
     if description.frames is not None:
         refuse_if(
             len(lenses) > 1,
@@ -106,7 +106,7 @@ def _view(
         color=color,
         depth=None if depth is None else path.parent / str(depth).replace("\\", "/"),
         matrix=matrix,
-        camera=description.camera or named_lens(lenses, _camera(said, color, path), str(path)),
+        camera=description.camera or add_lens(lenses, _camera(said, color, path), str(path)),
         depth_scale=unit,
         valid=None if not mask else path.parent / str(mask).replace("\\", "/"),
     )
@@ -115,17 +115,15 @@ def _view(
 def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
     """The value of any key, or None. Raises InputError if two differ."""
     found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
-    if len(set(found.values())) > 1:
-        both = " and ".join(f"{key} = {value}" for key, value in found.items())
-        raise InputError(f"{path}: {both} differ", remedy="leave one of them out")
+    both = " and ".join(f"{key} = {value}" for key, value in found.items())
+    refuse_if(len(set(found.values())) > 1, f"{path}: {both} differ", remedy="leave one of them out")
     return next(iter(found.values()), None)
 
 
 def _image(path: Path) -> Path:
     """An image whose name may omit `.png` or `.jpg`, as in Blender's scenes."""
-    if path.suffix:
-        return path
-    return next((file for end in (".png", ".jpg") if (file := path.with_name(path.name + end)).is_file()), path)
+    ends = () if path.suffix else (".png", ".jpg")
+    return next((file for end in ends if (file := path.with_name(path.name + end)).is_file()), path)
 
 
 def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
@@ -174,7 +172,7 @@ ENTRIES = (
     Layout(
         name="nerfstudio",
         order=4,
-        matches=marked(*FILES),
+        matches=find_marks(*FILES),
         read=read,
         docs="""
 nerfstudio, instant-ngp, Blender | `transforms.json` or `transforms_train.json`, `depth_file_path` or `depth_path` |

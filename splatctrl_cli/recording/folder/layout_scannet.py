@@ -31,10 +31,11 @@ from splatctrl_cli.recording.folder.folder_description import (
 )
 from splatctrl_cli.recording.folder.layout import (
     Layout,
-    Pairs,
-    described,
-    given_lens,
-    marked,
+    describe,
+    find_marks,
+    lens_option,
+    list_views,
+    move_poses,
     own_depth_camera,
     pinhole,
     pose_or_none,
@@ -86,10 +87,10 @@ def read_sens(path: Path, options: SourceOptions) -> Description:
     missing = sens.num_frames - len(frames)
     color, depth = frames[0].color, frames[0].depth
     assert depth is not None
-    lens = given_lens(options, color) or _lens(sens.color, color, f"{file} (colour)")
+    lens = lens_option(options, color) or _lens(sens.color, color, f"{file} (colour)")
     own = _lens(sens.depth, depth, f"{file} (depth)")
-    return described(
-        Pairs(path=file, views=views, unpaired=(0, 0)).moved(lambda T: T @ sens.T_base_color),
+    return describe(
+        move_poses(list_views(file, views, len(views), len(views)), lambda T: T @ sens.T_base_color),
         root,
         options,
         poses=PosesTable(format="sens", file=file.name),
@@ -206,7 +207,7 @@ ENTRIES = (
     Layout(
         name="ScanNet sensor file",
         order=11,
-        matches=marked(f"*{SUFFIX}"),
+        matches=find_marks(f"*{SUFFIX}"),
         read=read_sens,
         suffix=SUFFIX,
         docs="""

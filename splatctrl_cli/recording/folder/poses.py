@@ -11,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import POSE_TOLERANCE_NS
 from splatctrl_cli.config.ranges import MAX_PLACE
-from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.geometry import invert_transform, pose_at, quat_from_rotation, transform_from
 from splatctrl_cli.recording.log.registration import TfTree
 from splatctrl_cli.records import Float64
@@ -30,11 +30,9 @@ _CORRECT = "correct the file, or [poses] where a .toml names it"
 def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
     """T_world_camera (4, 4), optical, of a file's matrix. Raises InputError if not rigid."""
     T = rigid(matrix, where)
-    if convention == "world_to_camera":
-        T = invert_transform(T)
-    if axes == "left-handed":
-        return MIRROR @ T @ MIRROR
-    return T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
+    T = invert_transform(T) if convention == "world_to_camera" else T
+    T = T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
+    return MIRROR @ T @ MIRROR if axes == "left-handed" else T
 
 
 def rigid(matrix: Float64, where: str) -> Float64:
@@ -86,15 +84,14 @@ def tum_rows(path: Path) -> dict[str, Float64 | None]:
     """Read ``stamp tx ty tz qx qy qz qw`` by stamp [s]; None for NaN."""
     poses: dict[str, Float64 | None] = {}
     for where, words, values in read_rows(path):
-        if len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any():
-            poses[words[0]] = None
-            continue
-        is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_PLACE).all())
-        if not is_pose or not any(values[4:]):
-            raise InputError(
-                f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}", remedy=_CORRECT
-            )
-        poses[words[0]] = transform_from(values[1:4], values[4:8])
+        is_lost = len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any()
+        is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_PLACE).all()) and any(values[4:])
+        refuse_if(
+            not is_lost and not is_pose,
+            f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}",
+            remedy=_CORRECT,
+        )
+        poses[words[0]] = None if is_lost else transform_from(values[1:4], values[4:8])
     return poses
 
 
@@ -102,10 +99,11 @@ def read_matrix_lines(path: Path) -> dict[str, Float64]:
     """A 4x4 or 3x4 (KITTI) matrix per line, by number from 0."""
     poses: dict[str, Float64] = {}
     for where, _, values in read_rows(path):
-        if len(values) not in {12, 16}:
-            raise InputError(
-                f"{where}: expected the 16 or 12 numbers of a matrix, got {len(values)}", remedy=_CORRECT
-            )
+        refuse_if(
+            len(values) not in {12, 16},
+            f"{where}: expected the 16 or 12 numbers of a matrix, got {len(values)}",
+            remedy=_CORRECT,
+        )
         poses[str(len(poses))] = np.array([*values, 0.0, 0.0, 0.0, 1.0][:16]).reshape(4, 4)
     return poses
 
@@ -185,12 +183,11 @@ READERS: dict[str, Callable[[Path], dict[str, Float64]]] = {
 
 
 def _lines(path: Path) -> list[str]:
-    try:
+    with (
+        refuse_faults(lambda error: f"{path}: {error.strerror}", OSError, remedy="check [poses] file and root"),
+        refuse_faults(lambda _: f"{path}: not a text file", UnicodeDecodeError, remedy="check [poses] file"),
+    ):
         return [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}", remedy="check [poses] file and root") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file", remedy="check [poses] file") from None
 
 
 def _matrix(lines: list[str], where: str) -> Float64:
@@ -202,7 +199,5 @@ def _matrix(lines: list[str], where: str) -> Float64:
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
-    try:
+    with refuse_faults(lambda _: f"{where}: expected numbers, got {' '.join(words)!r}", ValueError, remedy=_CORRECT):
         return [np.nan if _MSVC_NAN.fullmatch(word) else float(word) for word in words]
-    except ValueError:
-        raise InputError(f"{where}: expected numbers, got {' '.join(words)!r}", remedy=_CORRECT) from None
