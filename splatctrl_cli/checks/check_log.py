@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import chain
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -217,12 +218,12 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
         own, target = strided_lens(camera.depth_lens.intrinsics, kept.stride), strided_lens(camera.intrinsics, stride)
         depth = warp_depth(depth, own, target, camera.T_color_depth)
     elif camera.maps is not None:
-        depth = camera.nearest(_enlarged(depth, kept))[::stride, ::stride]
+        depth = camera.remap(_enlarged(depth, kept))[::stride, ::stride]
     pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
     if color is not None and color.pixels.ndim == 3:
         pixels = color.pixels
         if camera.maps is not None:
-            pixels = camera.color(_enlarged(pixels, color))[:: color.stride, :: color.stride]
+            pixels = camera.remap(_enlarged(pixels, color), cv2.INTER_LINEAR)[:: color.stride, :: color.stride]
     if pixels.shape[:2] != depth.shape:
         pixels = np.zeros((*depth.shape, 3), np.uint8)
     return RgbdFrame(

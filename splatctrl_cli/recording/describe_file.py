@@ -196,23 +196,23 @@ def _short(value: object) -> object:
     return value
 
 
-def _suffix(describe: Callable[[Path, bytes], Summary], *suffixes: str) -> Callable[[Path, bytes], Summary | None]:
-    return lambda path, head: describe(path, head) if path.suffix.lower() in suffixes else None
-
-
-def _start(describe: Callable[[Path, bytes], Summary], *magics: bytes) -> Callable[[Path, bytes], Summary | None]:
-    return lambda path, head: describe(path, head) if head.startswith(magics) else None
+def _kind(
+    describe: Callable[[Path, bytes], Summary], starts: tuple[bytes, ...] = (), suffixes: tuple[str, ...] = ()
+) -> Callable[[Path, bytes], Summary | None]:
+    return lambda path, head: (
+        describe(path, head) if head.startswith(starts) or path.suffix.lower() in suffixes else None
+    )
 
 
 _KINDS: tuple[Callable[[Path, bytes], Summary | None], ...] = (
-    _start(_ply, b"ply\n", b"ply\r\n"),
-    _start(_npy, b"\x93NUMPY"),
-    _start(_image, b"\x89PNG", b"\xff\xd8\xff"),
+    _kind(_ply, (b"ply\n", b"ply\r\n")),
+    _kind(_npy, (b"\x93NUMPY",)),
+    _kind(_image, (b"\x89PNG", b"\xff\xd8\xff")),
     *(kind.describe for kind in GRID_FORMATS.values()),
-    _start(_npz, b"PK\x03\x04"),
-    _suffix(describe_splats, *(suffix for suffix in SPLAT_FORMATS if suffix != ".ply")),
-    _suffix(_urdf, ".urdf", ".xacro"),
-    _suffix(_json, ".json"),
-    _suffix(_rows, ".jsonl", ".csv"),
-    _suffix(_yaml, ".yaml", ".yml"),
+    _kind(_npz, (b"PK\x03\x04",)),
+    _kind(describe_splats, suffixes=tuple(suffix for suffix in SPLAT_FORMATS if suffix != ".ply")),
+    _kind(_urdf, suffixes=(".urdf", ".xacro")),
+    _kind(_json, suffixes=(".json",)),
+    _kind(_rows, suffixes=(".jsonl", ".csv")),
+    _kind(_yaml, suffixes=(".yaml", ".yml")),
 )

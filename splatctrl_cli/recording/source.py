@@ -59,8 +59,7 @@ def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth
     Raises InputError if missing, unusable, or without required depth.
     """
     options = options or SourceOptions()
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
     return calibrated(_opened(path, options, needs_depth=needs_depth), options)
 
 
@@ -111,8 +110,7 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
     Raises InputError if missing, or if one of several is no log.
     """
     for path in paths:
-        if not path.exists():
-            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+        refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
         if path.suffix == ".toml" or is_capture(path) or has_views(path):
             if len(paths) == 1:
                 return None
@@ -124,8 +122,7 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
 def describe(path: Path, options: SourceOptions | None = None) -> Summary:
     """Describe any input. Raises InputError if missing or unknown."""
     options = options or SourceOptions()
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
     if path.is_dir():
         return _describe_folder(path, options)
     with path.open("rb") as stream:
@@ -305,7 +302,7 @@ def _describe_capture(path: Path) -> Summary:
 
 def _describe_images(path: Path, source: ImageFolderSource, kind: str) -> Summary:
     first = next((item for item in source.stored() if isinstance(item, StoredFrame)), None)
-    counts = source.count_views()
+    counts = {name: sum(camera == name for _, camera, _ in source.poses()) for name in source.cameras}
     facts: dict[str, object] = {"has_clock": source.has_clock}
     if first is not None:
         valid = first.frame.depth > 0

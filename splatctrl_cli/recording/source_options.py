@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError, refuse_if
+from splatctrl_cli.errors import refuse_if
 
 CALIBRATION = "--calibration "  # begins the name of a calibration among the files that were read
 NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # of a distortion, that OpenCV takes
@@ -68,12 +68,14 @@ class SourceOptions:
         flags |= dict.fromkeys(["camera_poses", "camera_pose_topics"], "camera-pose")
         default = SourceOptions()
         for name in names:
-            if getattr(self, name) != getattr(default, name):
-                flag = flags.get(name, name.replace("_", "-"))
-                remedy = "leave it out"
-                if (name, kind) == ("holdout", "a capture"):
-                    remedy = "give it to `splatctrl ingest`, which makes a camera `holdout` of these views"
-                raise InputError(f"{path}: --{flag} does not apply to {kind}", remedy=remedy)
+            flag = flags.get(name, name.replace("_", "-"))
+            is_split = (name, kind) == ("holdout", "a capture")
+            ingest = "give it to `splatctrl ingest`, which makes a camera `holdout` of these views"
+            refuse_if(
+                getattr(self, name) != getattr(default, name),
+                f"{path}: --{flag} does not apply to {kind}",
+                remedy=ingest if is_split else "leave it out",
+            )
 
 
 def still_note(camera: str) -> str:

@@ -25,9 +25,8 @@ from splatctrl_cli.recording.log.stored_frame import (
     FrameSource,
     StoredFrame,
     human_mask,
+    merge_joints,
     read_topics,
-    with_joints,
-    without_joints,
 )
 from splatctrl_cli.recording.log.survey import RobotDescription, Survey
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions, refuse_unknown_cameras
@@ -255,7 +254,8 @@ class CaptureSource(FrameSource):
             found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
             chosen = options if options.joint_topic is not None else replace(options, joint_topic=kept.chosen)
             self.joint_names, self.states = joint_records(found, chosen, loss, joints)
-            self._loss = with_joints(without_joints(self._loss, kept.loss, kept.first_note), loss, kept.first_note)
+            bare = merge_joints(self._loss, kept.loss, kept.first_note, sign=-1)
+            self._loss = merge_joints(bare, loss, kept.first_note)
 
     @property
     def loss(self) -> LossReport:

@@ -20,6 +20,7 @@ from numpy.lib import format as npy
 from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import UsageError, WriteError, refuse_if
 from splatctrl_cli.files.output import sha256, write_json, write_table
+from splatctrl_cli.formats.image_file import PNG
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.capture.capture import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
 from splatctrl_cli.recording.log.messages import metres
@@ -29,7 +30,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     FrameSource,
     JointTopics,
     StoredFrame,
-    is_png,
+    is_kept,
     npy_bytes,
     write_rows,
     write_topics,
@@ -132,7 +133,7 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
 PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
-PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
+_FILTERED = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,7 +276,7 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
 def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
     stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
     color = stored.color_file or encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
-    color_name = f"color/{stored.camera}/{stem}.{'png' if is_png(color) else 'jpg'}"
+    color_name = f"color/{stored.camera}/{stem}.{'png' if is_kept(color, PNG) else 'jpg'}"
     kind, depth = _depth_file(stored, unit)
     depth_name = f"depth/{stored.camera}/{stem}.{kind}"
     files = {color_name: color, depth_name: depth}
@@ -330,7 +331,7 @@ def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, n
 
 def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
     """Encode an image as PNG."""
-    is_written, data = cv2.imencode(".png", pixels, PNG)
+    is_written, data = cv2.imencode(".png", pixels, _FILTERED)
     if not is_written:
         raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
     return bytes(data)

@@ -118,7 +118,7 @@ class McapLog(RawLog):
         self.files = (path,)
         self._file = McapFile(path)
         self._schemas: dict[int, Schema] = {}
-        self._topics: dict[int, Topic] = {}
+        self.channels: dict[int, Topic] = {}
         self._statistics: Statistics | None = None
         self._budget = Budget(self._file.size)
         self._whole: tuple[int, int] | None = None  # the file's state when a pass found all its checksums right
@@ -140,10 +140,6 @@ class McapLog(RawLog):
                     notes=(),
                 )
         return index_by_heads(self._file)
-
-    def topic_of(self, channel: int) -> Topic | None:
-        """A declared channel's topic, or None."""
-        return self._topics.get(channel)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.
@@ -223,7 +219,7 @@ class McapLog(RawLog):
             damage.add(f"{self.path.name}: a message record of {end - start} bytes")
             return None
         channel, _, log_time_ns, _ = _MESSAGE.unpack_from(records, start)
-        topic = self._topics.get(channel)
+        topic = self.channels.get(channel)
         if topic is None:
             damage.add(f"{self.path.name}: a message of undeclared channel {channel}")
             return None
@@ -246,7 +242,7 @@ class McapLog(RawLog):
         if isinstance(record, Schema):
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
-            self._topics[record.id] = _topic(record, self._schemas.get(record.schema_id))
+            self.channels[record.id] = _topic(record, self._schemas.get(record.schema_id))
         elif isinstance(record, Statistics):
             self._statistics = record
 

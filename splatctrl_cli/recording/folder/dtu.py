@@ -276,7 +276,7 @@ def fit_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     """Fit K to an image of `size` (width, height), whichever common size it is for.
 
     Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves it to (u + 0.5) scale -
-    0.5, as in `shrink_view`. MVSNet's cameras for 640x512, and for a quarter, are instead multiples of those for 1600x1200
+    0.5, as in `shrink_view`. MVSNet's cameras for 640x512, and for a quarter, are multiples of those for 1600x1200
     (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders agree.
     """
     width, height = size

@@ -19,7 +19,7 @@ from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.summary import names_in
 from splatctrl_cli.formats.arrays import DAMAGE, npy_of
-from splatctrl_cli.formats.image_file import decode_file, read_pfm
+from splatctrl_cli.formats.image_file import PNG, decode_file, read_pfm
 from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.recording.capture.capture_writer import check_not_partial
 from splatctrl_cli.recording.container.log_formats import SUFFIXES, is_bag_folder
@@ -43,7 +43,6 @@ from splatctrl_cli.recording.log.stored_frame import (
     check_depth,
     human_mask,
     is_kept,
-    is_png,
 )
 from splatctrl_cli.recording.source_options import SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.records import Bool, Float32, Float64, LossReport, UInt8
@@ -146,9 +145,6 @@ class ImageFolderSource(FrameSource):
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
 
-    def count_views(self) -> dict[str, int]:
-        return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
-
     def digests(self) -> dict[str, str]:
         """sha256 of description, pose files and images, by path below the root."""
         return dict(self._digests)
@@ -180,7 +176,7 @@ class ImageFolderSource(FrameSource):
             self._damaged.append(f"{broken}: not an image that can be read")
             return None
         _check_size(view.color, color, view.lens)
-        color = lens.color(np.asarray(color))
+        color = lens.remap(np.asarray(color), cv2.INTER_LINEAR)
         human = None if view.human is None else self._human(view.human, lens)
         valid = self._valid(view, lens)
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
@@ -214,7 +210,7 @@ class ImageFolderSource(FrameSource):
         ):
             return None
         data = view.depth.read_bytes()
-        return data if is_png(data) else None
+        return data if is_kept(data, PNG) else None
 
     def _lens(self, view: View) -> Lens:
         table, depth_camera = view.lens, self._description.depth_camera
@@ -241,7 +237,7 @@ class ImageFolderSource(FrameSource):
         if pixels is None:
             self._damaged.append(f"{path}: not an image that can be read")
             return None
-        return lens.nearest(human_mask(pixels, lens.intrinsics, str(path)))
+        return lens.remap(human_mask(pixels, lens.intrinsics, str(path)))
 
     def _depth(self, view: View, lens: Lens) -> Float32 | None:
         """(H, W) [m] at colour's pixels, 0 = no return; None if unreadable."""

@@ -28,13 +28,14 @@ from splatctrl_cli.recording.log.decoder import (
     is_ros,
     stamp_ns,
 )
-from splatctrl_cli.recording.log.messages import DEPTH, is_other, word_of
+from splatctrl_cli.recording.log.messages import DEPTH, GRAY, OTHERS, word_of
 from splatctrl_cli.recording.log.registration import is_distorted, lens_model
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.recording.log.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video
 from splatctrl_cli.recording.source_options import CameraTopics, PoseTopic, SourceOptions
 from splatctrl_cli.records import Float64
 
+_REGISTERED = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")  # in names of depth topics
 _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 
 
@@ -52,7 +53,7 @@ def _unlike(topic: TopicSurvey) -> str:
     image, parts = topic.image, _parts(topic.topic.name)
     if image.kind == "depth":
         word = word_of(parts) or word_of((image.frame_id,))
-        return word if is_other(word) else ""
+        return word if word in OTHERS else ""
     word = word_of(parts, is_device=False)
     return word if image.kind == "color" and word == DEPTH else ""
 
@@ -95,7 +96,7 @@ def _camera(
         [(depth, find_info(survey, depth, namespace)) for depth in depths],
         key=lambda item: (
             not is_registered(survey, color.topic.name, item[0].topic.name, info, item[1]),
-            not _says_registered(item[0].topic.name),
+            not any(word in item[0].topic.name for word in _REGISTERED),
             item[0].topic.type_name == COMPRESSED_IMAGE,
             item[0].topic.name,
         ),
@@ -143,12 +144,11 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
     """True if depth is on colour pixels: equal size, frame (or name), K and distortion."""
     color_image, depth_image = survey.topics[color].image, survey.topics[depth].image
-    if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
-        return False
+    is_other_size = (color_image.width, color_image.height) != (depth_image.width, depth_image.height)
     T_color_depth = survey.realsense.T_between(color, depth)
-    if T_color_depth is not None and not np.allclose(T_color_depth, np.eye(4), atol=1e-6):
-        return False
-    if frame_of(survey, color, depth) != depth_image.frame_id and not _says_registered(depth):
+    is_moved = T_color_depth is not None and not np.allclose(T_color_depth, np.eye(4), atol=1e-6)
+    is_other_frame = frame_of(survey, color, depth) != depth_image.frame_id
+    if is_other_size or is_moved or (is_other_frame and not any(word in depth for word in _REGISTERED)):
         return False
     calibration = survey.topics[info].calibration if info else None
     depth_calibration = survey.topics[depth_info].calibration if depth_info else None
@@ -181,14 +181,16 @@ def common_prefix(name: str, other: str) -> tuple[str, ...]:
     return tuple(a for a, _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def _says_registered(topic: str) -> bool:
-    return any(word in topic for word in ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb"))
-
-
 def _color_rank(topic: TopicSurvey) -> tuple[bool, bool, bool, bool, str]:
     name = topic.topic.name
     is_infrared = any(part.startswith(("infra", "ir")) for part in _parts(name))
-    return (topic.image.is_gray, is_infrared, "rect" not in name, topic.topic.type_name == COMPRESSED_IMAGE, name)
+    return (
+        topic.image.encoding in GRAY,
+        is_infrared,
+        "rect" not in name,
+        topic.topic.type_name == COMPRESSED_IMAGE,
+        name,
+    )
 
 
 def _parts(name: str) -> tuple[str, ...]:
@@ -201,18 +203,16 @@ def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
 
     Names are folders: other characters than letters, digits, ``_``, ``-``, ``.`` become ``_``.
     """
-    short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
-    long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
+    short, long = (
+        [re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:80] or "camera" for name in names]
+        for names in ([c.name.rpartition("/")[2] for c in cameras], [c.name.replace("/", "_") for c in cameras])
+    )
     names = [name if short.count(name) == 1 else long[i] for i, name in enumerate(short)]
     named = [
         replace(camera, name=name if names.count(name) == 1 else f"{name}_{i}")
         for i, (camera, name) in enumerate(zip(cameras, names, strict=True))
     ]
     return tuple(sorted(named, key=lambda camera: camera.name))
-
-
-def _folder_name(name: str) -> str:
-    return re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:80] or "camera"
 
 
 def no_camera(log: RawLog, survey: Survey) -> InputError:

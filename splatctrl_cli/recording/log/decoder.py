@@ -113,10 +113,9 @@ def header_stamp_ns(message: RawMessage) -> int:
         return stamp_ns(MessageDecoder().decode(message).header)
     start = 0 if message.topic.schema and message.topic.encoding == "ros1" else 4  # foxglove_msgs have no `seq`
     is_little = message.topic.encoding == "ros1" or message.data[1:2] in {b"\x01", b"\x03", b"\x07", b"\x09"}
-    try:
+    damage = f"{message.topic.name}: a message of {len(message.data)} bytes"
+    with refuse_faults(lambda _: damage, struct.error, error=UndecodableMessageError):
         seconds, nanoseconds = struct.unpack_from("<iI" if is_little else ">iI", message.data, start)
-    except struct.error:
-        raise UndecodableMessageError(f"{message.topic.name}: a message of {len(message.data)} bytes") from None
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 

@@ -16,11 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import refuse_faults, refuse_if
+from splatctrl_cli.errors import refuse_faults, refuse_if, require
 from splatctrl_cli.formats.image_file import JPEG, PNG, decode_file, image_head
 from splatctrl_cli.recording.log.decoder import IMAGE, UndecodableMessageError, UnreadFormError, stamp_ns
 from splatctrl_cli.records import MILLIMETRE, Float32, UInt8
 
+GRAY = frozenset({"mono8", "8UC1"})  # colour images of one channel
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 BAYER = {  # OpenCV names a pattern by the second row's second and third pixel
     "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
@@ -109,11 +110,6 @@ class ImageMessage:
         if self.encoding in DEPTH_ENCODINGS:
             return "depth"
         return "color" if self.encoding in COLOR_CONVERSIONS else "other"
-
-    @property
-    def is_gray(self) -> bool:
-        """True for a one-channel colour image."""
-        return self.encoding in {"mono8", "8UC1"}
 
     def unit(self, scale: float | None) -> float:
         """Metres per unit: `scale`, else 1 mm for counts, 1 m for floats (REP 118)."""
@@ -232,11 +228,9 @@ def _plain(packed: _Packed) -> tuple[str, tuple[int, int], bool] | None:
 
 
 def _decoded(packed: _Packed, *, color: bool) -> NDArray[Any]:
-    pixels = decode_file(packed.file, color=color)
-    if pixels is None:
-        what = f"compressed image ({packed.form}): {len(packed.file)} bytes that are not an image file"
-        raise (UndecodableMessageError if packed.file.startswith(_FILES) else UnreadFormError)(what)
-    return pixels
+    what = f"compressed image ({packed.form}): {len(packed.file)} bytes that are not an image file"
+    error = UndecodableMessageError if packed.file.startswith(_FILES) else UnreadFormError
+    return require(decode_file(packed.file, color=color), what, error=error)
 
 
 def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
@@ -434,15 +428,13 @@ def _numbers(data: bytes) -> NDArray[np.int64]:
         return np.zeros(0, dtype=np.int64)
     starts = np.concatenate([[0], ends[:-1] + 1])
     place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
-    refuse_if(
-        place.max() > 10, "RVL: a number of more than 33 bits", error=ValueError
-    )  # a number of more than 33 bits
+    refuse_if(place.max() > 10, "RVL: a number of more than 33 bits", error=ValueError)
     return np.asarray(np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << (3 * place), starts), dtype=np.int64)
 
 
 DEPTH = "depth"
 _COLORS = frozenset({"color", "colour", "rgb", "bgr"})
-_OTHERS = frozenset(
+OTHERS = frozenset(
     {
         *("ir", "infra", "infrared", "nir", "nearir", "swir", "lwir", "thermal", "aux", "mono", "gray", "grey"),
         *(
@@ -460,7 +452,7 @@ _OTHERS = frozenset(
         *("mask", "label", "labels", "segmentation", "semantic", "instance"),
     }
 )
-_WORDS = _OTHERS | _COLORS | {DEPTH}
+_WORDS = OTHERS | _COLORS | {DEPTH}
 _CAMERAS = frozenset({"camera", "cam"})  # words of parts that name a device, which may give more than depth
 
 
@@ -477,8 +469,3 @@ def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
         if found and (is_device or _CAMERAS.isdisjoint(words)):
             return DEPTH if found[-1].startswith(DEPTH) else found[-1]
     return ""
-
-
-def is_other(word: str) -> bool:
-    """True if 16-bit images so named are not depth."""
-    return word in _OTHERS

@@ -28,7 +28,7 @@ from splatctrl_cli.geometry import (
     transform_points,
 )
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics
 
 _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
@@ -193,6 +193,7 @@ class TfTree:
 
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+_SEPARATORS = re.compile("[^a-z0-9]")
 _SAME_MODELS = {  # lower case, letters and digits alone: what others call them
     **dict.fromkeys(("plumbbob", "brownconrady", "radtan", "opencv"), "plumb_bob"),
     **dict.fromkeys(("rationalpolynomial", "rational"), "rational_polynomial"),
@@ -205,17 +206,13 @@ _PINHOLES = ("", "none", "pinhole", "perspective", "rectilinear", "inversebrownc
 
 def lens_model(name: str) -> str:
     """One of `DISTORTION_MODELS` for a driver's name, else unchanged."""
-    return _SAME_MODELS.get(_letters(name), name)
+    return _SAME_MODELS.get(_SEPARATORS.sub("", name.lower()), name)
 
 
 def is_distorted(model: str, coefficients: Float64) -> bool:
     """False for a pinhole; equidistant and unknown models always distort."""
-    is_radial = lens_model(model) in DISTORTION_MODELS[:2] or _letters(model) in _PINHOLES
+    is_radial = lens_model(model) in DISTORTION_MODELS[:2] or _SEPARATORS.sub("", model.lower()) in _PINHOLES
     return not is_radial or bool(np.any(np.abs(coefficients) > 1e-9))
-
-
-def _letters(name: str) -> str:
-    return re.sub("[^a-z0-9]", "", name.lower())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -233,25 +230,18 @@ class Lens:
     depth_lens: "Lens | None" = None
     T_color_depth: Float64 | None = None
 
-    def color(self, image: UInt8) -> UInt8:
-        """Undistort (H, W, 3), interpolated."""
-        return self._remapped(image, cv2.INTER_LINEAR)
-
-    def nearest(self, image: NDArray[_Pixel]) -> NDArray[_Pixel]:
-        """Undistort labels or depth (H, W), nearest pixel."""
-        return self._remapped(image, cv2.INTER_NEAREST)
+    def remap(self, image: NDArray[_Pixel], interpolation: int = cv2.INTER_NEAREST) -> NDArray[_Pixel]:
+        """Undistort colour (H, W, 3), labels or depth (H, W)."""
+        if self.maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *self.maps, interpolation), dtype=image.dtype)
 
     def depth(self, image: Float32) -> Float32:
         """Map recorded depth [m] to colour's pixels (H, W)."""
         if self.depth_lens is None or self.T_color_depth is None:
-            return self.nearest(image)
-        depth = self.depth_lens.nearest(image)
+            return self.remap(image)
+        depth = self.depth_lens.remap(image)
         return warp_depth(depth, self.depth_lens.intrinsics, self.intrinsics, self.T_color_depth)
-
-    def _remapped(self, image: NDArray[_Pixel], interpolation: int) -> NDArray[_Pixel]:
-        if self.maps is None:
-            return image
-        return np.asarray(cv2.remap(image, *self.maps, interpolation), dtype=image.dtype)
 
 
 def warp_depth(depth: Float32, own: Intrinsics, target: Intrinsics, T_color_depth: Float64) -> Float32:

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import IMAGES_FEWEST_BACK
 from splatctrl_cli.errors import InputError, refuse_if, require
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.container.raw_log import RawLog
@@ -24,6 +25,7 @@ from splatctrl_cli.recording.log.cameras import (
     pose_topics,
 )
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from splatctrl_cli.recording.log.messages import GRAY
 from splatctrl_cli.recording.log.registration import (
     DISTORTION_MODELS,
     Lens,
@@ -258,16 +260,19 @@ class _Builder:
             expected = size
         by_hand = f", or give --intrinsics {self._topics.name}=FX,FY,CX,CY of the recorded images"
         remedy = f"name the right CameraInfo with --camera{by_hand if calibration.cut else ''}"
-        if not calibration.is_possible:
-            what = f"{info} says {calibration.cut}, which it is not inside of, for images of {size[0]}x{size[1]}"
-            raise InputError(f"{self._where}: topic {image_topic}: {what}", remedy=remedy)
-        if size != expected:
-            cut = f" ({calibration.cut})" if calibration.cut else ""
-            raise InputError(
-                f"{self._where}: topic {image_topic}: expected {expected[0]}x{expected[1]} images as {info}"
-                f" says{cut}, got {size[0]}x{size[1]}",
-                remedy=remedy,
-            )
+        refuse_if(
+            not calibration.is_possible,
+            f"{self._where}: topic {image_topic}: {info} says {calibration.cut}, which it is not inside of, for"
+            f" images of {size[0]}x{size[1]}",
+            remedy=remedy,
+        )
+        cut = f" ({calibration.cut})" if calibration.cut else ""
+        refuse_if(
+            size != expected,
+            f"{self._where}: topic {image_topic}: expected {expected[0]}x{expected[1]} images as {info} says{cut},"
+            f" got {size[0]}x{size[1]}",
+            remedy=remedy,
+        )
         sized = replace(calibration, width=size[0], height=size[1])
         lens = image_lens(self._survey, image_topic, sized)
         if lens == "contradicted":
@@ -316,7 +321,7 @@ class _Builder:
         for name in (self._topics.color, self._topics.depth):
             clock = self._survey.topics[name].clock
             refuse_if(
-                clock.went_back,
+                clock.num_back >= IMAGES_FEWEST_BACK,
                 f"{self._where}: topic {name}: the clock of its headers goes back by {clock.back_ns / 1e9:.3f} s"
                 f" at {clock.back_log_ns / 1e9:.3f} s of the log (a bag in a loop, a simulation that was reset),"
                 f" {clock.num_back} images in all",
@@ -334,16 +339,15 @@ class _Builder:
             f"{self._where}: tf has no frame {world!r}",
             remedy=f"--world-frame: use one of {listed(tf.frames)}",
         )
-        if frame_id not in tf.frames or not tf.connects(world, frame_id):
-            target = f" in {world!r}" if world != frame_id else ""
-            topics = pose_topics(self._survey)
-            instead = f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
-            raise InputError(
-                f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
-                f" frames tf knows: {listed(tf.frames)}",
-                remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw"
-                f"{instead}",
-            )
+        target = f" in {world!r}" if world != frame_id else ""
+        topics = pose_topics(self._survey)
+        instead = f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
+        refuse_if(
+            frame_id not in tf.frames or not tf.connects(world, frame_id),
+            f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
+            f" frames tf knows: {listed(tf.frames)}",
+            remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw{instead}",
+        )
         return world
 
     def _lens(self, calibration: Calibration, info: str) -> Lens:
@@ -428,7 +432,7 @@ def check_mask_topics(path: Path, survey: Survey, topics: Mapping[str, str], cam
     grey = [
         topic.topic.name
         for topic in survey.of_type(IMAGE, COMPRESSED_IMAGE)
-        if topic.first_image is not None and topic.first_image.is_gray
+        if topic.first_image is not None and topic.first_image.encoding in GRAY
     ]
     for camera, topic in topics.items():
         refuse_if(

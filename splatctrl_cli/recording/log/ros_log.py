@@ -10,11 +10,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.spilled_rows import RowFile, scratch_folder
+from splatctrl_cli.formats.image_file import PNG
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.recording.log.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.recording.log.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
@@ -29,8 +31,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     decoded,
     human_mask,
     is_kept,
-    is_png,
-    with_joints,
+    merge_joints,
 )
 from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, paired, survey
 from splatctrl_cli.recording.source_options import SourceOptions, still_note
@@ -69,9 +70,6 @@ class FramePlan:
     def __len__(self) -> int:
         return self._columns.shape[1]
 
-    def __iter__(self) -> Iterator[Planned]:
-        return (self[number] for number in range(len(self)))
-
     def __getitem__(self, number: int) -> Planned:
         stamp, camera, color, depth, human, row = self._columns[:, number].tolist()
         return Planned(
@@ -97,7 +95,6 @@ class FramePlan:
         is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
         human = np.array([masks.get(index, NO_MASK) for index in color[is_known].tolist()], dtype=np.int64)
         num = int(is_known.sum())
-        rows = first + np.arange(num)
         fresh = np.stack(
             [
                 stamp_ns[is_known],
@@ -105,7 +102,7 @@ class FramePlan:
                 color[is_known],
                 depth[is_known],
                 human,
-                rows,
+                first + np.arange(num),
             ]
         )
         columns = np.concatenate([self._columns, fresh], axis=1)
@@ -212,11 +209,11 @@ class RosLogSource(FrameSource):
         self._log = log
         self._options = options
         found = survey(log, by_log_time=options.stamps == "log")
-        if not found.num_messages and found.damage.count:
-            raise InputError(
-                f"{log.path}: nothing usable before the damage ({found.damage.notes[0]})",
-                remedy="copy the file again",
-            )
+        refuse_if(
+            not found.num_messages and found.damage.count,
+            f"{log.path}: nothing usable before the damage ({''.join(found.damage.notes[:1])})",
+            remedy="copy the file again",
+        )
         refuse_if(
             not found.num_messages,
             f"{log.path}: the log holds no messages",
@@ -241,7 +238,7 @@ class RosLogSource(FrameSource):
         self.joint_topics = JointTopics(
             topics=found.of_type(*STATE_TYPES), loss=loss, first_note=first_note, chosen=options.joint_topic
         )
-        self._loss = with_joints(self._loss, loss, first_note)
+        self._loss = merge_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
         self._passes = [Damage()]  # incomplete where a pass ends early
 
@@ -260,7 +257,8 @@ class RosLogSource(FrameSource):
         return decoded(by_stamp(self.states, self._frames(lazily=False)))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
+        plans = map(self._plan.__getitem__, range(len(self._plan)))
+        return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in plans)
 
     def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
         """T_world_camera (4, 4) at a time [ns]; None if tf does not know it."""
@@ -325,12 +323,12 @@ class RosLogSource(FrameSource):
         masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
         poses = (camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
         num = plan.add(camera, stamp_ns, color, depth, masks, poses)
-        if not num:
-            raise InputError(
-                f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
-                f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
-                remedy="check the clocks of the recording, or give --camera-pose",
-            )
+        refuse_if(
+            not num,
+            f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
+            f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
+            remedy="check the clocks of the recording, or give --camera-pose",
+        )
         self._loss.without_pose += len(color) - num
 
     def _frames(self, *, lazily: bool = True) -> Iterator[StoredFrame]:
@@ -346,7 +344,7 @@ class RosLogSource(FrameSource):
                 lost.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
                 continue
             where = f"{self._log.path}: topic {camera.human_topic}"
-            human = [camera.nearest(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]
+            human = [camera.remap(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]
             if depth.compressed is None:
                 lost.num_invalid += num_invalid(depth.pixels)
             stored = _stored_frame(planned, color, depth, human[0] if human else None, messages)
@@ -395,12 +393,12 @@ def _stored_frame(
         camera=camera.name,
         intrinsics=camera.intrinsics,
         T_world_camera=planned.T_world_camera,
-        read_color=lambda: camera.color(color_of(color)),
+        read_color=lambda: camera.remap(color_of(color), cv2.INTER_LINEAR),
         read_depth=lambda: camera.depth(depth_of(depth, camera.depth_scale)),
         human=human,
         valid=camera.valid,
         color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
-        depth_file=depth.compressed if keeps_depth and depth.is_counts and is_png(depth.compressed) else None,
+        depth_file=depth.compressed if keeps_depth and depth.is_counts and is_kept(depth.compressed, PNG) else None,
         depth_unit=depth.unit(camera.depth_scale) if is_counts else None,
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
         places=tuple(replace(message, data=b"") for message in messages),

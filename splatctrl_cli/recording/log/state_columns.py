@@ -138,8 +138,8 @@ class ColumnWriter:
         if len(self._waiting) == BLOCK:
             self._flush()
 
-    def tables(self) -> dict[str, Rows]:
-        """Columns so far, but those without any value."""
+    def columns(self) -> dict[str, Rows]:
+        """Columns (T, ...) so far, but those without any value; NaN where a state has none."""
         self._flush()
         return {name: Rows(self._files[name]) for name in self._shapes if name in self._files}
 
@@ -176,7 +176,7 @@ class StateCollector:
 
     def columns(self) -> StateColumns:
         nothing = np.zeros((0, self._num_joints))
-        found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.tables()}
+        found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.columns()}
         return StateColumns(stamp_ns=np.array(self._stamps, dtype=np.int64), **found)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import refuse_if, require
-from splatctrl_cli.files.spilled_rows import Rows
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.log.decoder import JOINT_STATE, UndecodableMessageError, stamp_ns
 from splatctrl_cli.recording.log.state_columns import ColumnWriter
@@ -176,7 +175,7 @@ COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
 _NO_STAMPS = np.zeros(0, dtype=np.int64)
 
 
-class JointStream:
+class JointStream(ColumnWriter):
     """States with equal joints, in the first one's order."""
 
     def __init__(
@@ -190,17 +189,13 @@ class JointStream:
         self.names = names
         self._stamps, self._log_times = array("q", stamp_ns.tolist()), array("q", log_time_ns.tolist())
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
-        self._columns = ColumnWriter(
-            {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}, columns or {}
-        )
+        shapes = {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}
+        super().__init__(shapes, columns or {})
         refuse_if(
-            columns and len(self._columns) != len(self),
-            f"columns of other lengths than {len(self)}",
+            columns and len(self) != len(self._stamps),
+            f"columns of other lengths than {len(self._stamps)}",
             error=ValueError,
         )
-
-    def __len__(self) -> int:
-        return len(self._stamps)
 
     @property
     def stamp_ns(self) -> Stamps:
@@ -210,19 +205,12 @@ class JointStream:
     def log_time_ns(self) -> Stamps:
         return np.array(self._log_times, dtype=np.int64)
 
-    def columns(self) -> dict[str, Rows]:
-        """position, velocity, commanded_velocity (T, J), T_base_ee (T, 4, 4).
-
-        NaN where a state has none, absent if none has one.
-        """
-        return self._columns.tables()
-
-    def add(self, state: RawJoints) -> None:
+    def add_state(self, state: RawJoints) -> None:
         """Add a state. Raises OverflowError for a time beyond 64 bits."""
         times = array("q", (state.stamp_ns, state.log_time_ns))  # both, before either is kept
         self._stamps.append(times[0])
         self._log_times.append(times[1])
-        self._columns.add({name: self._row(state, name) for name in COLUMNS})
+        self.add({name: self._row(state, name) for name in COLUMNS})
 
     def _row(self, state: RawJoints, name: str) -> Float64 | None:
         value: Float64 | None = getattr(state, name)
@@ -257,7 +245,7 @@ class JointLog:
             if state.names:
                 key = frozenset(state.names)
                 stream = self._streams[key] if key in self._streams else JointStream(state.names)
-                stream.add(state)
+                stream.add_state(state)
                 self._streams[key] = stream
             if self.first_names is None:
                 self.first_names = state.names

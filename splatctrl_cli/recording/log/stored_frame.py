@@ -56,14 +56,10 @@ class JointTopics:
     chosen: str | None = None
 
 
-def with_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
-    """Merge the joints' report, its notes at index `at`."""
-    return loss.plus(joints, [*loss.notes[:at], *joints.notes, *loss.notes[at:]])
-
-
-def without_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
-    """Undo `with_joints`."""
-    return loss.plus(joints, [*loss.notes[:at], *loss.notes[at + len(joints.notes) :]], sign=-1)
+def merge_joints(loss: LossReport, joints: LossReport, at: int, *, sign: int = 1) -> LossReport:
+    """Add the joints' report to `loss`, its notes at index `at`; with sign -1, take it out."""
+    added, after = (joints.notes, at) if sign > 0 else ([], at + len(joints.notes))
+    return loss.plus(joints, [*loss.notes[:at], *added, *loss.notes[after:]], sign=sign)
 
 
 def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
@@ -268,13 +264,9 @@ class FrameSource:
         return iter(())
 
 
-def is_kept(data: bytes | None) -> bool:
-    """True for JPEG or PNG, which captures keep."""
-    return data is not None and data.startswith((JPEG, PNG))
-
-
-def is_png(data: bytes | None) -> bool:
-    return data is not None and data.startswith(PNG)
+def is_kept(data: bytes | None, *kinds: bytes) -> bool:
+    """True for a JPEG or PNG, which captures keep, or for one of `kinds`."""
+    return data is not None and data.startswith(kinds or (JPEG, PNG))
 
 
 def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
@@ -283,14 +275,14 @@ def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
 
 def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
     """(H, W) uint8, 1 where not 0. Raises InputError unless 8-bit grey of that size."""
-    if pixels.dtype != np.uint8 or pixels.shape != (camera.height, camera.width):
-        size = "x".join(map(str, reversed(pixels.shape[:2])))
-        channels = pixels.shape[2] if pixels.ndim == 3 else 1
-        raise InputError(
-            f"{where}: expected an 8-bit grey mask of {camera.width}x{camera.height}, as the colour images,"
-            f" got {size} of {channels} channel(s), {pixels.dtype}",
-            remedy="write 0 where there is no person, anything else where there is one",
-        )
+    size = "x".join(map(str, reversed(pixels.shape[:2])))
+    channels = pixels.shape[2] if pixels.ndim == 3 else 1
+    refuse_if(
+        pixels.dtype != np.uint8 or pixels.shape != (camera.height, camera.width),
+        f"{where}: expected an 8-bit grey mask of {camera.width}x{camera.height}, as the colour images,"
+        f" got {size} of {channels} channel(s), {pixels.dtype}",
+        remedy="write 0 where there is no person, anything else where there is one",
+    )
     return np.asarray(pixels != 0, np.uint8)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_FEWEST_BACK, IMAGES_GAP, IMAGES_STEADY
+from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_GAP, IMAGES_STEADY
 from splatctrl_cli.recording.container.mcap_file import ChunkIndex
 from splatctrl_cli.recording.container.mcap_log import LogIndex, McapLog
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
@@ -64,7 +64,7 @@ def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.
 
 @dataclass(kw_only=True)
 class StampClock:
-    """A detector of header clocks that go back: a bag in a loop, a reset.
+    """A detector of header clocks that go back: a bag in a loop, a reset; single stamps may err.
 
     num_back: stamps over a second behind an earlier one; back_ns: the first one's distance, at log time back_log_ns.
     """
@@ -83,11 +83,6 @@ class StampClock:
             if not self.num_back:
                 self.back_ns, self.back_log_ns = self._latest_ns - stamp_ns, log_time_ns
             self.num_back += 1
-
-    @property
-    def went_back(self) -> bool:
-        """True after several such stamps; single ones may err."""
-        return self.num_back >= IMAGES_FEWEST_BACK
 
 
 def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
@@ -325,7 +320,7 @@ def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
     for entry in found.topics.values():
         entry.count = 0
     for channel, count in index.counts.items():
-        counted = log.topic_of(channel)
+        counted = log.channels.get(channel)
         if counted is not None:
             entry = found.topics[counted.name]
             entry.count += count
