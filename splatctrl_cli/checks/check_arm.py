@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from splatctrl_cli.checks import limits
-from splatctrl_cli.checks.check_views import rescaled
+from splatctrl_cli.checks.check_views import rescale_remedy
 from splatctrl_cli.checks.clock_offset import ImageMotion, estimate_clock_offset, select_states
 from splatctrl_cli.checks.finding import Finding, note, warning
 from splatctrl_cli.geometry import strided_lens
@@ -41,7 +41,7 @@ class ArmAgreement:
         return is_there and self.misfit <= limits.ARM_MISFIT
 
 
-def reduced(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
+def thin_frames(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     """Frames of at most `limits.ARM_ROWS` rows."""
     strides = [max(1, -(-frame.depth.shape[0] // limits.ARM_ROWS)) for frame in frames]
     return [
@@ -142,13 +142,13 @@ def _exchanged(posture: Posture, i: int, j: int) -> Posture:
 
 
 def _in_place(where: str, agreement: ArmAgreement, units: Iterable[float | None]) -> Finding:
-    """Finding of a camera that shows the arm in place or scaled (units: `rescaled`)."""
+    """Finding of a camera that shows the arm in place or scaled (units: `rescale_remedy`)."""
     if agreement.scale is not None:
         return warning(
             "arm",
             where,
             f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say",
-            f"{rescaled(units, 1 / agreement.scale)}, or check --base and the camera's pose",
+            f"{rescale_remedy(units, 1 / agreement.scale)}, or check --base and the camera's pose",
             value=round(agreement.scale, 3),
         )
     return note(
@@ -187,7 +187,7 @@ def motion_findings(
 ) -> list[Finding]:
     """Findings on joint states (in the model's order, if any) by the cameras.
 
-    frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescaled`.
+    frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescale_remedy`.
     """
     found: list[Finding] = []
     offsets: dict[str, float] = {}
@@ -213,7 +213,7 @@ def _arm_findings(
     timings: dict[str, tuple[float, float]] = {}
     bad: dict[str, ArmAgreement] = {}
     for camera in sorted({frame.camera for frame in frames}):
-        its = reduced([frame for frame in frames if frame.camera == camera])
+        its = thin_frames([frame for frame in frames if frame.camera == camera])
         where = f"camera {camera}"
         agreement = arm_agreement(model, its, posture)
         if agreement is None:
@@ -239,7 +239,7 @@ def _own_offsets(
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():
-        its = reduced([frame for frame in frames if frame.camera == camera])
+        its = thin_frames([frame for frame in frames if frame.camera == camera])
         at_middle = arm_agreement(model, its, posture, offset_s=middle)
         is_other = abs(offset_s - middle) > limits.TIME_OFFSET + limits.TIME_ERROR
         if not is_other or at_middle is None or misfit < limits.TIME_OWN * at_middle.misfit:
@@ -248,7 +248,7 @@ def _own_offsets(
 
 
 def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> str:
-    pair = swapped_joints(model, reduced(frames), posture)
+    pair = swapped_joints(model, thin_frames(frames), posture)
     if pair is None:
         return ""
     a, b = (model.joint_names[i] for i in pair)

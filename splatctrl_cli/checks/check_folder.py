@@ -1,7 +1,7 @@
 """Checks of a capture or image folder in one pass, judged as logs are."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,43 +41,34 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.scale import RecordedDepth
 
 
-@dataclass(frozen=True, kw_only=True)
-class Evidence:
-    """Data that a check keeps of a recording, in bounded memory.
-
-    frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
-    of the first images. states: in the model's order. cut: says that not all was read. is_guessed: the unit of
-    lengths is.
-    """
-
-    frames: Sequence[RgbdFrame]
-    depth_units: Mapping[str, float | None]
-    motion: ImageMotion
-    states: StateColumns | None
-    cut: str = ""
-    is_guessed: bool = False
-
-
-def judged(
-    report: CheckReport, evidence: Evidence, model: RobotModel | None, *, only_errors: bool = False
+def judge_frames(
+    report: CheckReport,
+    model: RobotModel | None,
+    *,
+    frames: Sequence[RgbdFrame],
+    depth_units: Mapping[str, float | None],
+    motion: ImageMotion,
+    states: StateColumns | None,
+    cut: str = "",
+    is_guessed: bool = False,
+    only_errors: bool = False,
 ) -> CheckReport:
     """Add findings on frames, and on frames against states, to a report.
 
-    only_errors: skip checks that yield only notes and warnings.
+    frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
+    of the first images. states: in the model's order. cut: says that not all was read. is_guessed: the unit of
+    lengths is. only_errors: skip checks that yield only notes and warnings.
     """
-    findings = [*report.findings, *alignment_findings(evidence.frames)]
-    frames, is_still = usable_frames(evidence.frames, findings), report.start_ns is None
+    findings = [*report.findings, *alignment_findings(frames)]
+    usable, is_still = usable_frames(frames, findings), report.start_ns is None
     wrong, scaled, corrected = check_views(
-        frames,
-        evidence.depth_units,
-        is_sure=not is_still or not (evidence.is_guessed or are_far(frames)),
-        only_errors=only_errors,
+        usable, depth_units, is_sure=not is_still or not (is_guessed or are_far(usable)), only_errors=only_errors
     )
     findings += wrong if only_errors else [*wrong, *exposure_findings(corrected)]
-    states = None if only_errors else evidence.states
-    if states is not None and not any(finding.code == "joints-degrees" for finding in findings):
-        findings += motion_findings(corrected, evidence.motion, states, model, evidence.depth_units.values())
-    findings += [note("quick", Path(report.path).name, evidence.cut)] if evidence.cut else []
+    is_known = states is not None and not any(finding.code == "joints-degrees" for finding in findings)
+    if states is not None and is_known and not only_errors:
+        findings += motion_findings(corrected, motion, states, model, depth_units.values())
+    findings += [note("quick", Path(report.path).name, cut)] if cut else []
     return replace(report, findings=findings, frames=scaled)
 
 
@@ -261,17 +252,15 @@ def check_folder(
             states_lack=of_states.lack,
         ),
     )
-    return judged(
+    return judge_frames(
         report,
-        Evidence(
-            frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
-            depth_units={name: camera.images.scale for name, camera in cameras.items()},
-            motion=motion,
-            states=of_states.states,
-            is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
-            cut="" if is_whole else f"only the first {num_images} frames of a camera were read",
-        ),
         of_states.model,
+        frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
+        depth_units={name: camera.images.scale for name, camera in cameras.items()},
+        motion=motion,
+        states=of_states.states,
+        is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
+        cut="" if is_whole else f"only the first {num_images} frames of a camera were read",
         only_errors=only_errors,
     )
 

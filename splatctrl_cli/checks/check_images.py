@@ -106,8 +106,7 @@ class ImageWatch:
 
     def _keep(self, stamp_ns: int, image: NDArray[Any], small: NDArray[Any]) -> None:
         height, width = image.shape[:2]
-        kept = Kept(stamp_ns=stamp_ns, stride=stride_of(height), width=width, height=height, pixels=small)
-        self.kept.add(kept)
+        self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride_of(height), width=width, height=height, pixels=small))
 
     def rescale(self, scale: float) -> None:
         """Set the scale [m per count] of a log that names it."""

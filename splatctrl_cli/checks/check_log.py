@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.checks.check_cameras import calibration_findings, camera_findings, tf_findings
-from splatctrl_cli.checks.check_folder import Evidence, judged
+from splatctrl_cli.checks.check_folder import judge_frames
 from splatctrl_cli.checks.check_images import (
     ImageWatch,
     Kept,
@@ -26,7 +27,7 @@ from splatctrl_cli.checks.check_times import (
     clock_findings,
     ending_findings,
     file_findings,
-    joined_gaps,
+    join_gaps,
     part_findings,
     peer_findings,
     time_findings,
@@ -178,10 +179,9 @@ class LogWatch(JoinedLog):
 
 def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
     """The camera as `ingest` builds it, or None (rig.missing says why)."""
-    try:
+    with suppress(InputError):
         return build_cameras(log, found, replace(options, cameras=(topics.name,)))[0]
-    except InputError:
-        return None
+    return None
 
 
 def reduced_frames(
@@ -302,8 +302,10 @@ def check_log(
     for topics, camera in rig:
         if camera is not None and camera.depth_scale is not None and topics.depth in watch.images:
             watch.images[topics.depth].rescale(camera.depth_scale)
-    findings += _time_findings(watch, found, cameras)
-    findings += _image_findings(watch, cameras, {t.topic.name for t in image_topics(found, "unlike")})
+    used = {name for camera in cameras for name in (camera.color, camera.depth)}
+    unused = watch.images.keys() - used if cameras else set()
+    findings += _time_findings(watch, found, cameras, unused)
+    findings += _image_findings(watch, unused, {t.topic.name for t in image_topics(found, "unlike")})
     findings += calibration_findings(found, cameras, watch.changed_infos)
     findings += tf_findings(found, cameras, options)
     for topics, camera in rig:
@@ -338,16 +340,14 @@ def check_log(
             states_lack=of_states.lack,
         ),
     )
-    return judged(
+    return judge_frames(
         report,
-        Evidence(
-            frames=list(chain.from_iterable(frames.values())),
-            depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
-            motion=image_motion(watch, whole, frames),
-            states=of_states.states,
-            cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
-        ),
         of_states.model,
+        frames=list(chain.from_iterable(frames.values())),
+        depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
+        motion=image_motion(watch, whole, frames),
+        states=of_states.states,
+        cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
         only_errors=only_errors,
     )
 
@@ -381,9 +381,11 @@ def _span(found: Survey) -> tuple[int, int]:
     return min((t.first_log_ns for t in entries), default=0), max((t.last_log_ns for t in entries), default=0)
 
 
-def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopics]) -> list[Finding]:
+def _time_findings(
+    watch: LogWatch, found: Survey, cameras: Sequence[CameraTopics], unused: Collection[str]
+) -> list[Finding]:
     names = [n for n, e in sorted(found.topics.items()) if e.topic.type_name in (*IMAGES, *STATE_TYPES)]
-    times = [watch.times[n] for n in names if n in watch.times and not _is_beside(watch, n, cameras)]
+    times = [watch.times[n] for n in names if n in watch.times and n not in unused]
     each = [f for t in times for f in time_findings(t, "images" if t.topic in watch.images else "states")]
     each += [
         replace(f, code="tf-gap") if f.code == "gap" else f
@@ -396,20 +398,15 @@ def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopic
     said = {finding.where for finding in clocks if finding.code == "clock-offset"}
     clocks += [f for topics in peers for f in peer_findings(topics) if f.where not in said]
     return [
-        *joined_gaps(each),
+        *join_gaps(each),
         *(part_findings(times) if not any(f.code in {"clock", "clock-offset"} for f in clocks) else ()),
         *clocks,
         *ending_findings(list(watch.transforms.values()), last_ns),
     ]
 
 
-def _is_beside(watch: LogWatch, name: str, cameras: Sequence[CameraTopics]) -> bool:
-    """True if no camera uses a topic's images."""
-    return bool(cameras) and name in watch.images and not any(name in (c.color, c.depth) for c in cameras)
-
-
-def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Collection[str]) -> list[Finding]:
-    """Findings on image topics; notes if no camera uses them. unlike: topics with only depth's encoding."""
+def _image_findings(watch: LogWatch, unused: Collection[str], unlike: Collection[str]) -> list[Finding]:
+    """Findings on image topics; notes on `unused` ones. unlike: topics with only depth's encoding."""
     findings, known = [], ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
     for name, images in sorted(watch.images.items()):
         its = list(image_findings(images))
@@ -418,7 +415,7 @@ def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Co
         remedy = f"record another topic of this camera, or convert it; read: {known}"
         text = f"encoding {', '.join(map(repr, unread[:1]))} is not read"
         its += judge(WARNING if unread else None, "encoding", name, text, remedy)
-        if _is_beside(watch, name, cameras):
+        if name in unused:
             its = [replace(f, severity=NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
         elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded and name not in unlike:
             its += depth_findings(images)

@@ -152,16 +152,14 @@ def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
     ]
 
 
-def joined_gaps(findings: list[Finding]) -> list[Finding]:
+def join_gaps(findings: list[Finding]) -> list[Finding]:
     """Findings, with common pauses of topics and transforms joined."""
     kept = [f for f in findings if f.code not in {"gap", "tf-gap"}]
     groups: list[list[Finding]] = []
     for finding in (f for f in findings if f.code in {"gap", "tf-gap"}):
-        group = next((g for g in groups if _overlap(g[0], finding)), None)
-        if group is None:
-            groups.append([finding])
-        else:
-            group.append(finding)
+        group = next((g for g in groups if _overlap(g[0], finding)), [])
+        groups += [] if group else [group]
+        group.append(finding)
     return [*(group[0] if len(group) == 1 else _joined(group) for group in groups), *kept]
 
 

@@ -100,12 +100,8 @@ def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
     return float(np.sum(x * y)) / length if length > 0 else 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotPoints:
-    """A robot's spheres by joint state: centers (T, S, 3) and radii (S,) [m], world."""
-
-    centers: Float64
-    radii: Float64
+RobotPoints = tuple[Float64, Float64]
+"""A robot's spheres by joint state: centers (T, S, 3) and radii (S,) [m], world."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +144,7 @@ def estimate_clock_offset(
     first, last = _span(cameras)
     near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
     states = [states[index] for index in near]
-    robot = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
+    robot = None if robot is None else (robot[0][near], robot[1])
     if len(states) < 3:
         return _unknown(num, f"no joint states within {limits.OFFSET_REACH:g} s of the frames")
     position = np.array([state.position for state in states])
@@ -191,7 +187,7 @@ def select_states(stamp_ns: Stamps, motion: ImageMotion) -> Index:
         at = _since(camera, int(near[0]))
         for offset in offsets:
             for times in (at - offset, step * np.round((at - offset) / step)):
-                after = _after(seconds, times)
+                after = np.clip(np.searchsorted(seconds, times), 1, len(seconds) - 1)
                 is_asked[after] = is_asked[after - 1] = True
     return first + np.flatnonzero(is_asked)
 
@@ -222,8 +218,8 @@ def _pixel_scores(
     number = np.round((_since(camera, start) - offsets[:, None]) / step).astype(np.int64)  # (O, K + 1)
     is_inside = (number >= 0) & (number * step < seconds[-1] + step / 2)
     wanted = np.unique(number[is_inside])
-    centers = _at(seconds, robot.centers.reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3)
-    depth = silhouettes(centers, robot.radii, camera)
+    centers = _at(seconds, robot[0].reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3)
+    depth = silhouettes(centers, robot[1], camera)
     changes = np.array(camera.changes)
     scores = np.zeros(len(offsets))
     for i, inside in enumerate(is_inside):
@@ -255,15 +251,10 @@ def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarra
 
 def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
     """Rows (K, D) of a curve (T, D) at times (K,), linear."""
-    after = _after(seconds, at)
+    after = np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
     before = after - 1
     share = np.clip((at - seconds[before]) / (seconds[after] - seconds[before]), 0.0, 1.0)[:, None]
     return np.asarray((1 - share) * curve[before] + share * curve[after])
-
-
-def _after(seconds: Float64, at: Float64) -> Index:
-    """State (K,) that ends each time's interval, or the nearest."""
-    return np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
 
 
 def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: float) -> ClockOffset:

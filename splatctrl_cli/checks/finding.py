@@ -238,14 +238,14 @@ class CheckReport:
         """The findings, worst first, then as found."""
         return sorted(self.findings, key=lambda finding: ORDER.index(finding.severity))
 
-    def refusing(self, command: str) -> list[Finding]:
+    def blockers(self, command: str) -> list[Finding]:
         """The errors that block a command."""
         errors = [f for f in self.sorted_findings if f.severity is ERROR]
         return [f for f in errors if command in CHECKS[f.code].blocked]
 
     def obstacles(self, command: str) -> list[str]:
         """Needs a command lacks, and errors that block it; empty if it can start."""
-        blocking = (f"{f.where}: {f.what} [{f.code}]" for f in self.refusing(command))
+        blocking = (f"{f.where}: {f.what} [{f.code}]" for f in self.blockers(command))
         return [*filter(None, [self.lacks[command]]), *blocking]
 
     @property

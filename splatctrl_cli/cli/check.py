@@ -72,7 +72,7 @@ def _needs(report: CheckReport) -> Iterator[str]:
         yield f"can start: {', '.join(ready)}"
     kept: dict[str, list[str]] = {}
     for command in report.lacks:
-        if codes := dict.fromkeys(finding.code for finding in report.refusing(command)):
+        if codes := dict.fromkeys(finding.code for finding in report.blockers(command)):
             kept.setdefault(", ".join(f"[{code}]" for code in codes), []).append(command)
     yield from (f"cannot start, or would be wrong: {', '.join(names)}; see {why}" for why, names in kept.items())
     for command, lack in report.lacks.items():

@@ -18,7 +18,7 @@ from splatctrl_cli.recording.capture.capture import (
     CaptureSource,
     is_capture,
     read_capture_header,
-    robot_description_of,
+    read_robot_description,
 )
 from splatctrl_cli.recording.capture.capture_writer import check_not_partial
 from splatctrl_cli.recording.container.log_formats import (
@@ -95,7 +95,7 @@ def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescript
     for path in paths:
         said = []
         if is_capture(path):
-            said = robot_description_of(path)
+            said = read_robot_description(path)
         elif path.exists() and not has_views(path):
             with suppress(InputError):  # who reads it says why
                 said = robot_descriptions(open_raw_log(path))
@@ -127,7 +127,7 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
         return _describe_folder(path, options)
     with path.open("rb") as stream:
         start = stream.read(16)
-    if start.startswith(tuple(kind.magic for kind in CONTAINERS)) or path.suffix in (*SUFFIXES, *VIDEOS):
+    if start.startswith(tuple(magic for magic, _ in CONTAINERS.values())) or path.suffix in (*SUFFIXES, *VIDEOS):
         return describe_log(open_log(path), options)
     if path.suffix == ".toml" and is_calibration(path):
         return describe_calibration(path)

@@ -10,7 +10,6 @@ from splatctrl_cli.checks.check_states import PoseAgreement, check_angles, check
 from splatctrl_cli.checks.clock_offset import (
     ClockOffset,
     ImageMotion,
-    RobotPoints,
     estimate_clock_offset,
     select_states,
 )
@@ -321,6 +320,4 @@ def clock_of(model: RobotModel, logged: LoggedStates, motion: ImageMotion) -> Cl
     asked = states.select(select_states(states.stamp_ns, motion))
     centers = model.sphere_centers_batch(asked.position[: len(asked)])
     moving = model.moving_spheres
-    return estimate_clock_offset(
-        asked, motion, RobotPoints(centers=centers[:, moving], radii=model.sphere_set.radii[moving])
-    )
+    return estimate_clock_offset(asked, motion, (centers[:, moving], model.sphere_set.radii[moving]))

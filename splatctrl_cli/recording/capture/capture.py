@@ -323,14 +323,12 @@ class CaptureSource(FrameSource):
 
     def _read(self, name: str) -> bytes | None:
         path = self._path / name
-        if not path.is_file():
-            self._damaged.append(f"{name}: missing")
-            return None
-        data = path.read_bytes()
-        if self._sums.get(name) != hashlib.sha256(data).hexdigest():
-            self._damaged.append(f"{name}: its checksum differs from SHA256SUMS")
-            return None
-        return data
+        data = path.read_bytes() if path.is_file() else None
+        if data is not None and self._sums.get(name) == hashlib.sha256(data).hexdigest():
+            return data
+        fault = "missing" if data is None else "its checksum differs from SHA256SUMS"
+        self._damaged.append(f"{name}: {fault}")
+        return None
 
     def _checked(self, name: str) -> Path:
         file = self._path / name
@@ -345,7 +343,7 @@ class CaptureSource(FrameSource):
         return file
 
 
-def robot_description_of(path: Path) -> list[RobotDescription]:
+def read_robot_description(path: Path) -> list[RobotDescription]:
     """A capture's URDF, if any. Raises InputError if changed."""
     file = path / ROBOT
     if not file.is_file():
@@ -373,12 +371,10 @@ def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | N
 
 def _read_joints(path: Path) -> StateColumns:
     file = path / "joints.npz"
-    try:
+    with refuse_faults(lambda error: str(error.message), InputError, remedy=AGAIN):
         content = NpzFile(file)
         stamps = content.stamps("stamp_ns", 1, 0, least=0)
         rows = {name: content.rows(name) for name in (*NEEDED[1:], *OPTIONAL) if name in (*NEEDED, *content.names)}
-    except InputError as error:
-        raise InputError(error.message, remedy=AGAIN) from None
     refuse_if(
         any(len(values) != len(stamps) for values in rows.values()),
         f"{file}: expected {len(stamps)} states in every array, got "

@@ -67,13 +67,11 @@ class Journal:
     def close(self) -> None:
         self._stream.close()
 
-    def kept(self) -> Entry | None:
+    def next_kept(self) -> Entry | None:
         """The earlier run's next frame, or None."""
         found = next(self._kept, None)
-        if found is None:
-            return None
-        self.num_entries += 1
-        return Entry(**found)
+        self.num_entries += found is not None
+        return None if found is None else Entry(**found)
 
     def add(self, entry: Entry) -> None:
         self.num_entries += 1
@@ -115,12 +113,13 @@ def check_not_partial(folder: Path) -> None:
 def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
     """Raise UsageError if a written frame differs from the source's."""
     differing = [name for name in now if before.get(name) != now[name]]
-    if differing:
-        name = differing[0]
-        raise UsageError(
-            f"{folder}: --resume: {before.get('color')}: {name} was {before.get(name)}, is {now[name]}",
-            remedy="the source has changed; start over without --resume",
-        )
+    name = next(iter(differing), "")
+    refuse_if(
+        differing,
+        f"{folder}: --resume: {before.get('color')}: {name} was {before.get(name)}, is {now.get(name)}",
+        remedy="the source has changed; start over without --resume",
+        error=UsageError,
+    )
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
@@ -130,6 +129,7 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
                 yield json.loads(line)
 
 
+LENSES = "valid/"  # masks that a lens's frames share, out of order
 PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
@@ -170,7 +170,7 @@ def write_capture(
                 states.add(item)
                 num_states += 1
                 continue
-            row, kept = _row(item, cameras), journal.kept()
+            row, kept = _row(item, cameras), journal.next_kept()
             if kept is None:
                 journal.add(_write_frame(folder, item, row, cameras[item.camera]))
             else:
@@ -220,19 +220,16 @@ def _write_index(
         shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
         header = header | {"joint_topics": write_topics(folder, topics, names.append)}
     write_json(folder / "capture.json", header)
-    of_lenses = {name: digest for entry in journal.entries() for digest, name in entry.sums if _is_of_lens(name)}
+    of_lenses = {
+        name: digest for entry in journal.entries() for digest, name in entry.sums if name.startswith(LENSES)
+    }
     others = {name: sha256(folder / name) for name in [*names, "capture.json"]}
     _write_sums(folder / SUMS, journal, of_lenses | others)
 
 
-def _is_of_lens(name: str) -> bool:
-    """True if a lens's frames share it, out of order."""
-    return name.startswith("valid/")
-
-
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
     """Write sorted lines; the journal is read once per image folder to bound memory."""
-    written = (name for entry in journal.entries() for _, name in entry.sums if not _is_of_lens(name))
+    written = (name for entry in journal.entries() for _, name in entry.sums if not name.startswith(LENSES))
     folders = {f"{name.rpartition('/')[0]}/" for name in written}
     with path.open("w", encoding="utf-8", newline="") as stream:
         for place in sorted([*folders, *others]):
@@ -275,7 +272,7 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
 
 def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
     stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
-    color = stored.color_file or encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
+    color = stored.color_file or encode_png(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
     color_name = f"color/{stored.camera}/{stem}.{'png' if is_kept(color, PNG) else 'jpg'}"
     kind, depth = _depth_file(stored, unit)
     depth_name = f"depth/{stored.camera}/{stem}.{kind}"
@@ -283,10 +280,10 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
     named = {"color": color_name, "depth": depth_name}
     if stored.human is not None:
         named["human"] = f"human/{stored.camera}/{stem}.png"
-        files[named["human"]] = encoded(stored.human * np.uint8(255))
+        files[named["human"]] = encode_png(stored.human * np.uint8(255))
     if stored.valid is not None:
-        mask = encoded(stored.valid * np.uint8(255))
-        named["valid"] = f"valid/{stored.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
+        mask = encode_png(stored.valid * np.uint8(255))
+        named["valid"] = f"{LENSES}{stored.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
         files[named["valid"]] = mask
     for name, data in files.items():
         path = folder / name
@@ -317,7 +314,7 @@ def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
-    return ("npy", npy_bytes(stored.depth)) if counts is None else ("png", encoded(counts))
+    return ("npy", npy_bytes(stored.depth)) if counts is None else ("png", encode_png(counts))
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
@@ -329,11 +326,10 @@ def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, n
     return counts if error <= (0.0 if is_exact else FLOAT_DEPTH_ERROR) else None
 
 
-def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
+def encode_png(pixels: np.ndarray[Any, Any]) -> bytes:
     """Encode an image as PNG."""
     is_written, data = cv2.imencode(".png", pixels, _FILTERED)
-    if not is_written:
-        raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
+    refuse_if(not is_written, f"an image of shape {pixels.shape} could not be encode_png as PNG", error=WriteError)
     return bytes(data)
 
 

@@ -88,10 +88,8 @@ _TEXTS = {  # by the topic, what a text of the SDK stands for; metadata say the 
 
 def stands_for(schema: str) -> str:
     """The ROS type of a Foxglove schema, "" for others."""
-    for prefix in ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/"):
-        if schema.startswith(prefix):
-            return _STANDS_FOR.get(schema.removeprefix(prefix), "")
-    return ""
+    match = re.match(r"foxglove(?:\.|_msgs/(?:msg/)?)(.*)", schema, re.DOTALL)
+    return _STANDS_FOR.get(match[1], "") if match else ""
 
 
 def standing_in(topic: Topic) -> Topic:
@@ -141,22 +139,6 @@ def _data(message: Any) -> Any:
     return np.frombuffer(base64.b64decode(value, validate=True) if isinstance(value, str) else value, dtype=np.uint8)
 
 
-def _compressed_image(message: Any) -> Any:
-    return SimpleNamespace(header=_header(message), format=message.format, data=_data(message))
-
-
-def _raw_image(message: Any) -> Any:
-    return SimpleNamespace(
-        header=_header(message),
-        width=int(message.width),
-        height=int(message.height),
-        encoding=str(message.encoding),
-        step=int(message.step),
-        is_bigendian=0,
-        data=_data(message),
-    )
-
-
 def _calibration(message: Any) -> Any:
     return SimpleNamespace(
         header=_header(message),
@@ -187,16 +169,6 @@ def _transform(message: Any) -> Any:
     )
 
 
-def _joint_states(message: Any) -> Any:
-    """Joint states without velocities: an unset one looks like zero."""
-    return SimpleNamespace(
-        header=_header(message),
-        name=[str(joint.name) for joint in message.joints],
-        position=np.array([float(_either(joint, "position")) for joint in message.joints]),
-        velocity=np.zeros(0),
-    )
-
-
 def _sdk_text(message: Any) -> Any:
     """Parse an SDK text. Raises KeyError or ValueError for a missing field."""
     said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
@@ -215,12 +187,27 @@ def _sdk_text(message: Any) -> Any:
 
 
 _READERS: dict[str, Callable[[Any], Any]] = {
-    "CompressedImage": _compressed_image,
-    "CompressedVideo": _compressed_image,
-    "RawImage": _raw_image,
+    **dict.fromkeys(
+        ("CompressedImage", "CompressedVideo"),
+        lambda message: SimpleNamespace(header=_header(message), format=message.format, data=_data(message)),
+    ),
+    "RawImage": lambda message: SimpleNamespace(
+        header=_header(message),
+        width=int(message.width),
+        height=int(message.height),
+        encoding=str(message.encoding),
+        step=int(message.step),
+        is_bigendian=0,
+        data=_data(message),
+    ),
     "CameraCalibration": _calibration,
     "FrameTransform": lambda message: SimpleNamespace(transforms=[_transform(message)]),
-    "JointStates": _joint_states,
+    "JointStates": lambda message: SimpleNamespace(  # without velocities: an unset one looks like zero
+        header=_header(message),
+        name=[str(joint.name) for joint in message.joints],
+        position=np.array([float(_either(joint, "position")) for joint in message.joints]),
+        velocity=np.zeros(0),
+    ),
     "String": _sdk_text,
     "FrameTransforms": lambda message: SimpleNamespace(transforms=[_transform(item) for item in message.transforms]),
 }

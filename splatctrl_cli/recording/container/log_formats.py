@@ -9,8 +9,8 @@ import shutil
 import tempfile
 import weakref
 import zipfile
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -72,29 +72,19 @@ class UnpackedMessagesLog(JoinedLog):
 def _unpacked_message(data: bytes, budget: Budget) -> bytes:
     with refuse_faults(lambda _: "is not a zstd frame", zstandard.ZstdError, error=BadBlockError):
         size = zstandard.frame_content_size(data)
-    if size >= 0:
-        return budget.unpacked(data, "zstd", size)
-    return budget.unpacked(data, "zstd", len(unpacked_start(data, "zstd", MAX_BLOCK)))
+    size = size if size >= 0 else len(unpacked_start(data, "zstd", MAX_BLOCK))
+    return budget.unpacked(data, "zstd", size)
 
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Container:
-    """A log format: suffix, first bytes, opener."""
-
-    suffix: str
-    magic: bytes
-    open: Callable[[Path], RawLog]
-
-
-CONTAINERS = (
-    Container(suffix=".mcap", magic=b"\x89MCAP0\r\n", open=McapLog),
-    Container(suffix=".bag", magic=b"#ROSBAG V", open=Bag1Log),
-    Container(suffix=".db3", magic=b"SQLite format 3", open=Db3Log),
-)
-SUFFIXES = tuple(kind.suffix for kind in CONTAINERS)
+CONTAINERS: Mapping[str, tuple[bytes, Callable[[Path], RawLog]]] = {  # first bytes and opener by suffix
+    ".mcap": (b"\x89MCAP0\r\n", McapLog),
+    ".bag": (b"#ROSBAG V", Bag1Log),
+    ".db3": (b"SQLite format 3", Db3Log),
+}
+SUFFIXES = tuple(CONTAINERS)
 
 
 class SessionLog(JoinedLog):
@@ -138,9 +128,9 @@ def open_raw_log(path: Path) -> RawLog:
     refuse_if(path.stat().st_size == 0, f"{path}: the file is empty (0 bytes)", remedy="record or copy it again")
     with path.open("rb") as stream:
         magic = stream.read(16)
-    kind = next((kind for kind in CONTAINERS if magic.startswith(kind.magic)), None)
-    if kind is not None:
-        log = kind.open(path)
+    open_kind = next((opener for first, opener in CONTAINERS.values() if magic.startswith(first)), None)
+    if open_kind is not None:
+        log = open_kind(path)
         first = () if isinstance(log, Bag1Log) else islice(log.messages(Damage()), 5)  # some may be damaged
         is_packed = any(m.topic.encoding == "cdr" and m.data.startswith(_ZSTD) for m in first)  # CDR begins with a 0
         return UnpackedMessagesLog(path, (log,), log.container) if is_packed else log
@@ -168,8 +158,11 @@ def _open_folder(path: Path) -> RawLog:
         _storage_files(path), key=lambda p: [int(n) for n in re.findall(r"\d+", p.name)]
     )
     missing = [file.name for file in files if not file.is_file()]
-    if missing:
-        raise InputError(f"{path}: metadata.yaml names {missing[0]}, which is not there", remedy="copy the whole bag")
+    refuse_if(
+        missing,
+        f"{path}: metadata.yaml names {''.join(missing[:1])}, which is not there",
+        remedy="copy the whole bag",
+    )
     refuse_if(not files, f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
     mode, compression = str(told.get("compression_mode", "")).lower(), str(told.get("compression_format"))
     refuse_if(
@@ -182,15 +175,12 @@ def _open_folder(path: Path) -> RawLog:
     return JoinedLog(path, parts, f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})", note=note)
 
 
-def told_formats(path: Path) -> set[str]:
+def read_formats(path: Path) -> set[str]:
     """Serialization formats in a bag folder's metadata.yaml."""
-    if not path.is_dir():
-        return set()
-    try:
+    with suppress(KeyError, TypeError):
         topics = _metadata(path)[0].get("topics_with_message_count") or ()
         return {str(topic["topic_metadata"]["serialization_format"]) for topic in topics}
-    except (KeyError, TypeError):
-        return set()
+    return set()
 
 
 def _open_compressed(path: Path) -> RawLog:
@@ -318,8 +308,6 @@ def _ends(path: Path) -> bytes:
 
 
 def _entries(path: Path) -> list[str]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.namelist()
-    except (zipfile.BadZipFile, NotImplementedError):  # the second of a later version of the format
-        return []
+    with suppress(zipfile.BadZipFile, NotImplementedError), zipfile.ZipFile(path) as archive:
+        return archive.namelist()  # NotImplementedError: of a later version of the format
+    return []

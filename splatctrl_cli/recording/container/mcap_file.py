@@ -18,8 +18,8 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics
 
 from splatctrl_cli.errors import refuse_faults
-from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE
-from splatctrl_cli.recording.container.raw_log import Damage
+from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError
+from splatctrl_cli.recording.container.raw_log import Damage, Part
 
 __all__ = ["Channel", "Chunk", "ChunkIndex", "DataEnd", "Footer", "Schema", "Statistics", "parse_record"]
 MAGIC = b"\x89MCAP0\r\n"
@@ -27,10 +27,6 @@ MESSAGE, CHUNK, ATTACHMENT, SCHEMA, CHANNEL = 0x05, 0x06, 0x09, 0x03, 0x04
 DATA_END, FOOTER, CHUNK_INDEX, STATISTICS, MESSAGE_INDEX = 0x0F, 0x02, 0x08, 0x0B, 0x07
 FIRST_OPCODE = 0x01
 HEAD = struct.Struct("<BQ")  # opcode and length of what follows
-
-
-class BadRecordError(ValueError):
-    """A record too short for its fields."""
 
 
 class _Fields(ReadDataStream):  # type: ignore[misc]
@@ -78,11 +74,11 @@ _KINDS: dict[int, Any] = {  # by opcode
 
 
 def parse_record(opcode: int, content: bytes) -> Any:
-    """A record, None if not in `_KINDS`. Raises BadRecordError."""
+    """A record, None if not in `_KINDS`. Raises BadBlockError."""
     if opcode not in _KINDS:
         return None
     with refuse_faults(
-        lambda _: f"a record of {len(content)} bytes ends within a field", EndOfFile, error=BadRecordError
+        lambda _: f"a record of {len(content)} bytes ends within a field", EndOfFile, error=BadBlockError
     ):
         return _KINDS[opcode].read(_Fields(BytesIO(content)))
 
@@ -90,15 +86,6 @@ def parse_record(opcode: int, content: bytes) -> Any:
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, start, end, unpacked size, crc; then the compression's name
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _FOOTER_SIZE = HEAD.size + 20
-
-
-class Part(NamedTuple):
-    """A record; attachments and unknown ones have no content."""
-
-    offset: int
-    opcode: int
-    content: bytes
-    is_cut: bool = False
 
 
 class McapFile:
@@ -138,7 +125,7 @@ class McapFile:
     def chunk_indexes(self) -> list[ChunkIndex]:
         found: list[ChunkIndex] = []
         for part in self.summary():
-            with suppress(BadRecordError):
+            with suppress(BadBlockError):
                 found += [parse_record(CHUNK_INDEX, part.content)] if part.opcode == CHUNK_INDEX else []
         return sorted(found, key=lambda index: index.chunk_start_offset)
 
@@ -253,7 +240,7 @@ class _Walk:
         if opcode != DATA_END or length > PIECE:
             return
         here, expected = self._stream.tell(), 0
-        with suppress(BadRecordError):
+        with suppress(BadBlockError):
             expected = parse_record(DATA_END, self._stream.read(length)).data_section_crc
         self._stream.seek(here)
         if expected and self._crc is not None and self._crc != expected:
@@ -280,7 +267,7 @@ class _Walk:
     def _check_end(self, part: Part) -> None:
         try:
             footer = parse_record(FOOTER, part.content)
-        except BadRecordError:
+        except BadBlockError:
             self._add("its footer is damaged")
             return
         after = self._stream.tell()

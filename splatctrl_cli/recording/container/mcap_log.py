@@ -25,7 +25,6 @@ from splatctrl_cli.recording.container.mcap_file import (
     MESSAGE_INDEX,
     SCHEMA,
     STATISTICS,
-    BadRecordError,
     Channel,
     Chunk,
     ChunkIndex,
@@ -65,7 +64,7 @@ def index_by_heads(file: McapFile) -> LogIndex:
                 break
             content = head[HEAD.size :]
             if opcode == CHUNK:
-                with suppress(BadRecordError):
+                with suppress(BadBlockError):
                     chunks.append(_chunk_index(content, offset, length))
             elif opcode == MESSAGE_INDEX and chunks:
                 channel, size = struct.unpack_from("<HI", content)
@@ -128,18 +127,16 @@ class McapLog(RawLog):
 
     def index(self) -> LogIndex:
         """The index by summary, else by the heads of records."""
-        found = self._statistics
-        if found is not None:
-            chunks = tuple(self._file.chunk_indexes())
-            if len(chunks) == found.chunk_count:
-                return LogIndex(
-                    counts=dict(found.channel_message_counts),
-                    first_ns=found.message_start_time,
-                    last_ns=found.message_end_time,
-                    chunks=chunks,
-                    notes=(),
-                )
-        return index_by_heads(self._file)
+        found, chunks = self._statistics, tuple(self._file.chunk_indexes())
+        if found is None or len(chunks) != found.chunk_count:
+            return index_by_heads(self._file)
+        return LogIndex(
+            counts=dict(found.channel_message_counts),
+            first_ns=found.message_start_time,
+            last_ns=found.message_end_time,
+            chunks=chunks,
+            notes=(),
+        )
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.
@@ -152,9 +149,8 @@ class McapLog(RawLog):
             if part.opcode == CHUNK and part.content:
                 yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
             elif part.opcode == MESSAGE and part.content:
-                message = self._message(part.content, 0, len(part.content), part.offset, damage, names)
-                if message is not None:
-                    yield message
+                size = len(part.content)
+                yield from filter(None, [self._message(part.content, 0, size, part.offset, damage, names)])
             elif part.opcode in {SCHEMA, CHANNEL}:
                 self._declare(part.opcode, part.content, damage)
         self._whole = state if damage.count == count else None
@@ -188,9 +184,7 @@ class McapLog(RawLog):
                     damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are not a record")
                 return
             if opcode == MESSAGE:
-                message = self._message(records, start, at, offset, damage, names)
-                if message is not None:
-                    yield message
+                yield from filter(None, [self._message(records, start, at, offset, damage, names)])
             elif opcode in {SCHEMA, CHANNEL}:
                 self._declare(opcode, records[start:at], damage)
 
@@ -206,7 +200,7 @@ class McapLog(RawLog):
                 "checksum differs",
                 error=BadBlockError,
             )
-        except (BadRecordError, BadBlockError) as error:
+        except BadBlockError as error:
             if not is_cut:  # the cut has been counted
                 damage.add(f"{self.path.name}: the chunk at byte {offset} was left out: {error}")
             return b""
@@ -236,7 +230,7 @@ class McapLog(RawLog):
     def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
         try:
             record = parse_record(opcode, content)
-        except BadRecordError as error:
+        except BadBlockError as error:
             damage.add(f"{self.path.name}: a schema or channel was left out: {error}")
             return
         if isinstance(record, Schema):

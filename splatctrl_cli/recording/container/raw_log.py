@@ -4,7 +4,8 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 MAX_NOTES = 100  # a long log can be damaged in a million places
 
@@ -38,6 +39,16 @@ class RawMessage:
     data: bytes
     file: str = ""
     offset: int = -1
+
+
+class Part(NamedTuple):
+    """A record of a file; attachments and unknown ones have no content. fields: a ROS 1 bag's."""
+
+    offset: int
+    opcode: int
+    content: bytes
+    is_cut: bool = False
+    fields: Mapping[str, bytes] = MappingProxyType({})
 
 
 @dataclass(kw_only=True)
@@ -76,17 +87,17 @@ class Damage:
 class RawLog:
     """A log that can be read repeatedly.
 
-    container: the kind of file in words, such as ``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``.
+    container: the kind of file in words, such as ``MCAP``, ``ROS 1 bag``. channels: declared topics by number.
     """
 
     path: Path
     files: tuple[Path, ...]
     container: str
-    _topics: Mapping[Any, Topic]
+    channels: Mapping[Any, Topic]
 
     def topics(self) -> tuple[Topic, ...]:
         """Topics in the index, even without messages; none without an index."""
-        return tuple(self._topics.values())
+        return tuple(self.channels.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages of `names` (None: all) in file order; losses go to `damage`."""

@@ -15,7 +15,7 @@ import numpy as np
 from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.formats.image_file import JPEG
 from splatctrl_cli.libraries import is_installed
-from splatctrl_cli.recording.container.log_formats import told_formats
+from splatctrl_cli.recording.container.log_formats import read_formats
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import (
     CAMERA_INFO,
@@ -256,7 +256,7 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
         )
     topics = [t.topic for t in survey.topics.values() if t.count]
     kinds = sorted({_kind(topic) for topic in topics})
-    formats = told_formats(log.path) or {topic.encoding for topic in topics}
+    formats = read_formats(log.path) or {topic.encoding for topic in topics}
     alien = sorted(formats - set(_ENCODINGS))
     if alien and len(alien) == len(formats):
         return InputError(

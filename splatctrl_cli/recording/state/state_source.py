@@ -29,12 +29,11 @@ from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_table import (
     ARRAY_FILES,
+    INFO,
     TIME_UNITS_NS,
     columns_of,
     dataset_track,
     described_track,
-    is_lerobot,
-    is_libfranka,
     libfranka_track,
     read_csv,
 )
@@ -72,8 +71,7 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
 
     Raises InputError if missing, or without usable states.
     """
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
     if path.suffix == ".csv":
         options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
         return _libfranka(path, joints)
@@ -86,7 +84,7 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
         f"{path}: a file of arrays, of which none is known to be joint states",
         remedy="describe them in a .toml and give that (splatctrl help replay, Logs)",
     )
-    if is_lerobot(path):
+    if (path / INFO).is_file() and (path / "data").is_dir():
         options.refuse(_NOT_FOR_TABLES, "a LeRobot dataset", path)
         raw, file = dataset_track(path)
         return _of_table(path, (file,), raw, LossReport(notes=["times are seconds from the episode's begin"]))
@@ -122,13 +120,7 @@ def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[st
 
 
 def _libfranka(path: Path, joints: Sequence[str]) -> StateSource:
-    table = read_csv(path)
-    refuse_if(
-        not is_libfranka(table),
-        f"{path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
-        remedy="describe the columns in a .toml and give that (splatctrl help replay, Logs)",
-    )
-    raw = libfranka_track(table)
+    raw = libfranka_track(read_csv(path))
     names = with_prefix(raw.names, joints)
     loss = LossReport(notes=["times are those of the robot, in ms since it was switched on"])
     if len(names) == len(raw.names):

@@ -9,6 +9,7 @@ seconds from the episode's begin.
 import csv
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -25,6 +26,11 @@ from splatctrl_cli.recording.folder.poses import stamp_of_text
 from splatctrl_cli.recording.log.state_messages import NAMELESS, pose_of_columns, pose_of_quat, rigid_or_none
 from splatctrl_cli.recording.log.state_track import RawTrack
 from splatctrl_cli.records import Float64, Stamps
+
+
+def _refuse_unreadable(path: Path) -> AbstractContextManager[None]:
+    faults = (OSError, UnicodeDecodeError, csv.Error)
+    return refuse_faults(f"{path}: cannot be read as CSV", *faults, remedy="check the file")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,10 +76,8 @@ class CsvTable:
             lines = ((reader.line_num, row) for row in reader if row)
             next(lines, None)
             while True:
-                try:
+                with _refuse_unreadable(self.path):
                     rows = dict(islice(lines, BLOCK))
-                except (OSError, UnicodeDecodeError, csv.Error) as error:
-                    raise _unreadable(self.path, error) from None
                 if not rows:
                     return
                 for number, row in rows.items():
@@ -110,22 +114,10 @@ class CsvTable:
 
 def read_csv(path: Path) -> CsvTable:
     """Open a CSV. Raises InputError without states."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = list(islice((line for line in csv.reader(stream) if line), 2))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise _unreadable(path, error) from None
+    with _refuse_unreadable(path), path.open(newline="", encoding="utf-8-sig") as stream:
+        lines = list(islice((line for line in csv.reader(stream) if line), 2))
     refuse_if(len(lines) < 2, f"{path}: expected joint states, got none", remedy="record them again")
     return CsvTable(path=path, names=[name.strip().lstrip("# ") for name in lines[0]])
-
-
-def _unreadable(path: Path, error: Exception) -> InputError:
-    return InputError(f"{path}: cannot be read as CSV: {error}", remedy="check the file")
-
-
-def is_libfranka(table: CsvTable) -> bool:
-    """True for the columns of franka::logToCSV."""
-    return table.names[0] in {"time", "duration"} and _first(table, "q", 0) is not None
 
 
 def libfranka_track(table: CsvTable) -> RawTrack:
@@ -135,6 +127,11 @@ def libfranka_track(table: CsvTable) -> RawTrack:
     prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second columns ``dq_d``
     (libfranka, src/log.cpp, src/logging/robot_state_log.cpp). O_T_EE is the end effector's pose by columns.
     """
+    refuse_if(
+        table.names[0] not in {"time", "duration"} or _first(table, "q", 0) is None,
+        f"{table.path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
+        remedy="describe the columns in a .toml and give that (splatctrl help replay, Logs)",
+    )
     num = len(NAMELESS)
     position = require(
         _block(table, "q", num),
@@ -192,10 +189,6 @@ def _sent(table: CsvTable, num: int) -> list[int] | None:
 
 
 INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_index"
-
-
-def is_lerobot(path: Path) -> bool:
-    return (path / INFO).is_file() and (path / "data").is_dir()
 
 
 def lerobot_preset(folder: Path, episode: int | None) -> Mapping[str, Any]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from pinocchio.rpy import rpyToMatrix
@@ -55,7 +56,9 @@ def test_coefficients_that_no_model_has_or_that_show_hardly_anything_are_refused
 ) -> None:
     expect_refusal(said, undistort_lens, SMALL, model, np.array(coefficients))
     image = np.random.default_rng(1).integers(0, 256, (30, 40, 3)).astype(np.uint8)
-    assert np.array_equal(undistort_lens(SMALL, "plumb_bob", np.zeros(5)).color(image), image), "none changes nothing"
+    assert np.array_equal(undistort_lens(SMALL, "plumb_bob", np.zeros(5)).remap(image, cv2.INTER_LINEAR), image), (
+        "none changes nothing"
+    )
     barrel = undistort_lens(SMALL, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0]))
     assert barrel.valid is None, "shows every pixel of its own pinhole"
 
@@ -72,7 +75,7 @@ def test_a_distorted_point_lands_where_the_pinhole_puts_it(model: str) -> None:
     columns, rows = np.meshgrid(np.arange(400), np.arange(300))
     spot = np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 18.0)
     image = np.repeat((255 * spot).astype(np.uint8)[..., None], 3, axis=2)
-    flat = undistort_lens(big, model, np.array([k1, 0, 0, 0])).color(image)[..., 0].astype(float)
+    flat = undistort_lens(big, model, np.array([k1, 0, 0, 0])).remap(image, cv2.INTER_LINEAR)[..., 0].astype(float)
     found = np.array([(flat * columns).sum(), (flat * rows).sum()]) / flat.sum()
     assert found == pytest.approx([400 * x + 199.5, 400 * y + 149.5], abs=0.5)
 
