@@ -37,12 +37,8 @@ class Rows:
     num_hidden: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Widths:
-    """Limits of residuals that count: reach [m], and cut [sigma] (default: the reach alone)."""
-
-    reach: float
-    cut: float = np.inf
+Widths = tuple[float, float]
+"""Limits of residuals that count: reach [m], and cut [sigma], inf for the reach alone."""
 
 
 @dataclass(kw_only=True)
@@ -110,18 +106,18 @@ class Adjustment:
 
     def normal(self, estimate: Estimate, widths: Widths, *, with_robot: bool = True) -> Normal:
         """The normal equations, optionally without the robot."""
-        P = self.unknowns.size
+        P, (reach, cut) = self.unknowns.size, widths
         H, g = np.zeros((P, P)), np.zeros(P)
         scores: list[Float64] = []
         numbers: dict[tuple[str, int], int] = {}
         counts: dict[tuple[str, str], int] = {}
         deviations: list[Float64] = []
-        for rows in self.rows(estimate, widths.reach, with_robot=with_robot):
+        for rows in self.rows(estimate, reach, with_robot=with_robot):
             if not len(rows.residual):
                 continue
             deviation = np.abs(rows.residual) / rows.sigma
-            cut = np.minimum(widths.reach / rows.sigma, widths.cut)
-            weight = np.where(deviation < cut, np.square(1 - np.square(deviation / cut)), 0.0)
+            width = np.minimum(reach / rows.sigma, cut)
+            weight = np.where(deviation < width, np.square(1 - np.square(deviation / width)), 0.0)
             is_free = rows.columns >= 0
             columns, J = rows.columns[is_free], rows.jacobian[:, is_free] / rows.sigma[:, None]
             weighed = J * weight[:, None]
@@ -183,9 +179,7 @@ class Adjustment:
         for i, j in self.evidence.pairs:
             yield self._overlap(views[i], views[j], *placed[i], *placed[j], estimate, reach)
         for frame in self.evidence.frames if with_robot else ():
-            rows = self._robot(frame, estimate, reach)
-            if rows is not None:
-                yield rows
+            yield from filter(None, [self._robot(frame, estimate, reach)])
 
     def _placed(self, item: DepthView | RgbdFrame, estimate: Estimate) -> tuple[Float64, Float64]:
         """T_world_camera, and its motion with the clock, camera frame."""

@@ -183,13 +183,8 @@ class Rig:
     held: Sequence[str] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class HandEye:
-    """X (4, 4) that keeps ``A X B`` constant (stays); distance [m]: median deviation."""
-
-    X: Float64
-    stays: Float64
-    distance: float
+HandEye = tuple[Float64, Float64, float]
+"""X (4, 4) that keeps ``A X B`` constant, that constant, and the median deviation [m] from it."""
 
 
 def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[str, Float64]:
@@ -208,12 +203,14 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
     for camera in [camera for camera in rig.recorded if camera not in rig.held]:
         try:
             if camera in rig.moving and stands:
-                found = hand_eye([(rig.recorded[camera][s.stamp_ns], s.T_camera_board) for s in by_camera[camera]])
-                _check_fit(found, f"{camera}, which moves,")
-                placed[camera], T_world_board = found.X, found.stays
+                X, stays, off = hand_eye(
+                    [(rig.recorded[camera][s.stamp_ns], s.T_camera_board) for s in by_camera[camera]]
+                )
+                _check_fit(off, f"{camera}, which moves,")
+                placed[camera], T_world_board = X, stays
             elif camera not in rig.moving and not stands and rig.arm is not None and not rig.held:
-                found = _carried(rig.arm, by_camera[camera])
-                placed[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ found.X
+                T_world_camera = _carried(rig.arm, by_camera[camera])
+                placed[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ T_world_camera
         except NotEvaluableError as error:
             reasons.append(error.message.removeprefix("calibrate: "))
     refuse_if(
@@ -241,14 +238,15 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
 def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> None:
     fewest = fixed.CALIBRATION_BOARD_FEWEST
     few = [f"{camera} in {len(its)}" for camera, its in by_camera.items() if len(its) < fewest]
-    if few:
-        seen = [camera for camera, its in by_camera.items() if len(its) >= fewest]
-        only = f"; only {seen[0]} sees it" if len(seen) == 1 and len(by_camera) > 1 else ""
-        raise NotEvaluableError(
-            f"calibrate: too few views of the board of {board} inner corners: {', '.join(few)} frames (expected"
-            f" {fewest}){only}",
-            remedy=f"hold its printed side, whole and lit, in view of every camera; {SHOW}",
-        )
+    seen = [camera for camera, its in by_camera.items() if len(its) >= fewest]
+    only = f"; only {seen[0]} sees it" if len(seen) == 1 and len(by_camera) > 1 else ""
+    refuse_if(
+        few,
+        f"calibrate: too few views of the board of {board} inner corners: {', '.join(few)} frames (expected"
+        f" {fewest}){only}",
+        remedy=f"hold its printed side, whole and lit, in view of every camera; {SHOW}",
+        error=NotEvaluableError,
+    )
     ratios = [s.depth_ratio for its in by_camera.values() for s in its if s.depth_ratio is not None]
     ratio = float(np.median(ratios)) if ratios else 1.0
     low, high = fixed.CALIBRATION_BOARD_DEPTH
@@ -273,7 +271,7 @@ def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool
     return True
 
 
-def _carried(arm: Arm, sightings: Sequence[Sighting]) -> HandEye:
+def _carried(arm: Arm, sightings: Sequence[Sighting]) -> Float64:
     """T_world_camera of a camera that sees the board on the best-fitting link."""
     fits: list[HandEye] = []
     reasons = ["no joint states at its frames"]
@@ -284,22 +282,22 @@ def _carried(arm: Arm, sightings: Sequence[Sighting]) -> HandEye:
         except NotEvaluableError as error:
             reasons.append(error.message)
     refuse_if(not fits, reasons[-1], error=NotEvaluableError)
-    best = min(fits, key=lambda fit: fit.distance)
-    _check_fit(best, f"the board before {sightings[0].camera}, on the link that fits best,")
-    return best
+    X, _, off = min(fits, key=lambda fit: fit[2])
+    _check_fit(off, f"the board before {sightings[0].camera}, on the link that fits best,")
+    return X
 
 
-def _check_fit(found: HandEye, what: str) -> None:
+def _check_fit(off: float, what: str) -> None:
     refuse_if(
-        found.distance > fixed.CALIBRATION_BOARD_FIT,
-        f"calibrate: {what} does not move with the robot: {1e3 * found.distance:.0f} mm off (expected"
+        off > fixed.CALIBRATION_BOARD_FIT,
+        f"calibrate: {what} does not move with the robot: {1e3 * off:.0f} mm off (expected"
         f" {1e3 * fixed.CALIBRATION_BOARD_FIT:.0f})",
         error=NotEvaluableError,
     )
 
 
 def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
-    """X (4, 4) with the same ``A X B`` for all pairs (A, B).
+    """X (4, 4) with the same ``A X B`` for all pairs (A, B), that product, and their median deviation [m].
 
     From ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: X turns the right's rotation vectors into the left's, and its
     translation is linear (after Park and Martin, Robot sensor calibration, 1994). Outliers are dropped once. Raises
@@ -321,7 +319,7 @@ def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
             break
         near = away <= 3 * np.median(away) + 1e-9
         pairs = [pair for pair, is_near in zip(pairs, near.tolist(), strict=True) if is_near]
-    return HandEye(X=X, stays=stays, distance=float(np.median(away)))
+    return X, stays, float(np.median(away))
 
 
 def _hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> Float64:

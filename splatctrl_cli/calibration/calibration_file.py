@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.geometry import quat_from_rotation, transform_from
@@ -117,9 +117,11 @@ def read_calibration(path: Path) -> Calibration:
         f"{path}: expected a calibration, got another file",
         remedy="give what calibrate wrote",
     )
-    if content.get("version") != VERSION:
-        found = content.get("version")
-        raise InputError(f"{path}: expected version {VERSION}, got {found}", remedy="use a newer splatctrl")
+    refuse_if(
+        content.get("version") != VERSION,
+        f"{path}: expected version {VERSION}, got {content.get('version')}",
+        remedy="use a newer splatctrl",
+    )
     with refuse_faults(
         lambda error: f"{path}: damaged: {type(error).__name__}: {error}",
         KeyError,

@@ -217,13 +217,11 @@ class Arm:
 
     def travel(self, stamps: list[int]) -> float:
         """The largest distance [m] of any link from its first pose."""
-        places = []
-        for stamp in stamps:
-            poses = self.surface_poses(stamp)
-            if poses is not None:
-                places.append(
-                    np.concatenate([poses[:, :3, 3], *[transform_points(T, 0.1 * np.eye(3)) for T in poses]])
-                )
+        posed = [poses for stamp in stamps if (poses := self.surface_poses(stamp)) is not None]
+        places = [
+            np.concatenate([poses[:, :3, 3], *[transform_points(T, 0.1 * np.eye(3)) for T in poses]])
+            for poses in posed
+        ]
         if len(places) < 2:
             return 0.0
         return float(np.linalg.norm(np.array(places) - places[0], axis=2).max())

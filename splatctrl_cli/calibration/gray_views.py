@@ -119,7 +119,7 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
         residuals=distance * weight,
         by_twists=by_twists(own, there, normals, T) * weight[:, None],
         own=number,
-        by_own=_stretched(own, normals, T) * weight,
+        by_own=np.einsum("ki,ki->k", normals @ T[:3, :3], own) * weight,  # a farther point moves along its ray
         other=v * b.gray.shape[1] + u,
         by_other=-np.einsum("ki,ki->k", normals, surface) * weight,
     )
@@ -137,15 +137,10 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
         residuals=np.concatenate([depth.residuals, difference * weight]),
         by_twists=np.vstack([depth.by_twists, by_twists(own, there, gradient, T) * weight[:, None]]),
         own=np.tile(depth.own, 2),
-        by_own=np.concatenate([depth.by_own, _stretched(own, gradient, T) * weight]),
+        by_own=np.concatenate([depth.by_own, np.einsum("ki,ki->k", gradient @ T[:3, :3], own) * weight]),
         other=np.tile(depth.other, 2),
         by_other=np.concatenate([depth.by_other, np.zeros(len(own))]),
     )
-
-
-def _stretched(own: Float64, gradient: Float64, T: Float64) -> Float64:
-    """Derivatives by log-depth (K,) of a value with gradient (K, 3), at T (4, 4)."""
-    return np.asarray(np.einsum("ki,ki->k", gradient @ T[:3, :3], own))
 
 
 def on_surface(

@@ -252,7 +252,11 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
         return FoundBends()
     halves = [[view for view, of_half in zip(views, rank % 2 == k, strict=True) if of_half] for k in (0, 1)]
     told = [_joint(half, chosen, scale) for half in halves]
-    alike = {name: _likeness(told[0][name], told[1][name]) for name in chosen}
+    both = {name: (told[0][name], told[1][name]) for name in chosen}
+    alike = {
+        name: float(np.vdot(a, b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
+        for name, (a, b) in both.items()
+    }
     unlike = tuple(name for name in chosen if alike[name] < fixed.BEND_ALIKE)
     chosen = [name for name in chosen if name not in unlike]
     if not chosen:
@@ -281,10 +285,6 @@ def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) ->
     )
     _solved(views, poses, overlapping(views, poses, every, every), every, bends)
     return dict(zip(cameras, np.round(bends.grids / scale, 7), strict=True))
-
-
-def _likeness(a: Float64, b: Float64) -> float:
-    return float(np.vdot(a, b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
 
 
 def _solved(

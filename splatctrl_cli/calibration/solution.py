@@ -12,8 +12,8 @@ from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Float64
 
-WIDE = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_REACHES)
-FREED = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_FREED)
+WIDE = tuple((reach, np.inf) for reach in fixed.CALIBRATION_REACHES)
+FREED = tuple((reach, np.inf) for reach in fixed.CALIBRATION_FREED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,14 +93,14 @@ def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution
 
 def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]:
     """Misfits; inf with few comparable points, where a good fit means little."""
-    fits = [adjustment.cost(one, WIDE[-1].reach) for one in estimates]
+    fits = [adjustment.cost(one, WIDE[-1][0]) for one in estimates]
     most = max(num for _, num in fits)
     return [cost if 2 * num >= most else np.inf for cost, num in fits]
 
 
 def _better(a: Solution, b: Solution) -> Solution:
     """The better of two solutions. Raises NotEvaluableError if they fit alike."""
-    (cost_a, num_a), (cost_b, num_b) = (one.adjustment.cost(one.estimate, WIDE[-1].reach) for one in (a, b))
+    (cost_a, num_a), (cost_b, num_b) = (one.adjustment.cost(one.estimate, WIDE[-1][0]) for one in (a, b))
     if 2 * num_a < num_b or 2 * num_b < num_a:
         return a if num_a > num_b else b
     if abs(cost_a - cost_b) < fixed.CALIBRATION_OTHER[1] * min(cost_a, cost_b):
@@ -123,7 +123,7 @@ def _solution(adjustment: Adjustment, estimate: Estimate) -> Solution:
 def narrow(adjustment: Adjustment, estimate: Estimate) -> Widths:
     """Final widths: Tukey's, by the residuals' actual spread."""
     spread = adjustment.normal(estimate, WIDE[-1]).spread
-    return Widths(reach=WIDE[-1].reach, cut=fixed.CALIBRATION_TUKEY * max(spread, fixed.CALIBRATION_LEAST_SPREAD))
+    return WIDE[-1][0], fixed.CALIBRATION_TUKEY * max(spread, fixed.CALIBRATION_LEAST_SPREAD)
 
 
 def _starts(unknowns: Unknowns, start: Estimate) -> list[Estimate]:

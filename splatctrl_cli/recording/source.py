@@ -45,7 +45,7 @@ from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.log.survey import NAME as ROBOT
-from splatctrl_cli.recording.log.survey import RobotDescription, TopicSurvey, robot_descriptions, survey_to_describe
+from splatctrl_cli.recording.log.survey import TopicSurvey, robot_descriptions, survey_to_describe
 from splatctrl_cli.recording.log.video import SUFFIXES as VIDEOS
 from splatctrl_cli.recording.log.video import open_log
 from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
@@ -89,9 +89,9 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
     return open_source(paths[0], options) if log is None else calibrated(RosLogSource(log, options), options)
 
 
-def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:
-    """URDFs of logs and captures, each once with its path; skips other inputs."""
-    found: dict[str, tuple[Path, RobotDescription]] = {}
+def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, str, str]]:
+    """Path, topic or node, and text of logs' and captures' URDFs, each once; skips other inputs."""
+    found: dict[str, tuple[Path, str, str]] = {}
     for path in paths:
         said = []
         if is_capture(path):
@@ -99,8 +99,8 @@ def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescript
         elif path.exists() and not has_views(path):
             with suppress(InputError):  # who reads it says why
                 said = robot_descriptions(open_raw_log(path))
-        for description in said:
-            found.setdefault(description.text, (path, description))
+        for where, text in said:
+            found.setdefault(text, (path, where, text))
     return list(found.values())
 
 

@@ -195,10 +195,10 @@ class CameraAgreement:
         )[0]
         for finding in [finding for finding in findings if finding.code == "views-scale"]:
             if not self._is_allowed:
+                remedy = rescale_remedy(self._units(), finding.value or 1.0)
                 raise InputError(
                     f"{self._name}: {finding.what}",
-                    remedy=f"{rescale_remedy(self._units(), finding.value or 1.0)}, or correct the poses' unit; if both"
-                    " are right, give --allow-disagreement",
+                    remedy=f"{remedy}, or correct the poses' unit; if both are right, give --allow-disagreement",
                 )
             console.log(f"warning: {self._name}: {finding.what}")
 

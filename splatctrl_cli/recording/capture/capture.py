@@ -28,7 +28,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     merge_joints,
     read_topics,
 )
-from splatctrl_cli.recording.log.survey import RobotDescription, Survey
+from splatctrl_cli.recording.log.survey import Survey
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, LossReport, UInt8
 
@@ -343,15 +343,15 @@ class CaptureSource(FrameSource):
         return file
 
 
-def read_robot_description(path: Path) -> list[RobotDescription]:
-    """A capture's URDF, if any. Raises InputError if changed."""
+def read_robot_description(path: Path) -> list[tuple[str, str]]:
+    """Name and text of a capture's URDF, if any. Raises InputError if changed."""
     file = path / ROBOT
     if not file.is_file():
         return []
     refuse_if(
         FileSums(path).get(ROBOT) != sha256(file), f"{file}: its checksum differs from SHA256SUMS", remedy=AGAIN
     )
-    return [RobotDescription(where=ROBOT, text=file.read_bytes().decode("utf-8"))]
+    return [(ROBOT, file.read_bytes().decode("utf-8"))]
 
 
 def _pose(row: Mapping[str, str]) -> Float64:

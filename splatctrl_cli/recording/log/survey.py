@@ -349,16 +349,8 @@ STRING, EVENT = "std_msgs/msg/String", "rcl_interfaces/msg/ParameterEvent"
 _TEXT = 4  # a parameter's type that is text (rcl_interfaces/ParameterType)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotDescription:
-    """A URDF and its topic or node."""
-
-    where: str
-    text: str
-
-
-def robot_descriptions(log: RawLog) -> list[RobotDescription]:
-    """A log's URDFs, each once, from first messages; reads only their topics."""
+def robot_descriptions(log: RawLog) -> list[tuple[str, str]]:
+    """Topic or node and text of a log's URDFs, each once, from first messages; reads only their topics."""
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     wanted = own or {t.name for t in topics if t.type_name == EVENT}
@@ -380,4 +372,4 @@ def robot_descriptions(log: RawLog) -> list[RobotDescription]:
         if own and own <= found.keys():
             break
     where = {text: name for name, text in reversed(found.items()) if text.strip()}
-    return [RobotDescription(where=name, text=text) for text, name in reversed(where.items())]
+    return [(name, text) for text, name in reversed(where.items())]

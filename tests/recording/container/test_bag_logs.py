@@ -124,7 +124,7 @@ def test_a_damaged_chunk_costs_itself_alone_and_a_cut_what_follows(
 ) -> None:
     bag = make_bag1(tmp_path / "x.bag", compression)
     records, data = list(Bag1Log(bag).records(Damage())), bag.read_bytes()
-    chunks = [record for record in records if record.kind == 5]
+    chunks = [record for record in records if record.opcode == 5]
     bag.write_bytes(change(data, data.index(chunks[1].body), records[-1].offset))
     found, damage = read(bag)
     assert len(found) in num
