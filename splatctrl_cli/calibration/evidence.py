@@ -222,9 +222,7 @@ class Arm:
             np.concatenate([poses[:, :3, 3], *[transform_points(T, 0.1 * np.eye(3)) for T in poses]])
             for poses in posed
         ]
-        if len(places) < 2:
-            return 0.0
-        return float(np.linalg.norm(np.array(places) - places[0], axis=2).max())
+        return 0.0 if len(places) < 2 else float(np.linalg.norm(np.array(places) - places[0], axis=2).max())
 
 
 def _velocities(before: Float64, after: Float64, poses: Float64, T_world_camera: Float64) -> Float64:

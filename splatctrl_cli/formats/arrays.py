@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from io import BytesIO
 from math import prod
@@ -78,11 +78,9 @@ def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
     """True for a ``.npz`` with these arrays; head: its first bytes."""
     if not head.startswith(b"PK\x03\x04"):
         return False
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {f"{name}.npy" for name in names} <= set(archive.namelist())
-    except (*DAMAGE, OSError):
-        return False
+    with suppress(*DAMAGE, OSError), zipfile.ZipFile(path) as archive:
+        return {f"{name}.npy" for name in names} <= set(archive.namelist())
+    return False
 
 
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
@@ -355,8 +353,7 @@ class ParquetFile(ArrayFile):
                 values = self._values(batch.column(name), name)
                 if self._only is not None:
                     values = values[self._values(batch.column(self._only[0]), self._only[0]) == self._only[1]]
-                if shape not in (None, values.shape[1:]):
-                    raise self._ragged(name)
+                self._refuse_ragged(shape not in (None, values.shape[1:]), name)
                 shape = values.shape[1:]
                 if len(values):
                     yield values
@@ -364,13 +361,13 @@ class ParquetFile(ArrayFile):
     def _values(self, column: Any, name: str) -> Array:
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
-        if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:
-            raise self._ragged(name)
+        lengths = column.value_lengths().to_numpy(zero_copy_only=False).tolist()
+        self._refuse_ragged(column.null_count or len(set(lengths)) > 1, name)
         inner = self._values(column.flatten(), name)
         return inner.reshape(len(column), -1, *inner.shape[1:])
 
-    def _ragged(self, name: str) -> InputError:
-        return InputError(f"{self.path}: {name}: ragged: its rows differ in length, or have none", remedy=_RAGGED)
+    def _refuse_ragged(self, is_ragged: object, name: str) -> None:
+        refuse_if(is_ragged, f"{self.path}: {name}: ragged: its rows differ in length, or have none", remedy=_RAGGED)
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:

@@ -148,12 +148,12 @@ def _read_binary(
     dtype = wanted.dtype(path, byte_order)
     for found in elements:
         start, end = end if found is wanted else start, found.end(content, end, byte_order)
-    if len(content) != end:
-        what = "cut short" if len(content) < end else "longer than its header says"
-        raise InputError(
-            f"{path}: {what}: expected {end} bytes ({length} of header and the data it promises), got {len(content)}",
-            remedy="copy or write the file again",
-        )
+    what = "cut short" if len(content) < end else "longer than its header says"
+    refuse_if(
+        len(content) != end,
+        f"{path}: {what}: expected {end} bytes ({length} of header and the data it promises), got {len(content)}",
+        remedy="copy or write the file again",
+    )
     return np.frombuffer(content, dtype, count=wanted.count, offset=start)
 
 
@@ -268,7 +268,14 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)
-    try:
+    with (
+        refuse_faults(
+            lambda error: f"{name}: line {reader.line_num}: no CSV text: {error}",
+            csv.Error,
+            remedy="correct the line",
+        ),
+        refuse_faults(f"{name}: no UTF-8 text", UnicodeDecodeError, remedy="give a CSV file"),
+    ):
         remedy = "give a CSV file with the columns x,y,z [m]"
         first = require(next(lines, None), f"{name}: has no points", remedy=remedy)
         columns, rest = _axes(name, first[1]), lines
@@ -278,10 +285,6 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
         while block := list(islice(rest, POINTS_PER_BLOCK)):
             yield _numbers(name, block, columns, len(first[1]))
             num_points += len(block)
-    except csv.Error as error:
-        raise InputError(f"{name}: line {reader.line_num}: no CSV text: {error}", remedy="correct the line") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{name}: no UTF-8 text: {error}", remedy="give a CSV file") from None
     refuse_if(not num_points, f"{name}: has a header and no points", remedy="add a line for each point")
 
 
@@ -291,13 +294,13 @@ def _axes(name: str, cells: Sequence[str]) -> list[int] | None:
         return None
     titles = [cell.strip().lstrip("\ufeff").lower() for cell in cells]
     for axis in AXES:
-        if titles.count(axis) != 1:
-            what = "no column" if axis not in titles else "several columns"
-            raise InputError(
-                f"{name}: {what} {axis}: expected a header with x, y and z, or three numbers a line, got"
-                f" {','.join(cells)[:60]!r}",
-                remedy="name the columns x,y,z; they are in metres",
-            )
+        what = "no column" if axis not in titles else "several columns"
+        refuse_if(
+            titles.count(axis) != 1,
+            f"{name}: {what} {axis}: expected a header with x, y and z, or three numbers a line, got"
+            f" {','.join(cells)[:60]!r}",
+            remedy="name the columns x,y,z; they are in metres",
+        )
     return [titles.index(axis) for axis in AXES]
 
 

@@ -191,9 +191,7 @@ def _find(content: Any, key: str) -> Any:
 def _short(value: object) -> object:
     if isinstance(value, list) and (len(value) > _LIST_LIMIT or any(isinstance(v, list | dict) for v in value)):
         return f"{len(value)} entries"
-    if isinstance(value, dict):
-        return {key: _short(item) for key, item in value.items()}
-    return value
+    return {key: _short(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
 def _kind(

@@ -69,9 +69,7 @@ def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSo
         if needs_depth and (refusal := lacks_depth(source)) is not None:
             raise refusal
         return source
-    if is_capture(path):
-        return CaptureSource(path, options)
-    return RosLogSource(open_log(path), options)
+    return CaptureSource(path, options) if is_capture(path) else RosLogSource(open_log(path), options)
 
 
 def lacks_depth(source: FrameSource) -> InputError | None:
@@ -213,9 +211,7 @@ def _first(entry: TopicSurvey) -> str:
     if calibration is not None:
         K = calibration.K
         return f"{calibration.width}x{calibration.height} fx {K[0, 0]:.1f} cx {K[0, 2]:.1f} cy {K[1, 2]:.1f}"
-    if entry.joints.first_names is not None:
-        return f"{len(entry.joints.first_names)} joints"
-    return "-"
+    return f"{len(entry.joints.first_names)} joints" if entry.joints.first_names is not None else "-"
 
 
 def _describe_folder(path: Path, options: SourceOptions) -> Summary:

@@ -71,12 +71,13 @@ def header_text(grid: DistanceGrid) -> str:
 def parse_header(name: str, text: str) -> dict[str, object]:
     """Parse a header. Raises InputError naming `name` if invalid or of another version."""
     with refuse_faults(f"{name}: header: not JSON", json.JSONDecodeError, remedy="bake it again"):
-        parsed = json.loads(text)
-    if not isinstance(parsed, dict) or parsed.get("version") != VERSION:
-        version = parsed.get("version") if isinstance(parsed, dict) else None
-        raise InputError(
-            f"{name}: header: expected version {VERSION}, got {version!r}", remedy="bake it again with this splatctrl"
-        )
+        parsed: dict[str, object] = json.loads(text)
+    version = parsed.get("version") if isinstance(parsed, dict) else None
+    refuse_if(
+        version != VERSION,
+        f"{name}: header: expected version {VERSION}, got {version!r}",
+        remedy="bake it again with this splatctrl",
+    )
     return parsed
 
 
@@ -320,9 +321,8 @@ def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
         raise InputError(f"{folder / PROGRESS}: not readable: {error!r}", remedy="bake without --resume") from None
     wanted = plan.as_dict()
     differs = [key for key in wanted if left.get(key) != wanted[key]]
-    if differs:
-        told = ", ".join(_difference(key, left.get(key), wanted[key]) for key in differs)
-        raise UsageError(f"{folder}: cannot be continued: {told}", remedy="bake without --resume")
+    changes = ", ".join(_difference(key, left.get(key), wanted[key]) for key in differs)
+    refuse_if(differs, f"{folder}: cannot be continued: {changes}", remedy="bake without --resume", error=UsageError)
     for name in plan.channels:
         path = folder / f"{name}.npy"
         size = CHANNELS[name].shape(plan.shape)

@@ -49,13 +49,13 @@ def iso_surface(grid: DistanceGrid) -> Any:
             vertices.append(found[0] + (start, 0.0, 0.0))
             faces.append(found[1].astype(np.int64) + count)
             count += len(found[0])
-    if not vertices:
-        is_any = lowest <= highest
-        got = f"values from {lowest:.4g} to {highest:.4g} m" if is_any else "no cell that has a distance"
-        raise NotEvaluableError(
-            f"surface: expected sdf to cross 0 m, got {got}",
-            remedy="bake with a smaller voxel",
-        )
+    got = f"values from {lowest:.4g} to {highest:.4g} m" if lowest <= highest else "no cell that has a distance"
+    refuse_if(
+        not vertices,
+        f"surface: expected sdf to cross 0 m, got {got}",
+        remedy="bake with a smaller voxel",
+        error=NotEvaluableError,
+    )
     return _joined(grid, np.concatenate(vertices), np.concatenate(faces))
 
 

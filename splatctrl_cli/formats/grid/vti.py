@@ -15,7 +15,7 @@ import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
-from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
+from splatctrl_cli.errors import refuse_faults, refuse_if, require
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
@@ -94,12 +94,12 @@ def read_vti(path: Path, *, with_values: bool = True) -> DistanceGrid:
 
 
 def _opened(path: Path) -> BinaryIO:
-    try:
+    missing, folder = "bake one with sdf-bake --formats vti", "give the field.vti in it"
+    with (
+        refuse_faults(lambda _: f"{path}: no such file", FileNotFoundError, remedy=missing),
+        refuse_faults(lambda _: f"{path}: expected a file, got a folder", IsADirectoryError, remedy=folder),
+    ):
         return path.open("rb")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file", remedy="bake one with sdf-bake --formats vti") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: expected a file, got a folder", remedy="give the field.vti in it") from None
 
 
 def _head(path: Path, stream: BinaryIO) -> tuple[DistanceGrid, dict[str, int]]:

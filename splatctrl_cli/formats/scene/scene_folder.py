@@ -162,19 +162,14 @@ class SceneFolder:
         with refuse_faults(f"{file}: cannot be read", OSError, ValueError):
             run = json.loads(file.read_text(encoding="utf-8"))
         for name in ("metrics", "inputs", "config"):
-            if not isinstance(run, dict) or not isinstance(run.get(name, {}), dict):
-                raise InputError(f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
+            is_object = isinstance(run, dict) and isinstance(run.get(name, {}), dict)
+            refuse_if(not is_object, f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
         return dict(run)
 
     @cached_property
     def parts(self) -> Parts:
         """Digests that check every opened file."""
         return Parts.of_run(self.path, self.run)
-
-    @property
-    def has_digests(self) -> bool:
-        """False for an older scene, whose files cannot be checked."""
-        return self.parts.digests is not None
 
     @property
     def made_from(self) -> dict[str, Any]:

@@ -203,9 +203,11 @@ def _harmonics(ply: PlyFile) -> Float32:
     """(N, K, 3); f_rest has each channel's in a row."""
     num_rest = sum(name.startswith("f_rest_") for name in ply.names)
     names = [f"f_rest_{index}" for index in range(num_rest)]
-    if num_rest not in REST_PER_DEGREE or not all(name in ply.names for name in names):
-        expected = ", ".join(map(str, REST_PER_DEGREE))
-        raise InputError(f"{ply.path}: f_rest_*: expected {expected} of them in a row from 0, got {num_rest}")
+    refuse_if(
+        num_rest not in REST_PER_DEGREE or not all(name in ply.names for name in names),
+        f"{ply.path}: f_rest_*: expected {', '.join(map(str, REST_PER_DEGREE))} of them in a row from 0, got"
+        f" {num_rest}",
+    )
     channels = [[f"f_dc_{channel}", *names[channel * num_rest // 3 :][: num_rest // 3]] for channel in range(3)]
     values = [[ply.column(name).astype(np.float32) for name in channel] for channel in channels]
     return np.ascontiguousarray(np.array(values).transpose(2, 1, 0))

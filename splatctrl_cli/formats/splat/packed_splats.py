@@ -197,9 +197,11 @@ def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tu
         f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}",
     )
     _, version, num, degree, bits, flags, _ = HEADER.unpack_from(head)
-    if version not in versions:
-        known = "2 or 3 in gzip and 4 in plain"
-        raise InputError(f"{path}: .spz version: expected {known}, got {version}", remedy="write it as version 3")
+    refuse_if(
+        version not in versions,
+        f"{path}: .spz version: expected 2 or 3 in gzip and 4 in plain, got {version}",
+        remedy="write it as version 3",
+    )
     refuse_if(
         degree > 3 or bits > 23, f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}"
     )
@@ -231,9 +233,8 @@ def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], by
         num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
         expected = num * sum(widths)
         body = stream.read(expected + 1)
-    if len(body) != expected:
-        got = "more" if len(body) > expected else len(body)
-        raise InputError(f"{path}: expected {expected} bytes for {num} splats, got {got}")
+    got = "more" if len(body) > expected else len(body)
+    refuse_if(len(body) != expected, f"{path}: expected {expected} bytes for {num} splats, got {got}")
     return num, bits, widths, body
 
 

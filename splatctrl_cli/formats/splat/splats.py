@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if, require
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.ply import PlyFile, read_table, write_table
 from splatctrl_cli.formats.splat.gaussian_ply import (
@@ -167,12 +167,13 @@ def read_shell(path: Path) -> SplatSet:
 def splats_of(ply: PlyFile) -> SplatSet:
     """A PLY table's splats. Raises as `read_ply`."""
     path = ply.path
-    if num := num_stretched(ply):
-        raise InputError(
-            f"{path}: expected isotropic splats (three equal scale_*), got {num} of {len(ply)} whose scales differ",
-            remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set;"
-            " score renders them as they are",
-        )
+    num = num_stretched(ply)
+    refuse_if(
+        num,
+        f"{path}: expected isotropic splats (three equal scale_*), got {num} of {len(ply)} whose scales differ",
+        remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set;"
+        " score renders them as they are",
+    )
     radii = sigma_of_log(str(path), "scale_0", log_sigmas(ply)[:, 0])
     splats = SplatSet(
         centers=centers_of(ply, radii),
@@ -254,10 +255,8 @@ def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
 
 
 def _known_format(path: Path) -> SplatFormat:
-    try:
+    with refuse_faults(lambda error: str(error.message), UsageError):
         return format_of(path)
-    except UsageError as error:
-        raise InputError(error.message) from None
 
 
 def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:

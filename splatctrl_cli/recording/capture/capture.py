@@ -201,9 +201,7 @@ class FileSums:
     def get(self, name: str) -> str | None:
         """Hexadecimal sha256 of a name's last line, or None."""
         at = int(np.searchsorted(self._keys, np.uint64(_key(name.encode())), side="right")) - 1
-        if at < 0 or int(self._keys[at]) != _key(name.encode()):
-            return None
-        return bytes(self._sums[at]).hex()
+        return None if at < 0 or int(self._keys[at]) != _key(name.encode()) else bytes(self._sums[at]).hex()
 
 
 def _key(name: bytes) -> int:

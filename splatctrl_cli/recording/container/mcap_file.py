@@ -321,6 +321,4 @@ def _attachment_length(head: bytes) -> int | None:
         if at + 4 > len(head):
             return None
         at += 4 + int.from_bytes(head[at : at + 4], "little")
-    if at + 8 > len(head):
-        return None
-    return at + 8 + int.from_bytes(head[at : at + 8], "little")
+    return None if at + 8 > len(head) else at + 8 + int.from_bytes(head[at : at + 8], "little")

@@ -282,9 +282,7 @@ def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
     if stamps.names:
         said = f"{description.path}: stamps.names: expected seconds, got {view.name!r}"
         return require(stamp_of_text(view.name), said, remedy="see splatctrl help input")
-    if stamps.rate is not None:
-        return round(_number(view.name) * SECOND_NS / stamps.rate)
-    return position * SECOND_NS
+    return round(_number(view.name) * SECOND_NS / stamps.rate) if stamps.rate is not None else position * SECOND_NS
 
 
 def _number(name: str) -> int:

@@ -205,9 +205,7 @@ def _foxglove_store() -> Any:
 def _kind(description: Any) -> object:
     """A field's type without array, sequence and string lengths."""
     kind, detail = description
-    if kind == Nodetype.NAME:
-        return detail
-    return detail[0] if kind == Nodetype.BASE else [_kind(detail[0])]
+    return detail if kind == Nodetype.NAME else detail[0] if kind == Nodetype.BASE else [_kind(detail[0])]
 
 
 TRANSFORM, OPTION = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32"
