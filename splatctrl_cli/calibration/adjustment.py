@@ -8,7 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.calibration.evidence import DEPTH, OF_CAMERA, POSE, Estimate, Evidence, Unknowns, twist_between
+from splatctrl_cli.calibration.evidence import (
+    DEPTH,
+    HELD,
+    OF_CAMERA,
+    POSE,
+    Estimate,
+    Evidence,
+    Unknowns,
+    twist_between,
+)
 from splatctrl_cli.calibration.views import DepthView, depth_sigma, landed, overlap_rows
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, transform_points
@@ -62,6 +71,7 @@ class Adjustment:
         """basis (P, K): directions of steps, None for all."""
         self.evidence = evidence
         self.unknowns = unknowns
+        self._clock = [unknowns.size - 1 if unknowns.has_clock else HELD]  # its column
         self._basis = np.eye(unknowns.size) if basis is None else basis
 
     def solved(
@@ -234,9 +244,7 @@ class Adjustment:
                     by_a @ twist_a + by_b @ twist_b,
                 ]
             ),
-            columns=np.concatenate(
-                [self.unknowns.columns(a.camera), self.unknowns.columns(b.camera), [self.unknowns.clock_column]]
-            ),
+            columns=np.concatenate([self.unknowns.columns(a.camera), self.unknowns.columns(b.camera), self._clock]),
             clusters=_cells(transform_points(T_b, there[which]), self.evidence.scale),
         )
 
@@ -264,9 +272,7 @@ class Adjustment:
             residual=found.residual[some],
             sigma=np.hypot(slope * depth_sigma(z), fixed.CALIBRATION_NOISE[0]),
             jacobian=jacobian,
-            columns=np.concatenate(
-                [self.unknowns.columns(frame.camera), np.full(OF_CAMERA, -1), [self.unknowns.clock_column]]
-            ),
+            columns=np.concatenate([self.unknowns.columns(frame.camera), np.full(OF_CAMERA, -1), self._clock]),
             clusters=found.links[some] * int(np.prod(fixed.CALIBRATION_TILES)) + found.tiles[some],
             num_hidden=found.num_hidden // step,
         )

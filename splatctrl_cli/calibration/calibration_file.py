@@ -85,11 +85,16 @@ def calibration_text(calibration: Calibration) -> str:
     for name, camera in calibration.cameras.items():
         where = "T_recorded_camera" if camera.moves else "T_world_camera"
         axes = "its own" if camera.moves else "the world's"
+        poses = {"mount" if camera.moves else "pose": camera.T, "recorded": camera.recorded}
+        texts = {
+            key: _numbers([*T[:3, 3], *quat_from_rotation(T[:3, :3])]) for key, T in poses.items() if T is not None
+        }
+        pose, *recorded = (f"{key} = {text}" for key, text in texts.items())
         lines += [
             "",
             f"[cameras.{_text(name)}]",
-            f"{'mount' if camera.moves else 'pose'} = {_pose_text(camera.T)}  # {where}: x, y, z [m], qx, qy, qz, qw",
-            *([] if camera.recorded is None else [f"recorded = {_pose_text(camera.recorded)}"]),
+            f"{pose}  # {where}: x, y, z [m], qx, qy, qz, qw",
+            *recorded,
             f"depth_scale = {float(camera.scale)!r}",
             f"depth_bias = {float(camera.bias)!r}  # [m]",
             f"sigma_position = {_numbers(camera.sigma_position)}  # [m], along {axes} axes",
@@ -214,10 +219,6 @@ def _pose(values: Sequence[Any]) -> Float64:
         error=ValueError,
     )
     return transform_from(numbers[:3], numbers[3:])
-
-
-def _pose_text(T: Float64) -> str:
-    return _numbers([*T[:3, 3], *quat_from_rotation(T[:3, :3])])
 
 
 def _numbers(values: Any) -> str:

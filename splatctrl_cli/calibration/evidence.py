@@ -71,11 +71,6 @@ class Unknowns:
             first += len(named)
         return at
 
-    @property
-    def clock_column(self) -> int:
-        """The clock's column, `HELD` if fixed."""
-        return self.size - 1 if self.has_clock else HELD
-
     def moved(self, estimate: Estimate, step: Float64) -> Estimate:
         """The estimate after a step (P,)."""
         corrections, depth = dict(estimate.corrections), dict(estimate.depth)

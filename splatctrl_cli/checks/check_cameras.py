@@ -88,7 +88,12 @@ def calibration_findings(
         if its is not None:
             yield from _distortion(info, its, topic, image_lens(found, topic, its))
     for camera in cameras:
-        yield from _sizes(found, camera)
+        for topic, info in ((camera.color, camera.info), (camera.depth, camera.depth_info or camera.info)):
+            image, its = found.topics[topic].first_image, found.topics[info].calibration if info else None
+            if image is not None and its is not None and its.width:
+                size, expected = (f"{one.width}x{one.height}" for one in (image, its))
+                text = f"{topic} is {size}, its CameraInfo {expected}"
+                yield from judge(ERROR if size != expected else None, "camera-info-size", info, text)
         yield from _rivals(found, camera)
 
 
@@ -111,15 +116,6 @@ def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens
     remedies = {ERROR: f"{remedy}, with D1,D2,... behind it if not", WARNING: remedy, NOTE: ""}
     says = "" if severity is NOTE else ", whose name says rectified"
     return judge(severity, "distortion", name, f"{text}{says}", remedies[severity])
-
-
-def _sizes(found: Survey, camera: CameraTopics) -> Iterator[Finding]:
-    for topic, info in ((camera.color, camera.info), (camera.depth, camera.depth_info or camera.info)):
-        image, its = found.topics[topic].first_image, found.topics[info].calibration if info else None
-        if image is not None and its is not None and its.width:
-            size, expected = (f"{one.width}x{one.height}" for one in (image, its))
-            text = f"{topic} is {size}, its CameraInfo {expected}"
-            yield from judge(ERROR if size != expected else None, "camera-info-size", info, text)
 
 
 def _rivals(found: Survey, camera: CameraTopics) -> Iterator[Finding]:

@@ -1,7 +1,7 @@
 """Checks of images: encodings, sizes, depth, and registration of depth to colour by edges."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
@@ -115,8 +115,8 @@ class ImageWatch:
         if factor != 1.0:
             self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
             self.medians[:] = [float(median * factor) for median in self.medians]
-            self.kept[:] = [replace(kept, pixels=_scaled(kept.pixels, factor)) for kept in self.kept]
-            self.thumbnails = [(stamp_ns, _scaled(image, factor)) for stamp_ns, image in self.thumbnails]
+            self.kept[:] = [replace(k, pixels=k.pixels * factor) if k.pixels.ndim == 2 else k for k in self.kept]
+            self.thumbnails = [(ns, image * factor if image.ndim == 2 else image) for ns, image in self.thumbnails]
 
     @property
     def is_float(self) -> bool:
@@ -132,11 +132,6 @@ class ImageWatch:
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
-
-
-def _scaled(image: NDArray[Any], factor: np.float32) -> NDArray[Any]:
-    """The image, times a factor if it is depth."""
-    return image * factor if image.ndim == 2 else image
 
 
 def _constant(depth: Float32) -> list[float]:
@@ -166,13 +161,12 @@ def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
     return Intrinsics(fx=lens.fx * across, fy=lens.fy * down, cx=cx, cy=cy, width=width, height=height)
 
 
-def _counted(kinds: Counter[Any], name: Callable[[Any], str] = str) -> str:
-    return ", ".join(f"{name(kind)} ({num})" for kind, num in kinds.most_common(4))
-
-
 def image_findings(images: ImageWatch) -> list[Finding]:
     where, num_bad = images.where, images.num_bad
-    sizes = _counted(images.sizes, lambda size: f"{size[0]}x{size[1]}")
+    most = [(f"{width}x{height}", num) for (width, height), num in images.sizes.most_common(4)]
+    sizes, encodings = (
+        ", ".join(f"{kind} ({num})" for kind, num in kinds) for kinds in (most, images.encodings.most_common(4))
+    )
     return [
         *judge(
             None if not num_bad else ERROR if num_bad == images.count else WARNING,
@@ -192,7 +186,7 @@ def image_findings(images: ImageWatch) -> list[Finding]:
             WARNING if len(images.encodings) > 1 else None,
             "encoding",
             where,
-            f"the encoding of the images changes: {_counted(images.encodings)}",
+            f"the encoding of the images changes: {encodings}",
             "record one encoding",
         ),
     ]
@@ -291,7 +285,7 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
     found: list[Finding] = []
     others: dict[str, tuple[str, float, float]] = {}
     for camera, spectra in edges.items():
-        surface = np.mean([_correlation(color, depth) for color, depth in spectra], axis=0)
+        surface = _correlate(spectra)
         dv, du, peak, runner_up = _peak(surface)
         width = surface.shape[1]
         if max(peak, 0.0) >= limits.EDGE_CLEAR and peak >= limits.EDGE_AHEAD * runner_up:
@@ -335,7 +329,7 @@ def _other(
     """The camera whose depth clearly fits this one's colour, and both scores (own first)."""
     pairs = {name: list(zip(edges[camera], its, strict=False)) for name, its in edges.items() if name != camera}
     scores = {
-        name: _at_zero(np.mean([_correlation(a[0], b[1]) for a, b in its], axis=0))
+        name: _at_zero(_correlate([(a[0], b[1]) for a, b in its]))
         for name, its in pairs.items()
         if all(a[0].shape == b[1].shape for a, b in its)
     }
@@ -365,9 +359,10 @@ def _transformed(image: Float32) -> Float64:
     return np.asarray(np.fft.rfft2(centred / length if length > 0 else centred))
 
 
-def _correlation(color: Float64, depth: Float64) -> Float64:
-    """(h, w) by shift of colour against depth edges, zero in the middle."""
-    return np.fft.fftshift(np.fft.irfft2(color * np.conj(depth)))
+def _correlate(edges: Sequence[tuple[Float64, Float64]]) -> Float64:
+    """(h, w) mean by shift of colour against depth edges, zero in the middle."""
+    surfaces = [np.fft.fftshift(np.fft.irfft2(color * np.conj(depth))) for color, depth in edges]
+    return np.asarray(np.mean(surfaces, axis=0))
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:

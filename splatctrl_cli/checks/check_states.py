@@ -47,7 +47,7 @@ class Spread:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PoseAgreement:
     """Logged end-effector poses against forward kinematics.
 
@@ -161,20 +161,20 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
     near = min(links, key=lambda link: _cost(_spread(links[link], logged)))
     difference = _spread(links[near], logged)
     if difference.is_small:
-        return _agreement("agree", near, len(chosen), difference, np.eye(4), difference)
+        return PoseAgreement("agree", near, len(chosen), difference, np.eye(4), difference)
     tools = {link: _explained(poses, logged) for link, poses in links.items()}
     bases = {link: _explained(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
     tool = min(tools, key=lambda link: (round(_cost(tools[link][1]), 6), _cost(_spread(links[link], logged))))
     base = min(bases, key=lambda link: _cost(bases[link][1]))
     travel = _spread(np.broadcast_to(logged[0], logged.shape), logged)
     if max(travel.max_position, travel.max_rotation) < limits.LINK_TRAVEL:
-        return _agreement("still", near, len(chosen), difference, np.eye(4), difference)
+        return PoseAgreement("still", near, len(chosen), difference, np.eye(4), difference)
     if tools[tool][1].is_small:
-        return _agreement("tool", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+        return PoseAgreement("tool", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
     if bases[base][1].is_small:
         offset, rest = bases[base]
-        return _agreement("base", base, len(chosen), _spread(links[base], logged), invert_transform(offset), rest)
-    return _agreement("disagree", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+        return PoseAgreement("base", base, len(chosen), _spread(links[base], logged), invert_transform(offset), rest)
+    return PoseAgreement("disagree", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
 
 
 def _posed(states: Sequence[JointState]) -> Index:
@@ -182,12 +182,6 @@ def _posed(states: Sequence[JointState]) -> Index:
         return np.zeros(0, dtype=np.int64)
     has_pose = (s.T_base_ee is not None or s.T_world_ee is not None for s in states)
     return np.flatnonzero(np.fromiter(has_pose, dtype=np.bool_, count=len(states)))
-
-
-def _agreement(
-    verdict: PoseVerdict, link: str, num: int, difference: Spread, offset: Float64, rest: Spread
-) -> PoseAgreement:
-    return PoseAgreement(verdict=verdict, link=link, num_poses=num, difference=difference, offset=offset, rest=rest)
 
 
 def _world(model: RobotModel, state: JointState) -> Float64:

@@ -112,13 +112,11 @@ class Rows:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Float64:
         return np.asarray(self[: len(self)], dtype=dtype)
 
-    def select(self, index: Index) -> "Rows":
-        """Rows of an index (K,), in its order."""
-        return Rows(self._file, index if self._index is None else self._index[index], self._columns)
-
-    def of_columns(self, order: Index) -> "Rows":
-        """Rows with these columns, in that order."""
-        return Rows(self._file, self._index, order if self._columns is None else self._columns[order])
+    def select(self, index: Index | None = None, columns: Index | None = None) -> "Rows":
+        """Rows of an index (K,), and of columns, in their order."""
+        wanted = ((self._index, index), (self._columns, columns))
+        chosen = (old if new is None else new if old is None else old[new] for old, new in wanted)
+        return Rows(self._file, *chosen)
 
     def _read(self, first: int, last: int) -> Float64:
         if self._index is None:
@@ -133,13 +131,12 @@ Table = Float64 | Rows
 """Rows (T, ...) by number, slice or index: in memory, or in a file."""
 
 
-def selected(table: Table, index: Index) -> Table:
-    """Rows of an index (K,), in its order; a file is not read."""
-    return table.select(index) if isinstance(table, Rows) else table[index]
-
-
-def of_columns(table: Table, order: Index) -> Table:
-    return table.of_columns(order) if isinstance(table, Rows) else table[:, order]
+def select(table: Table, index: Index | None = None, columns: Index | None = None) -> Table:
+    """Rows of an index (K,), and of columns, in their order; a file is not read."""
+    if isinstance(table, Rows):
+        return table.select(index, columns)
+    rows = table if index is None else table[index]
+    return rows if columns is None else rows[:, columns]
 
 
 def blocks_of(table: Table) -> Iterator[Float64]:

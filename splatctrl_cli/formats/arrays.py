@@ -10,7 +10,6 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
 from io import BytesIO
 from math import prod
 from pathlib import Path
@@ -30,13 +29,8 @@ DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a 
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pieces:
-    """An array made during writing: `make` yields its values in C order."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    make: Callable[[], Iterable[Values]]
+Pieces = tuple[str, tuple[int, ...], Callable[[], Iterable[Values]]]
+"""An array made during writing: dtype, shape, and a maker of its values in C order."""
 
 
 def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) -> None:
@@ -44,13 +38,13 @@ def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) 
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
         for name, array in arrays.items():
-            size = np.dtype(array.dtype).itemsize * int(np.prod(array.shape))
+            dtype, shape = array[:2] if isinstance(array, tuple) else (array.dtype, array.shape)
+            size = np.dtype(dtype).itemsize * int(np.prod(shape))
             with archive.open(f"{name}.npy", "w", force_zip64=size >= 2**30) as stream:
-                if isinstance(array, Pieces):
-                    np.lib.format.write_array_header_1_0(
-                        stream, {"descr": array.dtype, "fortran_order": False, "shape": array.shape}
-                    )
-                    for piece in array.make():
+                if isinstance(array, tuple):
+                    header = {"descr": dtype, "fortran_order": False, "shape": shape}
+                    np.lib.format.write_array_header_1_0(stream, header)
+                    for piece in array[2]():
                         stream.write(piece.tobytes())
                 else:
                     np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)

@@ -74,7 +74,7 @@ def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSo
 
 def lacks_depth(source: FrameSource) -> InputError | None:
     """The error for missing depth, possible only in image folders."""
-    return source.no_depth() if isinstance(source, ImageFolderSource) and not source.has_depth else None
+    return source.depth_fault if isinstance(source, ImageFolderSource) and not source.has_depth else None
 
 
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
@@ -143,22 +143,20 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     """Topics, times, frames, cameras, and what a reconstruction misses."""
     found, sampling = survey_to_describe(log)
-    with_messages = [t for t in found.topics.values() if t.count]
+    logged = [t for t in found.topics.values() if t.count]
+    first, last = min((t.first_log_ns for t in logged), default=0), max((t.last_log_ns for t in logged), default=0)
+    times = {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
+    frames = {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
+    joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
+    robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
     facts: dict[str, object] = {
         "bytes": sum(file.stat().st_size for file in log.files),
         "messages": found.num_messages,
+        **(times if logged else {}),
+        **(frames if found.tf.frames else {}),
+        **({"joints": list(joints)} if joints else {}),
+        **({ROBOT: robots} if robots else {}),
     }
-    if with_messages:
-        first, last = min(t.first_log_ns for t in with_messages), max(t.last_log_ns for t in with_messages)
-        facts |= {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
-    if found.tf.frames:
-        facts |= {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
-    joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
-    if joints:
-        facts["joints"] = list(joints)
-    robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
-    if robots:
-        facts[ROBOT] = robots
     rows = [_topic_row(found.topics[name]) for name in sorted(found.topics)]
     grids = [
         Grid(
@@ -238,15 +236,18 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     entries = [path / name for name in names_in(path)[:1000]]
     rows = [[file.name + "/" if file.is_dir() else file.name, *files_below(file)] for file in entries]
     count, size = files_below(path)
-    facts: dict[str, object] = {"files": count, "bytes": size}
-    if "splats.ply" in names:
-        facts["splats"] = describe_file(path / "splats.ply").facts
-    if "occupancy.npz" in names:
-        facts["space"] = _known_space(path, has_run="run.json" in names)
-    facts |= field
-    if "run.json" in names and not field:
-        run = describe_file(path / "run.json").facts
-        facts["run"] = {key: value for key, value in run.items() if key != "config"}  # `info run.json` shows it
+    has_run, is_run = "run.json" in names, "run.json" in names and not field
+    run = describe_file(path / "run.json").facts if is_run else {}
+    facts: dict[str, object] = {
+        "files": count,
+        "bytes": size,
+        **({"splats": describe_file(path / "splats.ply").facts} if "splats.ply" in names else {}),
+        **({"space": _known_space(path, has_run=has_run)} if "occupancy.npz" in names else {}),
+        **field,
+        **(
+            {"run": {key: value for key, value in run.items() if key != "config"}} if is_run else {}
+        ),  # `info run.json`
+    }
     grid = Grid(name="files", header=("name", "files", "bytes"), rows=rows)
     return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,))
 
@@ -299,20 +300,13 @@ def _describe_capture(path: Path) -> Summary:
 def _describe_images(path: Path, source: ImageFolderSource, kind: str) -> Summary:
     first = next((item for item in source.stored() if isinstance(item, StoredFrame)), None)
     counts = {name: sum(camera == name for _, camera, _ in source.poses()) for name in source.cameras}
-    facts: dict[str, object] = {"has_clock": source.has_clock}
-    if first is not None:
-        valid = first.frame.depth > 0
-        intrinsics = first.frame.intrinsics
-        facts |= {
-            "size": f"{intrinsics.width}x{intrinsics.height}",
-            "fx_fy_cx_cy": [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
-            "first_valid_depth_share": round(float(valid.mean()), 4),
-        }
-    loss = source.loss
-    facts["loss"] = {
-        "unpaired_color": loss.unpaired_color,
-        "unpaired_depth": loss.unpaired_depth,
-        "without_pose": loss.without_pose,
+    loss, k = source.loss, None if first is None else first.intrinsics
+    seen = {} if first is None else {"first_valid_depth_share": round(float((first.depth > 0).mean()), 4)}
+    facts: dict[str, object] = {
+        "has_clock": source.has_clock,
+        **({} if k is None else {"size": f"{k.width}x{k.height}", "fx_fy_cx_cy": [k.fx, k.fy, k.cx, k.cy]}),
+        **seen,
+        "loss": {name: getattr(loss, name) for name in ("unpaired_color", "unpaired_depth", "without_pose")},
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
     refusal = lacks_depth(source)

@@ -27,19 +27,12 @@ class CameraTopics:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseTopic:
-    """A topic of poses; frame: what it poses, "" for the messages' or the camera's."""
-
-    topic: str
-    frame: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
 class SourceOptions:
     """The user's settings for an input; the defaults fit a well-formed log.
 
     world_frame: of poses (default: tf's root). cameras: only these (default: all). By camera name: camera_topics;
-    camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf has none; human_topics:
+    camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf has
+    none, with the frame that they pose or ""; human_topics:
     images not 0 on a person; intrinsics: fx, fy, cx, cy [px] and distortion coefficients. depth_scale [m per count].
     root: of an image folder's files. holdout: its frames (index or name) for camera `holdout`. stamps: ``header`` or
     ``log``. calibration: a file of `calibrate`. perturb: changes to frames (`calibrated`).
@@ -49,7 +42,7 @@ class SourceOptions:
     cameras: tuple[str, ...] | None = None
     camera_topics: tuple[CameraTopics, ...] = ()
     camera_poses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    camera_pose_topics: Mapping[str, PoseTopic] = field(default_factory=dict)
+    camera_pose_topics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     human_topics: Mapping[str, str] = field(default_factory=dict)
     intrinsics: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     depth_scale: float | None = None
@@ -78,8 +71,7 @@ class SourceOptions:
             )
 
 
-def still_note(camera: str) -> str:
-    return f"camera {camera}: stands still where --camera-pose puts it, not where the recording may say"
+still_note = "camera {}: stands still where --camera-pose puts it, not where the recording may say".format
 
 
 def refuse_unknown_cameras(where: Path, asked: Iterable[str], known: Collection[str]) -> None:

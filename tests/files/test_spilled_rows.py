@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.files import spilled_rows
-from splatctrl_cli.files.spilled_rows import RowFile, Rows, scratch_folder, selected
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, scratch_folder, select
 from splatctrl_cli.formats import arrays
 from splatctrl_cli.recording.log import state_columns
 from splatctrl_cli.recording.log.state_columns import StateCollector
@@ -45,10 +45,10 @@ def test_rows_are_read_as_those_of_an_array(monkeypatch: pytest.MonkeyPatch, in_
     assert (len(table), table.shape) == (40, (40, 3))
     assert np.array_equal(table[5:9], values[5:9]) and np.array_equal(table[-1], values[-1])
     assert np.array_equal(table[far], values[far]) and not len(table[40:50])
-    chosen = table.select(far).of_columns(np.array([2, 0]))
+    chosen = table.select(far).select(columns=np.array([2, 0]))
     assert np.array_equal(chosen[1:4], values[far][1:4][:, [2, 0]])
     assert np.array_equal(chosen.select(np.array([3, 0]))[:2], values[[17, 39]][:, [2, 0]])
-    assert np.array_equal(selected(values, far), values[far])
+    assert np.array_equal(select(values, far), values[far])
     table[0:1][0, 0] = 9.0  # a copy
     assert table[0][0] == 0.0
     with pytest.raises(ValueError, match="expected"):

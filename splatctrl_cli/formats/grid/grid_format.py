@@ -248,7 +248,7 @@ class GridSlabs:
         )
         num = len(slab[self.plan.channels[0]])
         for name in self.plan.channels:
-            wanted = (CHANNELS[name].dtype, self._shape(name, num))
+            wanted = (CHANNELS[name].dtype, CHANNELS[name].shape((num, *self.plan.shape[1:])))
             values = slab[name]
             refuse_if(
                 (values.dtype.str, values.shape) != wanted or num + self.num_layers > self.plan.shape[0],
@@ -280,12 +280,11 @@ class GridSlabs:
             header=dict(header),
         )
 
-    def _shape(self, name: str, num_layers: int) -> tuple[int, ...]:
-        return CHANNELS[name].shape((num_layers, *self.plan.shape[1:]))
-
     def _write_channel(self, name: str, values: Values) -> None:
         path = self.folder / f"{name}.npy"
-        layer = np.dtype(CHANNELS[name].dtype).itemsize * int(np.prod(self._shape(name, 1)))
+        layer = np.dtype(CHANNELS[name].dtype).itemsize * int(
+            np.prod(CHANNELS[name].shape((1, *self.plan.shape[1:])))
+        )
         with path.open("r+b") as stream:
             stream.seek(path.stat().st_size - layer * (self.plan.shape[0] - self.num_layers))
             stream.write(np.ascontiguousarray(values).data)

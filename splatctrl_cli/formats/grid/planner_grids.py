@@ -49,10 +49,10 @@ def write_curobo(path: Path, grid: DistanceGrid) -> None:
     )
     sides = np.array(shape, np.float64) - 1.0
     center = grid.origin + 0.5 * grid.voxel * sides - 0.5 * grid.voxel
-    features = Pieces(
-        dtype="<f4",
-        shape=(shape[0] * shape[1] * shape[2],),
-        make=lambda: (-layers.astype(np.float32, copy=False) for layers in slabs(distances)),
+    features: Pieces = (
+        "<f4",
+        (shape[0] * shape[1] * shape[2],),
+        lambda: (-layers.astype(np.float32, copy=False) for layers in slabs(distances)),
     )
     arrays: dict[str, Values | Pieces] = {
         "features": features,

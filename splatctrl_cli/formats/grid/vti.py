@@ -42,6 +42,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
     """Write the grid; NaN is kept. Raises InputError for invalid channels."""
     x, y, z = check_grid(grid)
     extent = f"0 {x - 1} 0 {y - 1} 0 {z - 1}"
+    origin, spacing = (" ".join(repr(float(v)) for v in values) for values in (grid.origin, [grid.voxel] * 3))
     arrays, offset = [], 0
     for name, values in grid.channels.items():
         arrays.append(
@@ -55,7 +56,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
         '<?xml version="1.0"?>',
         f"<VTKFile {' '.join(f'{key}={quoteattr(value)}' for key, value in _FILE.items())}>",
         *(f"  <!-- {line} -->" for line in _comments(grid)),
-        f'  <ImageData WholeExtent="{extent}" Origin="{_triple(grid.origin)}" Spacing="{_triple([grid.voxel] * 3)}">',
+        f'  <ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}">',
         "    <FieldData>",
         '      <Array type="String" Name="header" NumberOfTuples="1" format="ascii">',
         f"        {codes}",
@@ -170,10 +171,6 @@ def _values(path: Path, stream: BinaryIO, grid: DistanceGrid, name: str, start: 
 def _comments(grid: DistanceGrid) -> list[str]:
     names = ("sign", "frame", "units", "origin", "distance", "kernel", "length_scale", "weights")
     return [f"{name}: {grid.header[name]}".replace("--", "- -") for name in names if name in grid.header]
-
-
-def _triple(values: object) -> str:
-    return " ".join(repr(float(value)) for value in np.asarray(values, dtype=np.float64))
 
 
 def describe_vti(path: Path, head: bytes) -> Summary | None:

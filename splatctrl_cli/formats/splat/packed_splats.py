@@ -85,13 +85,11 @@ def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
     return replace(without_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
 
 
-def splat_bound(gaussians: GaussianSet) -> Differences:
-    """Half a step of each byte: 1/510 of colour and opacity, 1/256 of quaternions.
-
-    Four of 1/256 move a unit quaternion by at most 2/256, and turn by twice that: 0.9 degrees.
-    """
-    return Differences(center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0)
-
+# Half a step of each byte: 1/510 of colour and opacity, 1/256 of quaternions. Four of 1/256 move a unit quaternion by
+# at most 2/256, and turn by twice that: 0.9 degrees.
+SPLAT_BOUND = Differences(
+    center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0
+)
 
 MAGIC = 0x5053474E  # NGSP
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, number, degree, fraction bits, flags, reserved
@@ -314,7 +312,7 @@ ENTRIES = (
         write=write_splat,
         read=read_splat,
         held=held_by_splat,
-        bound=splat_bound,
+        bound=lambda _: SPLAT_BOUND,
         docs="""
 `.splat` | 32 bytes per Gaussian, no header | colour, opacity 1/510; rotation 0.9 degrees | labels, density,
     comments, view-dependent colour, colours outside 0 to 1

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if, require
+from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError, refuse_if, require
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.ply import PlyFile, read_table, write_table
 from splatctrl_cli.formats.splat.gaussian_ply import (
@@ -210,10 +210,10 @@ def check_splats(where: str, splats: SplatSet) -> None:
 FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(__package__, SplatFormat)}
 
 
-def format_of(path: Path) -> SplatFormat:
-    """The suffix's format, PLY without one. Raises UsageError if unknown."""
+def format_of(path: Path, error: type[SplatCtrlError] = UsageError) -> SplatFormat:
+    """The suffix's format, PLY without one. Raises `error` if unknown."""
     said = f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}"
-    return require(FORMATS.get(path.suffix.lower() or ".ply"), said, error=UsageError)
+    return require(FORMATS.get(path.suffix.lower() or ".ply"), said, error=error)
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
@@ -221,7 +221,7 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 
     Raises InputError if missing, truncated, unknown or invalid.
     """
-    kind = _known_format(path)
+    kind = format_of(path, InputError)
     if kind is not FORMATS[".ply"]:
         gaussians, comments = kind.read(path)
         is_round = not (_is_stretched(gaussians).any() or gaussians.harmonics[:, 1:].any())
@@ -235,7 +235,7 @@ def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
 
     If float32 would move them, an origin is subtracted, which the comment `ORIGIN` names. Raises as `read_splats`.
     """
-    if _known_format(path) is not FORMATS[".ply"]:
+    if format_of(path, InputError) is not FORMATS[".ply"]:
         splats, comments = read_splats(path)
         return splats, comments, splats.centers.astype(np.float64)
     ply = read_table(path, "vertex", REQUIRED)
@@ -252,11 +252,6 @@ def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
             moved.rows[name] = column
         named = " ".join(f"{value:.0f}" for value in origin)
         return _splats_or_gaussians(moved), {**comments, ORIGIN: named}, exact - origin
-
-
-def _known_format(path: Path) -> SplatFormat:
-    with refuse_faults(lambda error: str(error.message), UsageError):
-        return format_of(path)
 
 
 def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:
@@ -282,22 +277,22 @@ def describe_splats(path: Path, _head: bytes) -> Summary:
     """Summarise a splat file. Raises InputError for another kind."""
     found, comments = read_splats(path)
     gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
+    ranges: dict[str, Floats] = {}
+    if len(gaussians):
+        ranges = {
+            "lower_m": gaussians.centers.min(axis=0),
+            "upper_m": gaussians.centers.max(axis=0),
+            "sigma_m": np.percentile(gaussians.scales, [0, 50, 100]),
+            "opacity": np.percentile(gaussians.opacities, [0, 50, 100]),
+        }
+    labels = {label.name.lower(): int(np.count_nonzero(gaussians.labels == label)) for label in Label}
     facts: dict[str, object] = {
         "format": format_of(path).name,
         "splats": len(gaussians),
         "shape": "isotropic" if isinstance(found, SplatSet) else "anisotropic",
         "degree_of_harmonics": int(np.sqrt(gaussians.harmonics.shape[1])) - 1,
+        **({"labels": labels} if (gaussians.labels != Label.OBJECT).any() else {}),
+        **{name: [float(f"{value:.4g}") for value in values] for name, values in ranges.items()},
+        "comments": comments,
     }
-    if (gaussians.labels != Label.OBJECT).any():
-        facts["labels"] = {label.name.lower(): int(np.count_nonzero(gaussians.labels == label)) for label in Label}
-    if len(gaussians):
-        facts["lower_m"] = _rounded(gaussians.centers.min(axis=0))
-        facts["upper_m"] = _rounded(gaussians.centers.max(axis=0))
-        facts["sigma_m"] = _rounded(np.percentile(gaussians.scales, [0, 50, 100]))
-        facts["opacity"] = _rounded(np.percentile(gaussians.opacities, [0, 50, 100]))
-    facts["comments"] = comments
     return Summary(path=str(path), kind="splats", facts=facts)
-
-
-def _rounded(values: Floats) -> list[float]:
-    return [float(f"{value:.4g}") for value in values]

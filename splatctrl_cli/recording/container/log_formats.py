@@ -9,9 +9,10 @@ import shutil
 import tempfile
 import weakref
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -56,17 +57,14 @@ def unpack(path: Path, target: Path) -> str:
             written.write(piece)
 
 
-class UnpackedMessagesLog(JoinedLog):
-    """A log of zstd messages."""
-
-    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield unpacked messages; failures are counted."""
-        budget = Budget(sum(file.stat().st_size for file in self.files))
-        for message in super().messages(damage, names):
-            try:
-                yield replace(message, data=_unpacked_message(message.data, budget))
-            except BadBlockError as error:
-                damage.add(f"{message.topic.name}: a message was left out: {error}")
+def unpack_messages(messages: Iterable[RawMessage], damage: Damage, size: int) -> Iterator[RawMessage]:
+    """Yield unpacked zstd messages of a log of `size` bytes; failures are counted."""
+    budget = Budget(size)
+    for message in messages:
+        try:
+            yield replace(message, data=_unpacked_message(message.data, budget))
+        except BadBlockError as error:
+            damage.add(f"{message.topic.name}: a message was left out: {error}")
 
 
 def _unpacked_message(data: bytes, budget: Budget) -> bytes:
@@ -133,7 +131,8 @@ def open_raw_log(path: Path) -> RawLog:
         log = open_kind(path)
         first = () if isinstance(log, Bag1Log) else islice(log.messages(Damage()), 5)  # some may be damaged
         is_packed = any(m.topic.encoding == "cdr" and m.data.startswith(_ZSTD) for m in first)  # CDR begins with a 0
-        return UnpackedMessagesLog(path, (log,), log.container) if is_packed else log
+        unpack_all = partial(unpack_messages, size=sum(file.stat().st_size for file in log.files))
+        return JoinedLog(path, (log,), log.container, change=unpack_all) if is_packed else log
     if magic.startswith(_ZSTD):
         return _open_compressed(path)
     refuse_if(

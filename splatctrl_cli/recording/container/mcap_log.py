@@ -8,7 +8,7 @@ import struct
 import zlib
 from collections.abc import Collection, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from splatctrl_cli.errors import refuse_if
@@ -38,15 +38,8 @@ from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
 MOST_HEADS = 100_000  # records that are visited: a second or so
 
 
-@dataclass(frozen=True, kw_only=True)
-class LogIndex:
-    """Messages by channel, log times [ns], chunks in file order; notes: gaps."""
-
-    counts: dict[int, int]
-    first_ns: int
-    last_ns: int
-    chunks: tuple[ChunkIndex, ...]
-    notes: tuple[str, ...]
+LogIndex = tuple[dict[int, int], tuple[int, int], tuple[ChunkIndex, ...], tuple[str, ...]]
+"""Messages by channel, first and last log time [ns], chunks in file order, and what is missing, in words."""
 
 
 def index_by_heads(file: McapFile) -> LogIndex:
@@ -80,13 +73,8 @@ def index_by_heads(file: McapFile) -> LogIndex:
             num_heads += 1
     stamps += [stamp for c in chunks for stamp in (c.message_start_time, c.message_end_time)]
     notes = [] if offset + HEAD.size >= file.size else [f"counted up to byte {offset} of {file.size}"]
-    return LogIndex(
-        counts=counts,
-        first_ns=min(stamps, default=0),
-        last_ns=max(stamps, default=0),
-        chunks=tuple(chunks),
-        notes=("has no summary: counted by the heads of its records", *notes),
-    )
+    span_ns = min(stamps, default=0), max(stamps, default=0)
+    return counts, span_ns, tuple(chunks), ("has no summary: counted by the heads of its records", *notes)
 
 
 def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex:
@@ -130,13 +118,8 @@ class McapLog(RawLog):
         found, chunks = self._statistics, tuple(self._file.chunk_indexes())
         if found is None or len(chunks) != found.chunk_count:
             return index_by_heads(self._file)
-        return LogIndex(
-            counts=dict(found.channel_message_counts),
-            first_ns=found.message_start_time,
-            last_ns=found.message_end_time,
-            chunks=chunks,
-            notes=(),
-        )
+        span_ns = found.message_start_time, found.message_end_time
+        return dict(found.channel_message_counts), span_ns, chunks, ()
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.

@@ -1,8 +1,9 @@
 """Recorded messages as bytes, in file order; damage is counted, not raised."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -105,14 +106,21 @@ class RawLog:
 
 
 class JoinedLog(RawLog):
-    """Logs read in turn; `note` is a fault of the whole, counted as damage."""
+    """Logs read in turn, messages changed; `note` is a fault of the whole, counted as damage."""
 
     def __init__(
-        self, path: Path, parts: Sequence[RawLog], container: str, *, files: tuple[Path, ...] = (), note: str = ""
+        self,
+        path: Path,
+        parts: Sequence[RawLog],
+        container: str,
+        *,
+        files: tuple[Path, ...] = (),
+        note: str = "",
+        change: Callable[[Iterator[RawMessage], Damage], Iterator[RawMessage]] | None = None,
     ) -> None:
         self.path, self.container = path, container
         self.files = files or tuple(file for part in parts for file in part.files)
-        self._parts, self._note = parts, note
+        self._parts, self._note, self._change = parts, note, change
 
     def topics(self) -> tuple[Topic, ...]:
         return tuple(dict.fromkeys(topic for part in self._parts for topic in part.topics()))
@@ -120,5 +128,5 @@ class JoinedLog(RawLog):
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         if self._note:
             damage.add(self._note)
-        for part in self._parts:
-            yield from part.messages(damage, names)
+        messages = chain.from_iterable(part.messages(damage, names) for part in self._parts)
+        yield from messages if self._change is None else self._change(messages, damage)

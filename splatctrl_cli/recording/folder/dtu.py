@@ -339,12 +339,11 @@ def _camera_text(view: DtuView) -> str:
     K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
     known = view.depth[view.depth > 0].astype(np.float64) * MILLIMETRES
     near, far = (float(np.floor(known.min())), float(np.ceil(known.max()))) if known.size else (425.0, 935.0)
-    rows = ["extrinsic", *_rows(T_camera_world), "", "intrinsic", *_rows(K), "", f"{near:g} {(far - near) / 191:.6g}"]
+    pose, lens = (
+        [" ".join(f"{value + 0.0:.10g}" for value in row) for row in matrix] for matrix in (T_camera_world, K)
+    )
+    rows = ["extrinsic", *pose, "", "intrinsic", *lens, "", f"{near:g} {(far - near) / 191:.6g}"]
     return "\n".join(rows) + "\n"
-
-
-def _rows(matrix: Float64) -> list[str]:
-    return [" ".join(f"{value + 0.0:.10g}" for value in row) for row in matrix]
 
 
 def _pairs(views: Sequence[DtuView]) -> str:

@@ -20,10 +20,10 @@ from splatctrl_cli.recording.folder.folder_description import (
 )
 from splatctrl_cli.recording.folder.poses import (
     READERS,
-    Trajectory,
     read_matrix_blocks,
     read_matrix_file,
     stamp_of_text,
+    trajectory,
     world_camera,
 )
 from splatctrl_cli.recording.source_options import SourceOptions, still_note
@@ -246,8 +246,8 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
     file = root / table.file
     by_key = read_matrix_blocks(file, table.heading) if is_of_blocks else READERS[table.format](file)
     if table.format == "tum":
-        trajectory = Trajectory(by_key)
-        at_stamp = {name: trajectory.at(stamp) for name in colors if (stamp := stamp_of_text(name)) is not None}
+        pose_at = trajectory(by_key)
+        at_stamp = {name: pose_at(stamp) for name in colors if (stamp := stamp_of_text(name)) is not None}
         return {name: pose for name, pose in at_stamp.items() if pose is not None}
     if table.format == "nerfstudio":
         keys = {name: path.relative_to(root).as_posix() for name, path in colors.items()}

@@ -83,17 +83,15 @@ class ImageFolderSource(FrameSource):
         self.cameras = tuple(names) if options.cameras is None else options.cameras
         refuse_unknown_cameras(path, self.cameras, names)
         self._views = [view for view in self._views if view.camera in self.cameras]
+        self.depth_fault = InputError(
+            f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
+            remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
+        )
 
     @property
     def has_depth(self) -> bool:
         """True if any view has a depth file; without, every depth is 0."""
         return any(view.depth is not None for view in self._views)
-
-    def no_depth(self) -> InputError:
-        return InputError(
-            f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
-            remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
-        )
 
     @property
     def loss(self) -> LossReport:
@@ -145,12 +143,9 @@ class ImageFolderSource(FrameSource):
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
 
-    def digests(self) -> dict[str, str]:
-        """sha256 of description, pose files and images, by path below the root."""
-        return dict(self._digests)
-
     @cached_property
     def _digests(self) -> dict[str, str]:
+        """sha256 of description, pose files and images, by path below the root."""
         found: dict[str, Path] = {}
         for description in self._descriptions:
             lens = None if len(self._descriptions) == 1 else description.camera
@@ -181,7 +176,7 @@ class ImageFolderSource(FrameSource):
         valid = self._valid(view, lens)
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
         is_counts = lens.depth_lens is None and not (
-            view.depth is None or _is_float(self._description.depth.encoding, view.depth)
+            view.depth is None or self._description.depth.encoding == "float32" or view.depth.suffix == ".npy"
         )
         is_plain = lens.maps is None
         return StoredFrame(
@@ -255,7 +250,7 @@ class ImageFolderSource(FrameSource):
 
     def _recorded_depth(self, path: ImageFile, scale: float) -> Float32 | None:
         table = self._description.depth
-        if _is_float(table.encoding, path):
+        if table.encoding == "float32" or path.suffix == ".npy":  # which always has floats (nerfstudio)
             pixels = _float_pixels(path)
             if pixels is None:
                 return None
@@ -274,11 +269,6 @@ class ImageFolderSource(FrameSource):
         counts = np.where(counts == table.invalid, np.uint16(0), counts)
         self._num_invalid += num_invalid(counts)
         return metres(counts, scale)
-
-
-def _is_float(encoding: str, path: ImageFile) -> bool:
-    """True for floats, which every .npy has (nerfstudio)."""
-    return encoding == "float32" or path.suffix == ".npy"
 
 
 def _corrected(camera: CameraTable) -> Lens:

@@ -49,7 +49,7 @@ from splatctrl_cli.recording.folder.layout import (
     pair_stamps,
     read_json,
 )
-from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, read_rows, stamp_of_text
+from splatctrl_cli.recording.folder.poses import read_numbers, read_rows, stamp_of_text, trajectory
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import MILLIMETRE, Float64
 
@@ -62,7 +62,7 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
     root = _frames(folder)
     assert root is not None
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
-    pairs = pair_stamps(root / TRAJECTORY, colors, depths, Trajectory(_poses(root / TRAJECTORY)).at, options)
+    pairs = pair_stamps(root / TRAJECTORY, colors, depths, trajectory(_poses(root / TRAJECTORY)), options)
     lenses: list[CameraTable] = []
     pincams = {
         stamp: path

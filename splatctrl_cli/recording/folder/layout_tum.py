@@ -40,7 +40,7 @@ from splatctrl_cli.recording.folder.layout import (
     pose_or_none,
     read_K,
 )
-from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, rigid, stamp_of_text, tum_rows
+from splatctrl_cli.recording.folder.poses import read_numbers, rigid, stamp_of_text, trajectory, tum_rows
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
@@ -82,9 +82,9 @@ def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
     series = _series(folder)
     file = folder / "groundtruth.txt"
     rows = tum_rows(file) if file.is_file() else {}
-    trajectory, num_lost = Trajectory(rows), sum(T is None for T in rows.values())
+    num_lost = sum(T is None for T in rows.values())
     lost = (f"{file.name}: {num_lost} of {len(rows)} lines are no pose (nan)",) if num_lost else ()
-    pairs = pair_stamps(folder / "rgb.txt", colors, depths, trajectory.at, options)
+    pairs = pair_stamps(folder / "rgb.txt", colors, depths, trajectory(rows), options)
     return describe(
         move_poses(pairs, marker_to_camera) if series == "bonn" else pairs,
         folder,

@@ -138,31 +138,30 @@ def read_numbers(path: Path) -> list[float]:
     return [value for line in _lines(path) if not line.startswith("#") for value in _numbers(line.split(), str(path))]
 
 
-class Trajectory:
-    """A camera's poses by stamp [s, as text], interpolated like tf, never across None."""
+def trajectory(poses: Mapping[str, Float64 | None]) -> Callable[[int], Float64 | None]:
+    """A camera's T_world_camera (4, 4) at any stamp [ns], from poses by stamp [s, as text]; None where unknown.
 
-    def __init__(self, poses: Mapping[str, Float64 | None]) -> None:
-        self._tree = TfTree()
-        known, lost = [], []
-        for text, T in poses.items():
-            stamp_ns = stamp_of_text(text)
-            if stamp_ns is not None and T is not None:
-                known.append(stamp_ns)
-                self._tree.add("world", "camera", stamp_ns, T[:3, 3], quat_from_rotation(T[:3, :3]), static=False)
-            elif stamp_ns is not None:
-                lost.append(stamp_ns)
-        self._known, self._lost = np.array(sorted(known), dtype=np.int64), np.array(sorted(lost), dtype=np.int64)
+    Poses are interpolated like tf, never across None.
+    """
+    tree, known, lost = TfTree(), list[int](), list[int]()
+    for text, T in poses.items():
+        stamp_ns = stamp_of_text(text)
+        if stamp_ns is not None:
+            (lost if T is None else known).append(stamp_ns)
+        if stamp_ns is not None and T is not None:
+            tree.add("world", "camera", stamp_ns, T[:3, 3], quat_from_rotation(T[:3, :3]), static=False)
+    known_ns, lost_ns = np.array(sorted(known), dtype=np.int64), np.array(sorted(lost), dtype=np.int64)
 
-    def at(self, stamp_ns: int) -> Float64 | None:
-        """T_world_camera (4, 4); None where the trajectory does not reach."""
-        after = np.searchsorted(self._known, stamp_ns)
-        is_known = after < len(self._known) and self._known[after] == stamp_ns
-        before = self._known[after : after + 1] if is_known else self._known[max(after - 1, 0) : after]
-        later = self._known[after : after + 1]
+    def pose_at_stamp(stamp_ns: int) -> Float64 | None:
+        after = np.searchsorted(known_ns, stamp_ns)
+        is_known = after < len(known_ns) and known_ns[after] == stamp_ns
+        before = known_ns[after : after + 1] if is_known else known_ns[max(after - 1, 0) : after]
+        later = known_ns[after : after + 1]
         first, last = (part[0] if len(part) else stamp_ns for part in (before, later))
-        if ((self._lost >= first) & (self._lost <= last)).any():
-            return None
-        return self._tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
+        is_lost = ((lost_ns >= first) & (lost_ns <= last)).any()
+        return None if is_lost else tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
+
+    return pose_at_stamp
 
 
 def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:

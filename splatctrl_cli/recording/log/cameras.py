@@ -32,7 +32,7 @@ from splatctrl_cli.recording.log.messages import DEPTH, GRAY, OTHERS, word_of
 from splatctrl_cli.recording.log.registration import is_distorted, lens_model
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.recording.log.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video
-from splatctrl_cli.recording.source_options import CameraTopics, PoseTopic, SourceOptions
+from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.records import Float64
 
 _REGISTERED = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")  # in names of depth topics
@@ -217,56 +217,65 @@ def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
 
 def no_camera(log: RawLog, survey: Survey) -> InputError:
     """The error for a log without matching colour and depth."""
-    colors = [t.topic.name for t in image_topics(survey, "color")]
-    depths = [t.topic.name for t in image_topics(survey, "depth")]
+    colors, depths = ([t.topic.name for t in image_topics(survey, kind)] for kind in ("color", "depth"))
     broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
-    rgbd = [t for t in survey.topics.values() if t.count and t.topic.type_name.rpartition("/")[2].startswith("RGBD")]
-    if rgbd and not (colors and depths):
-        return InputError(
-            f"{log.path}: colour and depth are in one message, which is not read: {rgbd[0].topic.type_name} on"
-            f" {rgbd[0].topic.name}",
-            remedy="record the camera's own topics instead: colour and aligned depth images, their camera_info, tf",
-        )
-    named = _named_unlike(survey)
-    if not depths and (colors or named):
-        chosen = "; if one of these is depth, give --camera NAME=COLOR,DEPTH" if "(named " in named else ""
-        unread = "".join(f"; {note}" for note in survey.damage.remarks if any(name in note for name in broken))
-        return InputError(
-            f"{log.path}: no depth topic{named}{unread}; colour topics there: {listed(colors)}",
-            remedy="record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)"
-            f"{chosen}",
-        )
-    videos = sorted(t.topic.name for t in survey.topics.values() if t.count and is_video(t.topic))
-    if videos and not colors:
-        return _unread_video(f"{log.path}: colour is video ({', '.join(videos)})", has_depth=bool(depths))
-    lost = next((note for note in survey.damage.notes if KEY_FRAME in note), "")
-    if lost and not colors:
-        return InputError(f"{log.path}: no image of the video can be decoded ({lost})", remedy=OFTENER)
-    if broken:
-        notes = survey.damage.all_notes
-        why = next((note for note in notes if "image" in note or broken[0] in note), "see `splatctrl info`")
-        return InputError(
-            f"{log.path}: no image of {listed(broken)} can be decoded ({why.removeprefix(f'{broken[0]}: ')})",
-            remedy="record raw images, JPEG or PNG; decode video to images first",
-        )
-    if depths and not colors:
-        return InputError(
-            f"{log.path}: no colour topic{named}; depth topics there: {listed(depths)}",
-            remedy="record the colour images",
-        )
     topics = [t.topic for t in survey.topics.values() if t.count]
-    kinds = sorted({_kind(topic) for topic in topics})
+    rgbd = [f"{t.type_name} on {t.name}" for t in topics if t.type_name.rpartition("/")[2].startswith("RGBD")]
+    named, first = _named_unlike(survey), "".join(broken[:1])
+    chosen = "; if one of these is depth, give --camera NAME=COLOR,DEPTH" if "(named " in named else ""
+    unread = "".join(f"; {note}" for note in survey.damage.remarks if any(name in note for name in broken))
+    videos = ", ".join(sorted(topic.name for topic in topics if is_video(topic)))
+    lacks = "" if depths else "; and there is no depth topic"
+    codec, to_images = (
+        "which is neither H.264 nor H.265",
+        "`ros2 run image_transport republish` for ROS topics, else ffmpeg",
+    )
+    lost = next((note for note in survey.damage.notes if KEY_FRAME in note), "")
+    why = next((note for note in survey.damage.all_notes if "image" in note or first in note), "see `splatctrl info`")
+    kinds = listed(sorted({_kind(topic) for topic in topics}))
     formats = read_formats(log.path) or {topic.encoding for topic in topics}
     alien = sorted(formats - set(_ENCODINGS))
-    if alien and len(alien) == len(formats):
-        return InputError(
-            f"{log.path}: expected messages in {', '.join(_ENCODINGS)}, got {', '.join(alien)}: {listed(kinds)}",
-            remedy="convert the log, for example with `ros2 bag convert`",
-        )
-    return InputError(
-        f"{log.path}: no image topics; message types there: {listed(kinds)}",
-        remedy="expected sensor_msgs Image or CompressedImage",
-    )
+    reasons = [
+        (
+            rgbd and not (colors and depths),
+            f"colour and depth are in one message, which is not read: {''.join(rgbd[:1])}",
+            "record the camera's own topics instead: colour and aligned depth images, their camera_info, tf",
+        ),
+        (
+            not depths and (colors or named),
+            f"no depth topic{named}{unread}; colour topics there: {listed(colors)}",
+            f"record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without){chosen}",
+        ),
+        (
+            videos and not colors and not is_installed(LIBRARY),
+            f"colour is video ({videos}), for which the library {LIBRARY} is not installed{lacks}",
+            f"pip install 'splatctrl-cli[{EXTRA}]'",
+        ),
+        (
+            videos and not colors,
+            f"colour is video ({videos}), {codec}{lacks}",
+            f"decode it to images first: {to_images}",
+        ),
+        (lost and not colors, f"no image of the video can be decoded ({lost})", OFTENER),
+        (
+            broken,
+            f"no image of {listed(broken)} can be decoded ({why.removeprefix(f'{first}: ')})",
+            "record raw images, JPEG or PNG; decode video to images first",
+        ),
+        (
+            depths and not colors,
+            f"no colour topic{named}; depth topics there: {listed(depths)}",
+            "record the colour images",
+        ),
+        (
+            alien and len(alien) == len(formats),
+            f"expected messages in {', '.join(_ENCODINGS)}, got {', '.join(alien)}: {kinds}",
+            "convert the log, for example with `ros2 bag convert`",
+        ),
+        (True, f"no image topics; message types there: {kinds}", "expected sensor_msgs Image or CompressedImage"),
+    ]
+    what, remedy = next((what, remedy) for is_so, what, remedy in reasons if is_so)
+    return InputError(f"{log.path}: {what}", remedy=remedy)
 
 
 def _named_unlike(survey: Survey) -> str:
@@ -279,19 +288,6 @@ def _named_unlike(survey: Survey) -> str:
         )
         found.append(f"{name} ({f'named {_unlike(topic)}' if image.kind == 'depth' else lossy})")
     return f"; neither depth nor colour: {listed(found)}" if found else ""
-
-
-def _unread_video(what: str, *, has_depth: bool) -> InputError:
-    lacks = "" if has_depth else "; and there is no depth topic"
-    if not is_installed(LIBRARY):
-        return InputError(
-            f"{what}, for which the library {LIBRARY} is not installed{lacks}",
-            remedy=f"pip install 'splatctrl-cli[{EXTRA}]'",
-        )
-    return InputError(
-        f"{what}, which is neither H.264 nor H.265{lacks}",
-        remedy="decode it to images first: `ros2 run image_transport republish` for ROS topics, else ffmpeg",
-    )
 
 
 def listed(names: Sequence[str]) -> str:
@@ -331,7 +327,7 @@ def join_pose_topics(
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}
     children = {
-        given.topic: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()
+        given[0]: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()
     } or _odometries(log, survey, options, set(frames.values()))
     for topic, child in children.items():
         _add(log, survey, topic, child, only_first=only_first)
@@ -341,22 +337,23 @@ def pose_topics(survey: Survey) -> list[str]:
     return [topic.topic.name for topic in survey.of_type(*POSE_TYPES)]
 
 
-def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame: str) -> str:
+def _child_of(log: RawLog, survey: Survey, camera: str, given: tuple[str, str], frame: str) -> str:
     """The posed frame. Raises InputError if it does not place the camera."""
-    where = f"{log.path}: --camera-pose {camera}={given.topic}"
+    topic, posed = given
+    where = f"{log.path}: --camera-pose {camera}={topic}"
     refuse_if(
-        given.topic not in pose_topics(survey),
+        topic not in pose_topics(survey),
         f"{where}: no poses on that topic",
         remedy=f"expected {', '.join(name.rpartition('/')[2] for name in POSE_TYPES)}; pose topics there:"
         f" {', '.join(pose_topics(survey)) or 'none'}",
     )
-    _, first_child, *_ = next(_poses(log, survey, given.topic, Damage()), ("", ""))
-    child = given.frame or first_child or frame
+    _, first_child, *_ = next(_poses(log, survey, topic, Damage()), ("", ""))
+    child = posed or first_child or frame
     tf = survey.tf
     refuse_if(
         child != frame and not tf.connects(child, frame),
         f"{where}: poses frame {child!r}, which tf does not join to the camera's frame {frame!r}",
-        remedy=f"record /tf_static, or give --camera-pose {camera}={given.topic}@{frame} if it poses the camera",
+        remedy=f"record /tf_static, or give --camera-pose {camera}={topic}@{frame} if it poses the camera",
     )
     refuse_if(
         tf.root_of(child) != child,

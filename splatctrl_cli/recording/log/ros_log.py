@@ -265,9 +265,6 @@ class RosLogSource(FrameSource):
         found = next(c for c in self._rig if c.name == camera)
         return found.pose_at(self._tf, stamp_ns, round(self._options.pose_tolerance_s * SECOND_NS))
 
-    def digests(self) -> dict[str, str]:
-        return dict(self._digests)
-
     @cached_property
     def _digests(self) -> dict[str, str]:
         names = [file.name for file in self._log.files]

@@ -8,7 +8,7 @@ from typing import Any, Self, overload
 import numpy as np
 
 from splatctrl_cli.errors import refuse_if
-from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, blocks_of, of_columns, ranges, selected
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, blocks_of, ranges, select
 from splatctrl_cli.records import Float64, Index, JointState, Posture, Stamps
 
 OF_JOINTS = ("position", "velocity", "commanded_velocity")
@@ -89,10 +89,10 @@ class StateColumns(Sequence[JointState]):
 
     def select(self, index: Index) -> Self:
         """States of an index (K,), in its order."""
-        return self._changed(lambda table, _: selected(table, index), COLUMNS, stamp_ns=self.stamp_ns[index])
+        return self._changed(lambda table, _: select(table, index), COLUMNS, stamp_ns=self.stamp_ns[index])
 
     def of_joints(self, order: Index) -> Self:
-        return self._changed(lambda table, _: of_columns(table, order), OF_JOINTS)
+        return self._changed(lambda table, _: select(table, columns=order), OF_JOINTS)
 
     def of_log(self, order: Index, factor: Float64, offset: Float64) -> Self:
         """Joints (J,): ``position[order] * factor + offset``; velocities without offset."""

@@ -351,8 +351,7 @@ def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossRepor
 def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
     n = CLOCK_NEIGHBOURS
     if len(late) < 2 * n:
-        if np.ptp(late) > CLOCK_MIXED:
-            raise _mixed(where, float(np.ptp(late)), int(np.argmax(np.abs(np.diff(late)))) + 1)
+        _refuse_mixed(float(np.ptp(late)), int(np.argmax(np.abs(np.diff(late, append=late[-1:])))) + 1, where)
         return
     near = np.lib.stride_tricks.sliding_window_view(late, n)
     windows = np.concatenate([np.median(near[first:last], axis=1) for first, last in ranges(len(near))])
@@ -362,13 +361,13 @@ def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
         return
     at = int(np.argmax(change))
     state = at + 1 + int(np.argmax(np.abs(np.diff(late[at : at + 2 * n]))))
-    if step > CLOCK_MIXED:
-        raise _mixed(where, step, state)
+    _refuse_mixed(step, state, where)
     loss.notes.append(f"{where}: stamps step by {step:.3f} s against the time of logging at state {state}")
 
 
-def _mixed(where: str, step: float, state: int) -> InputError:
-    return InputError(
+def _refuse_mixed(step: float, state: int, where: str) -> None:
+    refuse_if(
+        step > CLOCK_MIXED,
         f"{where}: mixed clocks: stamps jump by {step:.1f} s against the time of logging at state {state}",
         remedy="cut the log there, or give another --joint-topic",
     )

@@ -246,6 +246,10 @@ class FrameSource:
 
     def digests(self) -> dict[str, str]:
         """sha256 of every input file, by name."""
+        return dict(self._digests)
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
         raise NotImplementedError
 
     def records(self) -> Iterator[Record]:

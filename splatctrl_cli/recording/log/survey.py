@@ -1,7 +1,7 @@
 """A first pass over a log: topics, stamps, frames, calibrations, joints, first images and ``robot_description``."""
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_GAP, IMAGES_STEADY
 from splatctrl_cli.recording.container.mcap_file import ChunkIndex
-from splatctrl_cli.recording.container.mcap_log import LogIndex, McapLog
+from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import (
     CAMERA_INFO,
@@ -300,17 +300,22 @@ def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
     inner, video = (log.inner, log) if isinstance(log, VideoLog) else (log, None)
     if size < LARGE or not isinstance(inner, McapLog):
         return survey(log), ()
-    index = inner.index()
-    found = _sampled(inner, index, video)
+    counts, span_ns, chunks, notes = inner.index()
+    found = _sampled(inner, counts, span_ns, _first_chunks(counts, chunks), video)
     return found, (
-        *index.notes,
+        *notes,
         f"{size} bytes: described by index and first messages; neither checksums nor the rest were read",
     )
 
 
-def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
+def _sampled(
+    log: McapLog,
+    counts: Mapping[int, int],
+    span_ns: tuple[int, int],
+    chunks: Sequence[ChunkIndex],
+    video: VideoLog | None,
+) -> Survey:
     found, decoder = Survey(), MessageDecoder()
-    chunks = _first_chunks(index)
     messages = log.messages_of(chunks, found.damage) if chunks else islice(log.messages(Damage()), 2000)
     messages = messages if video is None else video.decoded(messages, Damage())  # others lie between these chunks
     for message in messages:
@@ -319,20 +324,20 @@ def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
         found.topics.setdefault(topic.name, TopicSurvey(topic=topic))
     for entry in found.topics.values():
         entry.count = 0
-    for channel, count in index.counts.items():
+    for channel, count in counts.items():
         counted = log.channels.get(channel)
         if counted is not None:
             entry = found.topics[counted.name]
             entry.count += count
-            entry.first_log_ns = entry.first_log_ns or index.first_ns
-            entry.last_log_ns = index.last_ns
+            entry.first_log_ns = entry.first_log_ns or span_ns[0]
+            entry.last_log_ns = span_ns[1]
     return found
 
 
-def _first_chunks(index: LogIndex) -> list[ChunkIndex]:
-    wanted = {chunk.chunk_start_offset: chunk for chunk in index.chunks[:4]}
-    for channel in sorted(index.counts):
-        first = next((c for c in index.chunks if channel in c.message_index_offsets), None)
+def _first_chunks(counts: Mapping[int, int], chunks: Sequence[ChunkIndex]) -> list[ChunkIndex]:
+    wanted = {chunk.chunk_start_offset: chunk for chunk in chunks[:4]}
+    for channel in sorted(counts):
+        first = next((c for c in chunks if channel in c.message_index_offsets), None)
         if first is not None:
             wanted[first.chunk_start_offset] = first
     chosen: list[ChunkIndex] = []

@@ -201,19 +201,23 @@ class VideoFileLog(RawLog):
         )
         self._av = of_extra(LIBRARY, EXTRA, "video files")
         self.files, self._stamps = (path, beside), _read_stamps(beside)
-        self._topic = Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)
-
-    def topics(self) -> tuple[Topic, ...]:
-        return (self._topic,)
+        self.channels = {0: Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)}
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield the images. Raises InputError if they and the stamps differ in number."""
-        if names is not None and self._topic.name not in names:
+        if names is not None and self.channels[0].name not in names:
             return
         num, found = 0, Damage()
         for frame in self._frames(found):
             if frame is not None and num < len(self._stamps):
-                yield self._message(frame, int(self._stamps[num]))
+                seconds, nanoseconds = divmod(int(self._stamps[num]), SECOND_NS)
+                header = SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id="")
+                yield RawMessage(
+                    topic=self.channels[0],
+                    log_time_ns=int(self._stamps[num]),
+                    data=pack_image(header, frame.to_ndarray(format="rgb24")),
+                    file=self.path.name,
+                )
             num += 1
         for note in found.notes:
             damage.add(note)
@@ -237,19 +241,6 @@ class VideoFileLog(RawLog):
                     yield None if frame.is_corrupt else frame
         except (self._av.FFmpegError, OSError) as error:
             damage.add(f"{self.path.name}: cannot be decoded further: {error}")
-
-    def _message(self, frame: Any, stamp_ns: int) -> RawMessage:
-        return RawMessage(
-            topic=self._topic,
-            log_time_ns=stamp_ns,
-            data=pack_image(
-                SimpleNamespace(
-                    stamp=SimpleNamespace(sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS), frame_id=""
-                ),
-                frame.to_ndarray(format="rgb24"),
-            ),
-            file=self.path.name,
-        )
 
 
 def _read_stamps(path: Path) -> Stamps:
