@@ -115,7 +115,6 @@ class Adjustment:
         return 1 / np.square(sigma), offset
 
     def normal(self, estimate: Estimate, widths: Widths, *, with_robot: bool = True) -> Normal:
-        """The normal equations, optionally without the robot."""
         P, (reach, cut) = self.unknowns.size, widths
         H, g = np.zeros((P, P)), np.zeros(P)
         scores: list[Float64] = []

@@ -261,7 +261,6 @@ def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> No
 
 
 def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool:
-    """True unless a stationary camera sees the board move."""
     for camera, its in by_camera.items():
         places = np.array([s.T_camera_board[:3, 3] for s in its])
         if camera not in rig.moving and len(its) > 1:

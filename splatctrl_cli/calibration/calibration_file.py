@@ -45,7 +45,6 @@ class CalibratedCamera:
 
     @property
     def moves(self) -> bool:
-        """True if the camera moves."""
         return self.recorded is None
 
 
@@ -71,7 +70,6 @@ class Calibration:
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """The TOML text of a calibration."""
     lines = [
         f"format = {_text(FORMAT)}",
         f"version = {VERSION}",
@@ -154,7 +152,6 @@ def is_calibration(path: Path) -> bool:
 
 
 def describe_calibration(path: Path) -> Summary:
-    """Summarise a calibration file."""
     calibration = read_calibration(path)
     rows = [
         [

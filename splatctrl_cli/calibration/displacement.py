@@ -50,7 +50,6 @@ def is_displaced(row: Mapping[str, Any]) -> bool:
 
 
 def is_corrected(row: Mapping[str, Any]) -> bool:
-    """True if a row has a corrected pose."""
     return "T_recorded_camera" in row
 
 
@@ -65,7 +64,6 @@ def _moved(frame: RgbdFrame, T_recorded_camera: Float64) -> RgbdFrame:
 
 
 def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
-    """A camera's row; each correction is measured and corrected in turn."""
     found = displacement_of(arm, frames)
     if found is None:
         return None

@@ -56,7 +56,6 @@ class Unknowns:
 
     @property
     def size(self) -> int:
-        """The number P of unknowns."""
         return POSE * len(self.poses) + len(self.scales) + len(self.biases) + self.has_clock
 
     def columns(self, camera: str) -> Index:
@@ -72,7 +71,6 @@ class Unknowns:
         return at
 
     def moved(self, estimate: Estimate, step: Float64) -> Estimate:
-        """The estimate after a step (P,)."""
         corrections, depth = dict(estimate.corrections), dict(estimate.depth)
         for camera in self.poses:
             corrections[camera] = corrections[camera] @ transform_of(step[self.columns(camera)[:POSE]])
@@ -135,7 +133,6 @@ class Arm:
         self.surface_poses = lru_cache(maxsize=REMEMBERED)(self._surface_poses)
 
     def is_posed(self, stamp_ns: int) -> bool:
-        """True if joint states are near a time [ns]."""
         return self._posture(stamp_ns) is not None
 
     def link_pose(self, link: str, stamp_ns: int) -> Float64 | None:
@@ -237,7 +234,6 @@ def _around(shows: Bool) -> tuple[tuple[slice, slice], tuple[int, int]]:
 
 
 def _inside_links(link: NDArray[np.int16], depth: Float32) -> Bool:
-    """Pixels whose neighbours show the same link, without a depth edge."""
     inside = np.zeros(link.shape, np.bool_)
     middle = link[1:-1, 1:-1]
     around = (link[1:-1, 2:], link[1:-1, :-2], link[2:, 1:-1], link[:-2, 1:-1])
@@ -262,7 +258,6 @@ class Evidence:
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """All cameras with a view or frame."""
         return tuple(sorted({v.camera for v in self.views} | {f.camera for f in self.frames}))
 
     @cached_property
@@ -339,7 +334,6 @@ def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
 
 
 def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
-    """The cameras whose recorded poses differ."""
     first: dict[str, Float64] = {}
     moving = set()
     for frame in frames:

@@ -28,7 +28,6 @@ class GrayView:
 
 
 def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
-    """The frame's view at about `REFINE_ROWS` rows."""
     stride = max(1, round(frame.depth.shape[0] / fixed.REFINE_ROWS))
     depth = cv2.medianBlur(np.ascontiguousarray(frame.depth / np.float32(scale)), 5)
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)

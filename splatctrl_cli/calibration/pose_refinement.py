@@ -145,7 +145,6 @@ class BentViews:
         )
 
     def move(self, step: Float64) -> None:
-        """Take a step in the free coordinates."""
         self._free += step.reshape(self._free.shape)
         self._bend()
 
@@ -271,7 +270,6 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
 
 
 def freed(frames: Sequence[RgbdFrame], grids: Mapping[str, Float64]) -> list[RgbdFrame]:
-    """The frames without the bends of their cameras."""
     return [unbent(frame, grids[frame.camera]) if frame.camera in grids else frame for frame in frames]
 
 
@@ -294,7 +292,6 @@ def _solved(
     is_free: Bool,
     bends: BentViews | None = None,
 ) -> list[Float64]:
-    """Poses after rounds of narrowing width; `bends` are solved in place."""
     poses, column = list(recorded), np.cumsum(is_free) - 1
     size = POSE * int(is_free.sum())
     prior = np.tile(np.repeat(1 / np.square(fixed.REFINE_PRIOR), 3), int(is_free.sum()))

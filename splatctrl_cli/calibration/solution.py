@@ -46,7 +46,6 @@ class Solution:
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Cameras whose pose is fixed."""
         unknowns = self.adjustment.unknowns
         return tuple(camera for camera in unknowns.cameras if camera not in unknowns.poses)
 
@@ -99,7 +98,6 @@ def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]
 
 
 def _better(a: Solution, b: Solution) -> Solution:
-    """The better of two solutions. Raises NotEvaluableError if they fit alike."""
     (cost_a, num_a), (cost_b, num_b) = (one.adjustment.cost(one.estimate, WIDE[-1][0]) for one in (a, b))
     if 2 * num_a < num_b or 2 * num_b < num_a:
         return a if num_a > num_b else b
@@ -252,7 +250,6 @@ def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, flo
 
 
 def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
-    """True if a scale or bias clearly differs from 1 or 0."""
     unknowns = tried.adjustment.unknowns
     camera = next(camera for camera in unknowns.cameras if at in unknowns.columns(camera))
     change = off if at == unknowns.columns(camera)[-1] else off * _far(tried, camera)

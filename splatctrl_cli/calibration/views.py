@@ -32,7 +32,6 @@ class DepthView:
 
     @classmethod
     def of(cls, frame: RgbdFrame, num_points: int, step: int = 1) -> "DepthView":
-        """A frame's view with at most `num_points` points; step: of `surface_normals`."""
         surface = back_project(frame.intrinsics, frame.depth)
         normals = surface_normals(surface, step)
         normals[bend(frame.depth, step) > fixed.CALIBRATION_CREASE * depth_sigma(frame.depth)] = 0.0

@@ -42,7 +42,6 @@ class ArmAgreement:
 
 
 def thin_frames(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Frames of at most `limits.ARM_ROWS` rows."""
     strides = [max(1, -(-frame.depth.shape[0] // limits.ARM_ROWS)) for frame in frames]
     return [
         replace(f, depth=f.depth[::s, ::s], color=f.color[::s, ::s], intrinsics=strided_lens(f.intrinsics, s))
@@ -142,7 +141,6 @@ def _exchanged(posture: Posture, i: int, j: int) -> Posture:
 
 
 def _in_place(where: str, agreement: ArmAgreement, units: Iterable[float | None]) -> Finding:
-    """Finding of a camera that shows the arm in place or scaled (units: `rescale_remedy`)."""
     if agreement.scale is not None:
         return warning(
             "arm",
@@ -163,7 +161,6 @@ def _in_place(where: str, agreement: ArmAgreement, units: Iterable[float | None]
 
 
 def _misplaced(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
-    """Finding of cameras that show the arm elsewhere; cause: the correction, or ""."""
     off = [1e3 * agreement.misfit for agreement in bad.values()]
     through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
     return warning(
@@ -256,7 +253,6 @@ def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> s
 
 
 def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
-    """A finding for the common clock, and one per other camera."""
     middle = float(np.median(list(offsets.values())))
     apart = limits.TIME_OFFSET + limits.TIME_ERROR
     others = {c: offset for c, offset in offsets.items() if abs(offset - middle) > apart and len(offsets) > 2}

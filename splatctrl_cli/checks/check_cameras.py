@@ -98,7 +98,6 @@ def calibration_findings(
 
 
 def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens) -> list[Finding]:
-    """Say how `ingest` treats the distortion of a topic's images."""
     d, model = calibration.distortion, lens_model(calibration.distortion_model)
     if not is_distorted(model, d):
         return []
@@ -119,7 +118,6 @@ def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens
 
 
 def _rivals(found: Survey, camera: CameraTopics) -> Iterator[Finding]:
-    """Other CameraInfo with the colour image's frame and size, but another K."""
     chosen = found.topics[camera.info].calibration if camera.info else None
     for entry in found.of_type(CAMERA_INFO):
         name, other = entry.topic.name, entry.calibration
@@ -186,7 +184,6 @@ def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 
 def camera_findings(
     found: Survey, topics: CameraTopics, camera: Camera | None, options: SourceOptions
 ) -> Iterator[Finding]:
-    """Pairs, lens and poses of one camera."""
     yield from _pairing(found, topics, options)
     yield from _lens(found, topics, options)
     if camera is None or camera.fixed_pose is not None:
@@ -240,7 +237,6 @@ def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> lis
 
 
 def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> list[Finding]:
-    """Findings on the lens in use, and on depth's own."""
     where, image = f"camera {topics.name}", found.topics[topics.color].first_image
     given = options.intrinsics.get(topics.name)
     if given is not None and image is not None:

@@ -146,7 +146,6 @@ class _CameraWatch:
         self.poses: list[Float64] = []
 
     def add(self, stored: StoredFrame, motion: ImageMotion) -> None:
-        """Take a frame, decoding images if wanted."""
         self.times.add(stored.stamp_ns, stored.stamp_ns)
         self.stamps.append(stored.stamp_ns)
         self.poses.append(stored.T_world_camera)
@@ -181,7 +180,6 @@ def _read(
     motion: ImageMotion,
     num_images: int | None,
 ) -> bool:
-    """Take all (True), or at most `num_images` per camera."""
     for item in source.stored():
         if isinstance(item, JointState):
             states.add(item)

@@ -96,7 +96,6 @@ class ImageWatch:
             self._keep(stamp_ns, depth, small.copy())
 
     def _add(self, stamp_ns: int, image: NDArray[Any], encoding: str, interpolation: int) -> None:
-        """Count a decoded image, and keep its thumbnail."""
         height, width = image.shape[:2]
         self.add_undecoded(encoding, width, height)
         self.num_decoded += 1
@@ -193,7 +192,6 @@ def image_findings(images: ImageWatch) -> list[Finding]:
 
 
 def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
-    """A note that not every image was decoded, if so."""
     few = [images for images in topics if images.num_decoded + images.num_bad < images.count and images.num_decoded]
     decoded, count = sum(images.num_decoded for images in few), sum(images.count for images in few)
     return judge(
@@ -276,7 +274,6 @@ def _scale(images: ImageWatch) -> list[Finding]:
 
 
 def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
-    """Findings on colour-depth registration, by camera."""
     edges = {
         camera: [_spectra(f) for f in its[:: max(1, len(its) // limits.EDGE_FRAMES)][: limits.EDGE_FRAMES]]
         for camera in sorted({frame.camera for frame in frames})
@@ -326,7 +323,6 @@ def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool)
 def _other(
     camera: str, edges: dict[str, list[tuple[Float64, Float64]]], own: float
 ) -> tuple[str, float, float] | None:
-    """The camera whose depth clearly fits this one's colour, and both scores (own first)."""
     pairs = {name: list(zip(edges[camera], its, strict=False)) for name, its in edges.items() if name != camera}
     scores = {
         name: _at_zero(_correlate([(a[0], b[1]) for a, b in its]))

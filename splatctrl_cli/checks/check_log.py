@@ -136,7 +136,6 @@ class LogWatch(JoinedLog):
             return  # the survey counts it
 
     def _is_headed(self, topic: Topic) -> bool:
-        """True if messages begin with a std_msgs/Header."""
         if topic not in self._headed:
             fields = [line.split("#")[0].strip() for line in topic.definition.splitlines()]
             first = next((line for line in fields if line), "")
@@ -211,7 +210,6 @@ def reduced_frames(
 
 
 def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
-    """Depth in the undistorted colour view, reduced."""
     depth, stride = kept.pixels, kept.stride
     if camera.depth_lens is not None and camera.T_color_depth is not None:
         stride = max(1, round(camera.intrinsics.height / kept.pixels.shape[0]))
@@ -253,7 +251,6 @@ def image_motion(
 
 
 def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Depth with colour, where both share a view."""
     gray = dict(watch.images[topics.color].thumbnails if camera.depth_lens is None else ())
     at, frames = sorted(gray), []
     poses = {frame.stamp_ns: frame.T_world_camera for frame in sorted(posed, key=lambda frame: frame.stamp_ns)}
@@ -353,7 +350,6 @@ def check_log(
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The selected cameras. Raises InputError for unknown ones."""
     cameras = camera_topics(log, found, options)
     names = tuple(camera.name for camera in cameras)
     if not names:
@@ -364,7 +360,6 @@ def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraT
 
 
 def _lacks(log: RawLog, found: Survey, options: SourceOptions) -> list[str]:
-    """Obstacles to `ingest` that no other finding names."""
     if not found.num_messages:
         damage = "nothing usable before the damage" if found.damage.count else "the log holds no messages"
         return [f"{damage}; record it again, or give another file"]
@@ -406,7 +401,6 @@ def _time_findings(
 
 
 def _image_findings(watch: LogWatch, unused: Collection[str], unlike: Collection[str]) -> list[Finding]:
-    """Findings on image topics; notes on `unused` ones. unlike: topics with only depth's encoding."""
     findings, known = [], ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
     for name, images in sorted(watch.images.items()):
         its = list(image_findings(images))

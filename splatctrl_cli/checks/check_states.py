@@ -283,7 +283,6 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
 
 
 def stream_findings(where: str, stream: JointStream) -> Iterator[Finding]:
-    """Findings on a topic's states of the same joints, as recorded."""
     position = stream.columns().get("position")
     if position is None:
         return

@@ -268,7 +268,6 @@ def _distances(a: DepthView, b: DepthView, scale_a: float = 1.0, scale_b: float 
 
 
 def _best_scale(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], cameras: Sequence[str]) -> float | None:
-    """Factor on these cameras' depths that fits far more points, or None."""
     medians = [float(np.median(v.points[:, 2])) for v in views if v.camera in cameras and len(v.points)]
     if not medians:
         return None
@@ -372,6 +371,5 @@ def _moved(views: Sequence[DepthView], camera: str, T: Float64) -> list[DepthVie
 
 
 def _move_all(frames: Sequence[_Posed], moves: Sequence[Move]) -> list[_Posed]:
-    """Views or frames, with every camera moved."""
     by_camera = {move.camera: move.T_camera_corrected for move in moves}
     return [replace(f, T_world_camera=f.T_world_camera @ by_camera.get(f.camera, np.eye(4))) for f in frames]

@@ -31,8 +31,6 @@ class CameraMotion:
 
 @dataclass(kw_only=True)
 class ImageMotion:
-    """Collected image changes by camera."""
-
     cameras: dict[str, CameraMotion] = field(default_factory=dict)
     _last: dict[str, tuple[Float32, UInt8]] = field(default_factory=dict)
 
@@ -214,7 +212,6 @@ def _since(camera: CameraMotion, start: int) -> Float64:
 def _pixel_scores(
     seconds: Float64, robot: RobotPoints, step: float, camera: CameraMotion, start: int, offsets: Float64
 ) -> Float64:
-    """Scores with the robot interpolated at every `step` from the first state."""
     number = np.round((_since(camera, start) - offsets[:, None]) / step).astype(np.int64)  # (O, K + 1)
     is_inside = (number >= 0) & (number * step < seconds[-1] + step / 2)
     wanted = np.unique(number[is_inside])
@@ -244,7 +241,6 @@ def _sum_scores(seconds: Float64, position: Float64, camera: CameraMotion, start
 
 
 def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
-    """Intervals (K,) within the joint log; none if too few."""
     keep = is_inside[1:] & is_inside[:-1]
     return keep if keep.sum() >= max(limits.MOTION_INTERVALS // 2, len(keep) // 2) else np.zeros_like(keep)
 

@@ -132,7 +132,6 @@ _BLOCKED = {"": (), "all": ALL, "later": LATER, "replay": ("replay",)}
 
 
 def _checks() -> Iterator[Check]:
-    """The entries of `_TABLE`, whose rows continue in indented lines."""
     for row in re.findall(r"^[a-z].*(?:\n +.*)*", _TABLE, flags=re.MULTILINE):
         code, severities, blocked, meaning, *remedy = (cell.strip() for cell in " ".join(row.split()).split("|"))
         yield Check(
@@ -235,11 +234,9 @@ class CheckReport:
 
     @property
     def sorted_findings(self) -> list[Finding]:
-        """The findings, worst first, then as found."""
         return sorted(self.findings, key=lambda finding: ORDER.index(finding.severity))
 
     def blockers(self, command: str) -> list[Finding]:
-        """The errors that block a command."""
         errors = [f for f in self.sorted_findings if f.severity is ERROR]
         return [f for f in errors if command in CHECKS[f.code].blocked]
 
@@ -292,7 +289,6 @@ def find_lacks(*, num_cameras: int, num_frames: int, states_lack: str) -> dict[s
 
 
 def damage_findings(where: str, notes: Sequence[str]) -> list[Finding]:
-    """One per kind of damage, with its count."""
     return [
         warning("damaged", where, text if num == 1 else f"{text} ({num} times)", value=num)
         for text, num in Counter(notes).items()

@@ -94,7 +94,6 @@ def held(partial: Path, *, is_folder: bool) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, link or folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -284,7 +283,6 @@ def flush(path: Path) -> None:
 
 
 def _check_replaceable(path: Path, *, is_folder: bool) -> None:
-    """Raise UsageError if --force could remove foreign files."""
     is_there, other, rights = path.is_dir(), "give another --out", os.W_OK | os.X_OK
     is_foreign = is_there and any(path.iterdir()) and not any((path / name).is_file() for name in MARKERS)
     for is_bad, what, remedy in (
@@ -326,7 +324,6 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the block's time to stage `name`."""
         start = time.perf_counter()
         try:
             yield
@@ -377,7 +374,6 @@ def write_run(
 
 
 def write_table(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows as CSV under a header of names."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, fieldnames=names, lineterminator="\n")
         table.writeheader()
@@ -395,12 +391,10 @@ def sha256(path: Path) -> str:
 
 
 def plain(value: object) -> object:
-    """Convert a foreign value for JSON."""
     if hasattr(value, "tolist"):
         return value.tolist()
     return str(value)
 
 
 def finite(value: float) -> float | None:
-    """The value, None if not finite."""
     return value if math.isfinite(value) else None

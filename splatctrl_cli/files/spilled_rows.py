@@ -46,7 +46,6 @@ class RowFile:
         return self._num
 
     def append(self, rows: Float64) -> None:
-        """Add rows (T, ...)."""
         block = np.ascontiguousarray(rows, dtype=np.float64)
         if block.shape[1:] != self.row_shape:
             raise ValueError(f"rows: expected {self.row_shape}, got {block.shape[1:]}")

@@ -210,7 +210,6 @@ class ArrayFile(ABC):
         return header
 
     def _read_as(self, kind: str, *faults: type[Exception]) -> AbstractContextManager[None]:
-        """Turn `faults` into InputError."""
         return refuse_faults(
             lambda error: (
                 f"{self.path}: cannot be read as {kind}: {' '.join(str(error).split()) or type(error).__name__}"
@@ -238,7 +237,6 @@ class NpzFile(ArrayFile):
             return shape, dtype
 
     def _blocks(self, name: str) -> Iterator[Array]:
-        """Yield the rows; an array stored by columns is read at once."""
         with self._opened(name) as (shape, dtype, is_by_columns, stream):
             size, step = prod(shape) * dtype.itemsize, max(shape[0], 1) if is_by_columns else BLOCK
             refuse_if(

@@ -65,7 +65,6 @@ def load_mesh(path: Path) -> TriangleMesh:
 
 
 def _opened(path: Path) -> tuple[BytesIO | Path, str]:
-    """A binary STL without trailing bytes, and a note; or a text."""
     content = path.read_bytes()
     num = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
     end = STL_HEADER + STL_FACE * num  # of a text: gigabytes

@@ -289,7 +289,6 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
 
 
 def _axes(name: str, cells: Sequence[str]) -> list[int] | None:
-    """Columns of x, y, z; None if the line is a point."""
     if len(cells) == 3 and all(_number(cell) is not None for cell in cells):
         return None
     titles = [cell.strip().lstrip("\ufeff").lower() for cell in cells]

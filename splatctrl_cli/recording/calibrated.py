@@ -105,7 +105,6 @@ class Correction:
         return replace(stored, T_world_camera=T, read_depth=counted, depth_unit=scaled)
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the calibration."""
         return {f"{CALIBRATION}{self.file.name}": sha256(self.file)}
 
     def notes(self, digests: Collection[str]) -> list[str]:
@@ -187,7 +186,6 @@ class ChangedSource(FrameSource):
                 yield stamp, camera, T
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the files, and the change."""
         return self.inner.digests() | self._change.digests()
 
     def _frames(self) -> Iterator[StoredFrame]:
@@ -295,7 +293,6 @@ class Perturbation:
         return {f"{PERTURB}{words}": words}
 
     def notes(self, _digests: Collection[str]) -> list[str]:
-        """A report's note."""
         return [f"perturbed: {words}" for words in self.digests().values()]
 
     def _generator(self, camera: str, stamp_ns: int = 0) -> np.random.Generator:

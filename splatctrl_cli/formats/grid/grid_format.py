@@ -60,7 +60,6 @@ CHANNELS: Mapping[str, Channel] = {
 
 
 def file_header(grid: DistanceGrid) -> dict[str, object]:
-    """The header with format and version."""
     return {**grid.header, "format": FORMAT, "version": VERSION}
 
 
@@ -188,7 +187,6 @@ def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
 
 
 def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
-    """The header's `FIELD_FACTS`."""
     return {key: header[key] for key in FIELD_FACTS if header.get(key) is not None}
 
 

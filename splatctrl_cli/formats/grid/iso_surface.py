@@ -94,7 +94,6 @@ def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64
 
 
 def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Any:
-    """Merge equal vertices, in world; drop collapsed triangles."""
     unique, index = np.unique(np.round(vertices / STEP), axis=0, return_inverse=True)
     joined = index.reshape(-1)[faces]
     first, second, third = joined.T
@@ -103,7 +102,6 @@ def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> 
 
 
 def describe_mesh(path: Path, _head: bytes) -> Summary | None:
-    """Summarise a ``.obj`` or ``.stl``, read whole."""
     if path.suffix.lower() not in {".obj", ".stl"}:
         return None
     with refuse_faults(

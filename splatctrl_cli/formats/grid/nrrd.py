@@ -85,7 +85,6 @@ def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def describe_nrrd(path: Path, head: bytes) -> Summary | None:
-    """Summarise an NRRD file and our bake's header."""
     if not head.startswith(b"NRRD000"):
         return None
     fields, pairs = read_nrrd_head(path)

@@ -87,7 +87,6 @@ def _above(values: Any) -> float:
 
 
 def _plain(value: object) -> object:
-    """Text or a number for OpenVDB; JSON of all else."""
     is_number = isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**31)
     return value if isinstance(value, str | bool) or is_number else json.dumps(value, allow_nan=False)
 
@@ -144,7 +143,6 @@ def _metadata(stream: BinaryIO) -> dict[str, object]:
 
 
 def describe_vdb(path: Path, head: bytes) -> Summary | None:
-    """Summarise an OpenVDB file and our bake's header."""
     if not head.startswith(MAGIC):
         return None
     grids = read_vdb_head(path)

@@ -174,7 +174,6 @@ def _comments(grid: DistanceGrid) -> list[str]:
 
 
 def describe_vti(path: Path, head: bytes) -> Summary | None:
-    """Summarise a ``.vti``: a distance grid if ours, else its XML."""
     if path.suffix != ".vti" and b'type="ImageData"' not in head[:512]:
         return None
     text = head.decode("latin-1")

@@ -168,7 +168,6 @@ class SceneFolder:
 
     @cached_property
     def parts(self) -> Parts:
-        """Digests that check every opened file."""
         return Parts.of_run(self.path, self.run)
 
     @property
@@ -200,7 +199,6 @@ class SceneFolder:
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of the last frame."""
         return self._metric("stamp_ns", int)
 
     @property
@@ -236,7 +234,6 @@ class SceneFolder:
         return read_world_splats(self._isotropic("splats.ply"))
 
     def _isotropic(self, name: str) -> Path:
-        """The checked file. Raises InputError if splats are not isotropic."""
         refuse_if(
             self.is_anisotropic,
             f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",

@@ -107,7 +107,6 @@ class SceneWriter:
         return self.folder / "snapshots" / f"{index:06d}.ply"
 
     def audit(self, row: object) -> None:
-        """Append to ``audit.jsonl``."""
         assert is_dataclass(row) and not isinstance(row, type)
         with self._audit.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(asdict(row)) + "\n")
@@ -143,7 +142,6 @@ class SceneWriter:
         self._thread.shutdown()
 
     def _write_shell(self, path: Path, stamp_ns: int, shell: SplatSet | None) -> None:
-        """Write a separate file, which readers of splats skip."""
         if shell is not None and len(shell):
             write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
 
@@ -166,7 +164,6 @@ class SceneWriter:
         write_durably(self.folder / CHECKPOINT, lambda path: savez(path, arrays, level=1 if is_last else 0))
 
     def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, shell: SplatSet | None = None) -> None:
-        """Write final splats, shell, occupancy and the index of snapshots."""
         self.settle()
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
         self._write_shell(self.folder / SHELL_FILE, stamp_ns, shell)

@@ -217,7 +217,6 @@ def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tu
 
 
 def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
-    """`_parsed` and the attributes, unpacking no more than announced."""
     with (
         refuse_faults(
             f"{path}: no whole .spz file",

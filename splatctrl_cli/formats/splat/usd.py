@@ -102,7 +102,6 @@ def _library() -> tuple[Any, Any, Any, Any, Any]:
 
 
 def _extent(gaussians: GaussianSet) -> Float32:
-    """Corners (2, 3) around three sigmas of every Gaussian, at any rotation."""
     reach = 3.0 * gaussians.scales.max(axis=1, keepdims=True)
     lower, upper = (gaussians.centers - reach).min(axis=0), (gaussians.centers + reach).max(axis=0)
     return np.stack([lower, upper]).astype(np.float32)

@@ -257,7 +257,6 @@ class CaptureSource(FrameSource):
 
     @property
     def loss(self) -> LossReport:
-        """The loss of `ingest`, and later damage."""
         loss = self._loss
         damaged = max(self._damaged, self._damaged_before, key=len)
         return replace(loss, damaged=loss.damaged + len(damaged), notes=[*loss.notes, *damaged])
@@ -274,7 +273,6 @@ class CaptureSource(FrameSource):
         yield from filter(None, map(self._stored_frame, self._rows))
 
     def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
-        """A row's frame; None, and counted, if a file of it is missing or damaged."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
         camera = self._cameras[row["camera"]]

@@ -68,7 +68,6 @@ class Journal:
         self._stream.close()
 
     def next_kept(self) -> Entry | None:
-        """The earlier run's next frame, or None."""
         found = next(self._kept, None)
         self.num_entries += found is not None
         return None if found is None else Entry(**found)
@@ -95,7 +94,6 @@ class Journal:
 
 
 def read_identity(folder: Path) -> Mapping[str, Any] | None:
-    """An interrupted run's identity, or None."""
     path = folder / JOURNAL
     first = next(_lines(path), None) if path.is_file() else None
     return None if first is None else first.get("identity")
@@ -239,7 +237,6 @@ def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """Make the frame's row of frames.csv without file names, and count the frame in `cameras`."""
     refuse_if(
         stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera),
         f"{stored.origin}: camera {stored.camera!r}: cannot name a folder",
@@ -310,7 +307,6 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
-    """Suffix and bytes of the depth image: the recorded PNG if its unit fits."""
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
@@ -327,7 +323,6 @@ def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, n
 
 
 def encode_png(pixels: np.ndarray[Any, Any]) -> bytes:
-    """Encode an image as PNG."""
     is_written, data = cv2.imencode(".png", pixels, _FILTERED)
     refuse_if(not is_written, f"an image of shape {pixels.shape} could not be encode_png as PNG", error=WriteError)
     return bytes(data)

@@ -135,7 +135,6 @@ class Bag1Log(RawLog):
                 stream.seek(place)
 
     def _connections(self) -> list[Part]:
-        """The index's connections, if any."""
         with self.path.open("rb") as stream:
             stream.readline(64)
             first = self._record(stream, stream.tell())
@@ -172,7 +171,6 @@ class Bag1Log(RawLog):
         return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
 
     def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
-        """Find the next whole chunk after `offset` by its header."""
         stream.seek(offset + 1)
         kept = b""
         while block := stream.read(PIECE):
@@ -294,7 +292,6 @@ class Db3Log(RawLog):
         os.truncate(self._database, size)
 
     def _merge(self, size: int) -> None:
-        """Merge the journal into the copy, or leave it out."""
         try:
             with closing(sqlite3.connect(self._database)) as database:
                 self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]

@@ -121,7 +121,6 @@ def _object(value: Any) -> Any:
 
 
 def _header(message: Any, frame_id: str | None = None) -> Any:
-    """A header; frame_id: for messages without that field."""
     frame_id = str(getattr(message, "frame_id", "")) if frame_id is None else frame_id
     time = getattr(message, "timestamp", None)
     seconds = _either(time, "sec", "seconds")

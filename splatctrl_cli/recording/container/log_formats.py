@@ -146,7 +146,6 @@ def open_raw_log(path: Path) -> RawLog:
 
 
 def is_bag_folder(path: Path) -> bool:
-    """True for a likely ROS 2 bag."""
     return bool(_storage_files(path)) or (path / "metadata.yaml").is_file()
 
 
@@ -183,7 +182,6 @@ def read_formats(path: Path) -> set[str]:
 
 
 def _open_compressed(path: Path) -> RawLog:
-    """Unpack into a temporary folder that lives as long as the log."""
     folder = Path(tempfile.mkdtemp(prefix="splatctrl-"))
     file = folder / path.stem
     with ExitStack() as stack:
@@ -208,7 +206,6 @@ def _storage_files(path: Path) -> list[Path]:
 
 
 def _metadata(path: Path) -> tuple[dict[str, Any], str]:
-    """Metadata and its fault; a bag can be read without."""
     file = path / "metadata.yaml"
     if not file.is_file():
         return {}, ""

@@ -89,8 +89,6 @@ _FOOTER_SIZE = HEAD.size + 20
 
 
 class McapFile:
-    """A reader of one file's records."""
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self.size = path.stat().st_size
@@ -106,7 +104,6 @@ class McapFile:
             yield from _Walk(stream, self.path.name, self.size, damage, places, has_crc=not is_known).parts()
 
     def summary(self) -> list[Part]:
-        """The summary section's records, if readable."""
         with self.path.open("rb") as stream:
             footer = _footer(stream, self.size)
             if footer is None or not len(MAGIC) <= footer.summary_start < self.size:
@@ -179,7 +176,6 @@ class _Walk:
                 return
 
     def _part(self, offset: int, opcode: int, length: int, head: bytes) -> Part:
-        """Read a record, without content if too large or unknown."""
         self._count(head)
         if opcode == ATTACHMENT:
             self._check_attachment(offset, length)
@@ -284,7 +280,6 @@ class _Walk:
             self._add("checksum of the summary differs")
 
     def _pass_over(self, length: int, crc: int = 0) -> int:
-        """Skip bytes; return their checksum, from `crc` on."""
         while length > 0 and (piece := self._take(min(length, PIECE))):
             crc = zlib.crc32(piece, crc)
             length -= len(piece)

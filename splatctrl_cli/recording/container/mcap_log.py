@@ -96,8 +96,6 @@ _MESSAGE = struct.Struct("<HIQQ")
 
 
 class McapLog(RawLog):
-    """One MCAP file."""
-
     container = "MCAP"
 
     def __init__(self, path: Path) -> None:
@@ -114,7 +112,6 @@ class McapLog(RawLog):
                 self._declare(part.opcode, part.content, Damage())
 
     def index(self) -> LogIndex:
-        """The index by summary, else by the heads of records."""
         found, chunks = self._statistics, tuple(self._file.chunk_indexes())
         if found is None or len(chunks) != found.chunk_count:
             return index_by_heads(self._file)
@@ -172,7 +169,6 @@ class McapLog(RawLog):
                 self._declare(opcode, records[start:at], damage)
 
     def _records_in(self, content: bytes, offset: int, damage: Damage, *, is_cut: bool) -> bytes:
-        """A chunk's records, its start if cut, empty if damaged."""
         try:
             chunk: Chunk = parse_record(CHUNK, content)
             if is_cut or len(chunk.records) < chunk.compressed_size:

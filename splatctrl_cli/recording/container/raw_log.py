@@ -81,7 +81,6 @@ class Damage:
 
     @property
     def all_notes(self) -> list[str]:
-        """Damage, then remarks with counts."""
         return [*self.notes, *(text if num == 1 else f"{text} ({num} times)" for text, num in self.remarks.items())]
 
 

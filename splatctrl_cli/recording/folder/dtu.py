@@ -174,7 +174,6 @@ def check_lengths(where: str, views: Sequence[DtuView]) -> None:
 
 
 def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
-    """Write a new DTU folder of one scan."""
     cameras = root / "Cameras"
     rectified = root / "Rectified" / f"{scan}_train"
     depths = root / "Depths_raw" / scan

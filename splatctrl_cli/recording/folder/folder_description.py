@@ -107,7 +107,6 @@ class ImagePart:
 
     @property
     def name(self) -> str:
-        """The file's name with the number."""
         return f"{self.file.name}#{self.number}"
 
     def __str__(self) -> str:

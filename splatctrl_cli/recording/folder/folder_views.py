@@ -216,7 +216,6 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
 
 
 def _masks(description: Description, names: list[str], loss: LossReport) -> dict[str, Path]:
-    """Masks by view name; missing ones are noted in `loss`."""
     assert description.frames is not None
     pattern = description.frames.human_mask
     if not pattern:
@@ -275,7 +274,6 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """Stamp by layout, file name, frame number and rate, or one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

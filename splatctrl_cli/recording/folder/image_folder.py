@@ -145,7 +145,6 @@ class ImageFolderSource(FrameSource):
 
     @cached_property
     def _digests(self) -> dict[str, str]:
-        """sha256 of description, pose files and images, by path below the root."""
         found: dict[str, Path] = {}
         for description in self._descriptions:
             lens = None if len(self._descriptions) == 1 else description.camera
@@ -368,14 +367,12 @@ def unknown_folder(folder: Path, what: str, remedy: str) -> InputError:
 
 
 def _bare_images(folder: Path) -> str:
-    """Words for missing depth in a folder of colour; "" without images."""
     num = max(len(images_of(place)) for place in (folder, *(folder / name for name in _COLORS)) if place.is_dir())
     is_colmap = any((folder / place).exists() for place in ("sparse", "images.bin", "images.txt"))
     return f"depth is missing: images{' of a COLMAP model' if is_colmap else ''} alone ({num})" if num else ""
 
 
 def _readable_in(folder: Path) -> str:
-    """Names of readable parts, or ""."""
     found = []
     for name in names_in(folder)[:_MOST_LOOKED_AT]:
         path = folder / name

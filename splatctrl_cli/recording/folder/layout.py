@@ -90,7 +90,6 @@ def list_views(path: Path, views: Sequence[ListedView], num_colors: int, num_dep
 
 
 def move_poses(pairs: Description, change: Callable[[Float64], Float64]) -> Description:
-    """Apply `change` to each known pose."""
     views = (v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in pairs.listed)
     return replace(pairs, listed=tuple(views))
 

@@ -157,7 +157,6 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
 
 
 def _sensors(folder: Path) -> list[str]:
-    """Suffixes of the sensors' file names, such as ``_cam1``; empty for ``scene_camera.json``."""
     stem = Path(FILE).stem
     found = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
     return [sensor for sensor in found if (folder / f"depth{sensor}").is_dir()]

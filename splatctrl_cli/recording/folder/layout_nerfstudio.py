@@ -41,7 +41,6 @@ def read(folder: Path, options: SourceOptions) -> Description:
 
 
 def with_transforms(description: Description) -> Description:
-    """Fill missing camera and views from transforms.json."""
     table = description.poses
     is_whole = bool(description.listed or (description.camera and description.frames))
     if is_whole or table is None or table.format != "nerfstudio":
@@ -113,7 +112,6 @@ def _view(
 
 
 def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
-    """The value of any key, or None. Raises InputError if two differ."""
     found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
     both = " and ".join(f"{key} = {value}" for key, value in found.items())
     refuse_if(len(set(found.values())) > 1, f"{path}: {both} differ", remedy="leave one of them out")

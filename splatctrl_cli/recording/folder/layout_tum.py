@@ -111,7 +111,6 @@ def list_files(path: Path) -> list[tuple[int, Path]]:
 
 
 def _series(folder: Path) -> str:
-    """The series, of `SERIES`, in the folder's name, or its lists' heads."""
     names = [folder.resolve().name]
     for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
         if (folder / file).is_file():

@@ -134,7 +134,6 @@ def read_matrix_file(path: Path) -> Float64:
 
 
 def read_numbers(path: Path) -> list[float]:
-    """All numbers of a text file, in order."""
     return [value for line in _lines(path) if not line.startswith("#") for value in _numbers(line.split(), str(path))]
 
 

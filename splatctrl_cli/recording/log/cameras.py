@@ -49,7 +49,6 @@ def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
 
 
 def _unlike(topic: TopicSurvey) -> str:
-    """The word in a name that contradicts the image kind."""
     image, parts = topic.image, _parts(topic.topic.name)
     if image.kind == "depth":
         word = word_of(parts) or word_of((image.frame_id,))
@@ -216,7 +215,6 @@ def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
 
 
 def no_camera(log: RawLog, survey: Survey) -> InputError:
-    """The error for a log without matching colour and depth."""
     colors, depths = ([t.topic.name for t in image_topics(survey, kind)] for kind in ("color", "depth"))
     broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
     topics = [t.topic for t in survey.topics.values() if t.count]
@@ -297,7 +295,6 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _kind(topic: Topic) -> str:
-    """The message type, with an encoding that is not ROS."""
     name = topic.schema or topic.type_name
     return name if is_ros(topic) and name else f"{name} ({topic.encoding})".strip()
 
@@ -338,7 +335,6 @@ def pose_topics(survey: Survey) -> list[str]:
 
 
 def _child_of(log: RawLog, survey: Survey, camera: str, given: tuple[str, str], frame: str) -> str:
-    """The posed frame. Raises InputError if it does not place the camera."""
     topic, posed = given
     where = f"{log.path}: --camera-pose {camera}={topic}"
     refuse_if(
@@ -364,7 +360,6 @@ def _child_of(log: RawLog, survey: Survey, camera: str, given: tuple[str, str], 
 
 
 def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set[str]) -> dict[str, str]:
-    """Frames by the odometry that alone places them."""
     known = set(survey.tf.frames)
     found: dict[str, str] = {}
     for topic in survey.of_type(ODOMETRY):

@@ -55,12 +55,10 @@ class UnreadFormError(UndecodableMessageError):
 
 
 def is_ros(topic: Topic) -> bool:
-    """True for ROS encodings, or messages that stand for ROS."""
     return topic.encoding in {"cdr", "ros1", VIDEO} or is_foxglove(topic)
 
 
 def is_foxglove(topic: Topic) -> bool:
-    """True for protobuf or JSON that stands for ROS."""
     return topic.schema != "" and topic.encoding in {"protobuf", "json"}
 
 
@@ -269,14 +267,12 @@ class RealSense:
 
 
 def has_unit(message: RawMessage) -> bool:
-    """True if a depth unit follows an SDK image."""
     topic = message.topic
     is_image = topic.encoding == "ros1" and topic.type_name == "sensor_msgs/msg/Image"
     return is_image and message.data[_AT : _AT + len(_FRAME_1)] == _FRAME_1 and device_of(topic.name) != ""
 
 
 def device_of(topic: str) -> str:
-    """An SDK topic's device, or ""."""
     match = _STREAM.match(topic)
     return match[1] if match else ""
 

@@ -163,7 +163,6 @@ class _Packed(NamedTuple):
 
     @property
     def recorded(self) -> str:
-        """Encoding before compression, if stated."""
         return self.form.partition(";")[0].strip()
 
     @property

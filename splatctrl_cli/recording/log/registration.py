@@ -137,7 +137,6 @@ class TfTree:
             self.note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
 
     def note(self, note: str) -> None:
-        """Note a remark once."""
         if note not in self.notes:
             self.notes.append(note)
 
@@ -151,7 +150,6 @@ class TfTree:
         return tuple(frame for frame in self.frames if frame not in self._edges)
 
     def root_of(self, frame: str) -> str:
-        """The topmost ancestor, perhaps itself."""
         return self._ancestors(frame)[-1]
 
     def span_ns(self, frame: str) -> tuple[int, int] | None:
@@ -160,7 +158,6 @@ class TfTree:
         return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None
 
     def connects(self, target: str, source: str) -> bool:
-        """True if edges join them."""
         return self.root_of(target.strip("/")) == self.root_of(source.strip("/"))
 
     def lookup(self, target: str, source: str, stamp_ns: int, tolerance_ns: int = 0) -> Float64 | None:
@@ -308,7 +305,6 @@ def undistort_lens(
 def _maps(
     lens: Intrinsics, model: str, coefficients: Float64, R: Float64, result: Intrinsics
 ) -> tuple[Float32, Float32]:
-    """Column and row in the distorted image, by result pixel."""
     K, P = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], dtype=np.float64) for k in (lens, result))
     size = (result.width, result.height)
     if model == "equidistant":

@@ -124,7 +124,6 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
 
 
 def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
-    """Smallest difference of a colour and a depth stamp."""
     color, depth = np.sort(np.array(color_ns)), np.sort(np.array(depth_ns))
     after = np.clip(np.searchsorted(depth, color), 0, len(depth) - 1)
     before = np.clip(after - 1, 0, None)
@@ -215,7 +214,6 @@ class _Builder:
         )
 
     def problems(self) -> list[str]:
-        """List all problems; empty if `build` succeeds."""
         found = []
         any_lens = Lens(intrinsics=Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1))
         steps: list[Callable[[], object]] = [
@@ -329,7 +327,6 @@ class _Builder:
             )
 
     def _check_world(self) -> str:
-        """The world frame, if tf joins the camera to it."""
         tf, frame_id = self._survey.tf, self._frame_id
         if self._topics.name in self._options.camera_poses:
             return self._options.world_frame or "world"
@@ -358,7 +355,6 @@ class _Builder:
             raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
 
     def _with_depth(self, lens: Lens) -> Lens:
-        """The lens with that of its unregistered depth."""
         topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
         depth_image = self._survey.topics[topics.depth].image
         size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"

@@ -53,7 +53,6 @@ class Planned:
 
     @property
     def keys(self) -> list[tuple[str, int]]:
-        """Topic and number of each image."""
         camera = self.camera
         keys = [(camera.color_topic, self.color_index), (camera.depth_topic, self.depth_index)]
         return keys if self.human_index is None else [*keys, (camera.human_topic, self.human_index)]
@@ -153,7 +152,6 @@ class HeldMessages:
         self._messages[key] = message
 
     def get(self, key: Key) -> RawMessage:
-        """A message, which stays."""
         message, place = self._messages[key], self._places.get(key)
         if place is None:
             return message
@@ -161,7 +159,6 @@ class HeldMessages:
         return replace(message, data=self._file.read(place[1]))
 
     def pop(self, key: Key) -> RawMessage:
-        """Remove and return a message."""
         found = self.get(key)
         self._num_bytes -= len(self._messages.pop(key).data)
         self._places.pop(key, None)
@@ -294,7 +291,6 @@ class RosLogSource(FrameSource):
         return plan
 
     def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
-        """Numbers and stamps without repeats; counts repeated and missing images."""
         stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
         refuse_if(
             len(stamps) > 1 and not stamps.any(),
@@ -329,7 +325,6 @@ class RosLogSource(FrameSource):
         self._loss.without_pose += len(color) - num
 
     def _frames(self, *, lazily: bool = True) -> Iterator[StoredFrame]:
-        """Yield frames; lazily: unchanged image files are decoded on demand."""
         lost, decoder, checked = Damage(), MessageDecoder(), set[str]()
         self._passes.append(lost)
         for planned, messages in planned_images(self._log, self._plan, lost, HeldMessages()):
@@ -375,7 +370,6 @@ def _images(
 
 
 def _keeps_files(camera: Camera) -> tuple[bool, bool]:
-    """True for colour and depth whose files a capture keeps."""
     return camera.maps is None, camera.maps is None and camera.depth_lens is None
 
 
@@ -412,7 +406,6 @@ def _times(found: Survey, camera: Camera) -> str:
 def _mask_by_color(
     survey: Survey, color_topic: str, mask_topic: str, tolerance_ns: int, camera: str, loss: LossReport
 ) -> dict[int, int]:
-    """Mask number by colour number, closest stamps paired; missing ones are noted."""
     if not mask_topic:
         return {}
     color_ns, mask_ns = survey.topics[color_topic].stamps_ns, survey.topics[mask_topic].stamps_ns

@@ -157,8 +157,6 @@ class ColumnWriter:
 
 
 class StateCollector:
-    """A collector of states."""
-
     def __init__(self, num_joints: int) -> None:
         self._num_joints = num_joints
         self._stamps = array("q")

@@ -233,7 +233,6 @@ def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
 
 
 def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
-    """Rename unknown joints to the robot's if only a prefix differs."""
     found = dict.fromkeys(name for stream in streams for name in stream.names)
     unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
     names = with_prefix(unknown, missing)
@@ -269,7 +268,6 @@ def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
 
 
 def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
-    """Add the joints of `other`, interpolated; states without them are left out."""
     order = np.argsort(other.stamp_ns, kind="stable")
     at = other.stamp_ns[order]
     stamps = track.stamp_ns

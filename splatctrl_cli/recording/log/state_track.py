@@ -66,7 +66,6 @@ class _Sums:
         return self._start + self._sums.shape[1] - 1
 
     def add(self, k: Float64, r: Float64) -> None:
-        """Add values (T,)."""
         rows = [np.cumsum(np.concatenate([s[-1:], v])) for s, v in zip(self._sums, (k, r, k**2, k * r), strict=True)]
         self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
 
@@ -75,7 +74,6 @@ class _Sums:
         return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
 
     def forget(self, before: int) -> None:
-        """Drop sums no later state needs."""
         if before > self._start:
             self._sums, self._start = self._sums[:, before - self._start :].copy(), before
 
@@ -142,7 +140,6 @@ class RawTrack(StateColumns):
     names: tuple[str, ...]
 
     def of_names(self, names: Sequence[str]) -> "RawTrack":
-        """Columns of these joints, in order."""
         order = np.array([self.names.index(name) for name in names], dtype=np.int64)
         return replace(self.of_joints(order), names=tuple(names))
 

@@ -253,7 +253,6 @@ class FrameSource:
         raise NotImplementedError
 
     def records(self) -> Iterator[Record]:
-        """Yield joint states and decoded frames."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:

@@ -76,7 +76,6 @@ class StampClock:
     _latest_log_ns: int = 0
 
     def see(self, stamp_ns: int, log_time_ns: int) -> None:
-        """Take the next message in order."""
         if self._latest_ns is None or stamp_ns > self._latest_ns:
             self._latest_ns, self._latest_log_ns = stamp_ns, log_time_ns
         elif self._latest_ns - stamp_ns > IMAGES_BACK_NS and log_time_ns > self._latest_log_ns:
@@ -286,7 +285,6 @@ def _calibration(message: Any) -> Calibration | None:
 
 
 def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
-    """Joint states; log time shifts all of a message."""
     states = read_states(decoded, message.topic.type_name, message.log_time_ns)
     if not result.by_log_time:
         return states

@@ -56,8 +56,6 @@ class _Stream:
 
 
 class VideoLog(RawLog):
-    """A log with video as images."""
-
     def __init__(self, log: RawLog) -> None:
         self.inner = log
         self.path, self.files, self.container = log.path, log.files, log.container
@@ -69,7 +67,6 @@ class VideoLog(RawLog):
         return self.decoded(self.inner.messages(damage, names), damage)
 
     def decoded(self, messages: Iterable[RawMessage], damage: Damage) -> Iterator[RawMessage]:
-        """Decode some of the log's messages, in order."""
         streams: dict[str, _Stream | None] = {}
         decoder = MessageDecoder()
         for message in messages:

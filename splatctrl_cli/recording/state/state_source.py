@@ -47,8 +47,6 @@ _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 
 
 class StateSource(FrameSource):
-    """Joint states without frames."""
-
     def __init__(
         self, name: str, files: Sequence[Path], names: tuple[str, ...], states: StateColumns, loss: LossReport
     ) -> None:
@@ -96,7 +94,6 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
 
 
 def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
-    """Open with frames if possible; else the states, with a note."""
     default = SourceOptions()
     try:
         return calibrated(RosLogSource(log, options, joints), options)
