@@ -263,10 +263,9 @@ def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> No
 def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool:
     for camera, its in by_camera.items():
         places = np.array([s.T_camera_board[:3, 3] for s in its])
-        if camera not in rig.moving and len(its) > 1:
-            away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-            if np.median(away) > fixed.CALIBRATION_BOARD_MOVED:
-                return False
+        away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+        if camera not in rig.moving and len(its) > 1 and np.median(away) > fixed.CALIBRATION_BOARD_MOVED:
+            return False
     return True
 
 

@@ -127,10 +127,9 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, An
         return {"distance_mm": 1e3 * DISPLACED_WIDTH, "sigma_mm": 0.0, "num_pixels": len(points)}, T
     moved = points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]
     by_pose = np.hstack([np.cross(np.eye(POSE // 2), points.mean(axis=0)).T, np.eye(POSE // 2)])  # of their middle
-    variance = float(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T))
     return {
         "distance_mm": round(1e3 * float(np.sqrt(np.square(moved).sum(axis=1).mean())), 2),
-        "sigma_mm": round(1e3 * variance**0.5, 2),
+        "sigma_mm": round(1e3 * float(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T)) ** 0.5, 2),
         "num_pixels": len(points),
     }, T
 

@@ -237,7 +237,9 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
             for channel in range(3):
                 some = ratios[is_of_pair & is_known[:, channel], channel]
                 if len(some) >= fixed.REFINE_FEWEST:
-                    found.append((channel, a, b, *_median_ratio(some)))
+                    ratio = float(np.median(some))
+                    spread = 1.4826 * float(np.median(np.abs(some - ratio)))
+                    found.append((channel, a, b, ratio, 1 / (fixed.EXPOSURE_ERROR**2 + spread**2 / len(some))))
     numbers, values = np.array([row[:3] for row in found], np.int64), np.array([row[3:] for row in found])
     numbers, values = numbers.reshape(-1, 3), values.reshape(-1, 2)
     return BandRatios(
@@ -248,12 +250,6 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
         ratios=values[:, 0],
         weights=values[:, 1],
     )
-
-
-def _median_ratio(ratios: Float64) -> tuple[float, float]:
-    ratio = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
-    return ratio, 1 / (fixed.EXPOSURE_ERROR**2 + spread**2 / len(ratios))
 
 
 def exposed(frame: RgbdFrame, gain: Float64) -> RgbdFrame:

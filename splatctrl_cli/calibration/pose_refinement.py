@@ -98,8 +98,7 @@ class BentViews:
         self._weights = {shape: _weights(shape) for shape in {view.gray.shape for view in self.recorded}}
         self._pixels = [_pixels(view) for view in self.recorded]
         self._basis, self._num = bends_alone(), max(self.cameras) + 1
-        prior = (_roughness() + np.eye(len(self._basis))) / fixed.BEND_PRIOR**2
-        self._prior = self._basis.T @ prior @ self._basis
+        self._prior = self._basis.T @ ((_roughness() + np.eye(len(self._basis))) / fixed.BEND_PRIOR**2) @ self._basis
         self._free = np.zeros((self._num, self._basis.shape[1]))
         self._bend()
 
@@ -124,8 +123,7 @@ class BentViews:
     def by_offsets(self, i: int, j: int, rows: Rows) -> csr_array:
         """(R, C G) derivatives of view i's residuals on view j by offsets."""
         size, parts = len(self._basis), []
-        own = self._pixels[i][rows.own]
-        for k, pixels, by_stretch in ((i, own, rows.by_own), (j, rows.other, rows.by_other)):
+        for k, pixels, by_stretch in ((i, self._pixels[i][rows.own], rows.by_own), (j, rows.other, rows.by_other)):
             if self.cameras[k] == HELD:
                 parts.append(csr_array((len(pixels), self._num * size)))
                 continue

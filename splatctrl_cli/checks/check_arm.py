@@ -140,41 +140,6 @@ def _exchanged(posture: Posture, i: int, j: int) -> Posture:
     return exchanged
 
 
-def _in_place(where: str, agreement: ArmAgreement, units: Iterable[float | None]) -> Finding:
-    if agreement.scale is not None:
-        return warning(
-            "arm",
-            where,
-            f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say",
-            f"{rescale_remedy(units, 1 / agreement.scale)}, or check --base and the camera's pose",
-            value=round(agreement.scale, 3),
-        )
-    return note(
-        "arm",
-        where,
-        f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); in"
-        f" {agreement.num_frames} depth images {100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
-        " show what is behind it",
-        value=round(1e3 * agreement.median, 1),
-        unit="mm",
-    )
-
-
-def _misplaced(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
-    off = [1e3 * agreement.misfit for agreement in bad.values()]
-    through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
-    return warning(
-        "arm",
-        f"camera{'s' if len(bad) > 1 else ''} {', '.join(bad)}",
-        f"the arm is not where the joints say: {', '.join(f'{each:.0f}' for each in off)} mm off in the mean"
-        f" (each pixel counted as {1e3 * limits.ARM_NEAR:.0f} mm at most); {through} % of its pixels show what is"
-        " behind it",
-        cause or "check the URDF, --base, the joints' zeros and the camera's pose; robot labels will be wrong",
-        value=round(max(off), 1),
-        unit="mm",
-    )
-
-
 def motion_findings(
     frames: Sequence[RgbdFrame],
     motion: ImageMotion,
@@ -220,12 +185,47 @@ def _arm_findings(
         if timing is not None:
             timings[camera] = timing
             agreement = arm_agreement(model, its, posture, offset_s=timing[0]) or agreement
-        if agreement.is_good or agreement.scale is not None:
-            found.append(_in_place(where, agreement, units))
+        if agreement.scale is not None:
+            found.append(
+                warning(
+                    "arm",
+                    where,
+                    f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say",
+                    f"{rescale_remedy(units, 1 / agreement.scale)}, or check --base and the camera's pose",
+                    value=round(agreement.scale, 3),
+                )
+            )
+        elif agreement.is_good:
+            found.append(
+                note(
+                    "arm",
+                    where,
+                    f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); in"
+                    f" {agreement.num_frames} depth images {100 * agreement.seen_through:.0f} % of"
+                    f" {agreement.num_pixels} pixels show what is behind it",
+                    value=round(1e3 * agreement.median, 1),
+                    unit="mm",
+                )
+            )
         else:
             bad[camera] = agreement
     if bad:
-        found.insert(0, _misplaced(bad, _swap(model, frames, posture)))
+        off = [1e3 * agreement.misfit for agreement in bad.values()]
+        through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
+        found.insert(
+            0,
+            warning(
+                "arm",
+                f"camera{'s' if len(bad) > 1 else ''} {', '.join(bad)}",
+                f"the arm is not where the joints say: {', '.join(f'{each:.0f}' for each in off)} mm off in the mean"
+                f" (each pixel counted as {1e3 * limits.ARM_NEAR:.0f} mm at most); {through} % of its pixels show"
+                " what is behind it",
+                _swap(model, frames, posture)
+                or "check the URDF, --base, the joints' zeros and the camera's pose; robot labels will be wrong",
+                value=round(max(off), 1),
+                unit="mm",
+            ),
+        )
     return _own_offsets(timings, model, frames, posture), found
 
 

@@ -287,24 +287,24 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
         width = surface.shape[1]
         if max(peak, 0.0) >= limits.EDGE_CLEAR and peak >= limits.EDGE_AHEAD * runner_up:
             if max(abs(du), abs(dv)) > max(limits.EDGE_SHIFT * width, limits.EDGE_AROUND):
-                found.append(_shifted(f"camera {camera}", du, dv, width, peak))
+                share = 100 * max(abs(du), abs(dv)) / width
+                found.append(
+                    error(
+                        "alignment",
+                        f"camera {camera}",
+                        f"depth edges lie {-du:+d} px across and {-dv:+d} px down from colour edges in images {width}"
+                        f" px wide ({share:.1f} % of the width, correlation {peak:.2f} there): depth is not"
+                        " registered to colour",
+                        "record depth aligned to colour, or with its own frame and CameraInfo, that ingest may"
+                        " register it",
+                        value=max(abs(du), abs(dv)),
+                        unit="px",
+                    )
+                )
         elif (other := _other(camera, edges, _at_zero(surface))) is not None:
             others[camera] = other
     exchanged = (_exchanged(camera, other, is_mutual=other[0] in others) for camera, other in others.items())
     return [*found, *chain.from_iterable(exchanged)]
-
-
-def _shifted(where: str, du: int, dv: int, width: int, peak: float) -> Finding:
-    share = 100 * max(abs(du), abs(dv)) / width
-    return error(
-        "alignment",
-        where,
-        f"depth edges lie {-du:+d} px across and {-dv:+d} px down from colour edges in images {width} px wide"
-        f" ({share:.1f} % of the width, correlation {peak:.2f} there): depth is not registered to colour",
-        "record depth aligned to colour, or with its own frame and CameraInfo, that ingest may register it",
-        value=max(abs(du), abs(dv)),
-        unit="px",
-    )
 
 
 def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> list[Finding]:

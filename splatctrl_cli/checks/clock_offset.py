@@ -287,8 +287,7 @@ def _vertex(offsets: Float64, score: Float64, best: int) -> float:
     near = slice(best - reach, best + reach + 1)
     width = float(offsets[best + reach] - offsets[best])
     a, b, _ = np.polyfit((offsets[near] - offsets[best]) / width, score[near], 2)
-    shift = float(np.clip(-b / (2 * a), -1.0, 1.0)) if a < 0 else 0.0
-    return float(offsets[best]) + shift * width
+    return float(offsets[best]) + (float(np.clip(-b / (2 * a), -1.0, 1.0)) if a < 0 else 0.0) * width
 
 
 def _unknown(num: int, reason: str, top: float = 0.0) -> ClockOffset:

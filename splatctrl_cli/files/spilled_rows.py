@@ -114,8 +114,7 @@ class Rows:
     def select(self, index: Index | None = None, columns: Index | None = None) -> "Rows":
         """Rows of an index (K,), and of columns, in their order."""
         wanted = ((self._index, index), (self._columns, columns))
-        chosen = (old if new is None else new if old is None else old[new] for old, new in wanted)
-        return Rows(self._file, *chosen)
+        return Rows(self._file, *(old if new is None else new if old is None else old[new] for old, new in wanted))
 
     def _read(self, first: int, last: int) -> Float64:
         if self._index is None:

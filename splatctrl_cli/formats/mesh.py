@@ -47,7 +47,8 @@ def load_mesh(path: Path) -> TriangleMesh:
         remedy="give an OBJ, STL, PLY, GLB or COLLADA file",
     ):  # trimesh raises whatever the reader of the format raises
         loaded = trimesh.load(source, file_type=kind[1:], force="mesh", process=False)
-        scale = _collada_unit(path) if kind == ".dae" else 1.0
+        unit = ElementTree.parse(path).find("{*}asset/{*}unit") if kind == ".dae" else None
+        scale = 1.0 if unit is None else float(unit.get("meter", "1"))  # metres per unit
     refuse_if(
         not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces),
         f"{path}: expected a mesh, got no triangle",
@@ -83,9 +84,3 @@ def _opened(path: Path) -> tuple[BytesIO | Path, str]:
     except UnicodeDecodeError:
         return BytesIO(content.decode("utf-8", "replace").encode()), ""
     return path, ""
-
-
-def _collada_unit(path: Path) -> float:
-    """Metres per unit."""
-    unit = ElementTree.parse(path).find("{*}asset/{*}unit")
-    return 1.0 if unit is None else float(unit.get("meter", "1"))

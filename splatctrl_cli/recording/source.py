@@ -171,14 +171,13 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
         grids.append(Grid(name="cameras", header=("camera", "color", "depth", "camera_info"), rows=rows))
     lacks = missing(log, found, options) if found.num_messages else ["the log holds no messages"]
-    notes = [*sampling, *found.damage.all_notes, *found.tf.notes]
     return Summary(
         path=str(log.path),
         kind=log.container,
         facts=facts,
         grids=tuple(grids),
         missing=tuple(lacks),
-        notes=tuple(notes),
+        notes=(*sampling, *found.damage.all_notes, *found.tf.notes),
         damaged=found.damage.count,
     )
 
@@ -301,11 +300,10 @@ def _describe_images(path: Path, source: ImageFolderSource, kind: str) -> Summar
     first = next((item for item in source.stored() if isinstance(item, StoredFrame)), None)
     counts = {name: sum(camera == name for _, camera, _ in source.poses()) for name in source.cameras}
     loss, k = source.loss, None if first is None else first.intrinsics
-    seen = {} if first is None else {"first_valid_depth_share": round(float((first.depth > 0).mean()), 4)}
     facts: dict[str, object] = {
         "has_clock": source.has_clock,
         **({} if k is None else {"size": f"{k.width}x{k.height}", "fx_fy_cx_cy": [k.fx, k.fy, k.cx, k.cy]}),
-        **seen,
+        **({} if first is None else {"first_valid_depth_share": round(float((first.depth > 0).mean()), 4)}),
         "loss": {name: getattr(loss, name) for name in ("unpaired_color", "unpaired_depth", "without_pose")},
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])

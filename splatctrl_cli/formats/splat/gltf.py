@@ -17,7 +17,7 @@ from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import SH_C0, SplatFormat, refuse, unit_quaternions
 from splatctrl_cli.formats.unpacking import read_bytes
-from splatctrl_cli.records import Array, Float32, GaussianSet, Label, UInt8
+from splatctrl_cli.records import Array, Float32, GaussianSet, Label
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942  # glTF, JSON, BIN
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -118,9 +118,10 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     ``_LABEL`` is written if some Gaussian is not an object. Raises InputError for an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
+    colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
     tables: dict[str, Array] = {  # the first has its range beside it
         "POSITION": gaussians.centers,
-        "COLOR_0": _point_colors(gaussians),
+        "COLOR_0": np.rint(255.0 * np.column_stack([colors, gaussians.opacities])).astype(np.uint8),
         ROTATION: np.roll(gaussians.quats_wxyz, -1, axis=1),
         SCALE: gaussians.scales,
         OPACITY: gaussians.opacities[:, None],
@@ -169,12 +170,6 @@ def coefficient_name(index: int) -> str:
     """Attribute of coefficient `index`, counted through all degrees."""
     degree = int(np.sqrt(index))
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index - degree * degree}"
-
-
-def _point_colors(gaussians: GaussianSet) -> UInt8:
-    """(N, 4) red, green, blue, opacity, 0 to 255, for point clouds."""
-    colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
-    return np.rint(255.0 * np.column_stack([colors, gaussians.opacities])).astype(np.uint8)
 
 
 def _primitive(path: Path, document: Mapping[str, Any]) -> dict[str, Any]:

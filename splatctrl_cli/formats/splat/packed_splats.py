@@ -66,13 +66,12 @@ def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     rows = np.frombuffer(content, dtype=ROW)
     check_finite(str(path), len(rows), {"center": rows["center"], "sigma": rows["sigma"]})
     quats = (rows["quat_wxyz"].astype(np.float64) - 128.0) / 128.0
-    colors = rows["rgba"][:, :3].astype(np.float64) / 255.0
     gaussians = GaussianSet(
         centers=rows["center"].copy(),
         scales=rows["sigma"].copy(),
         quats_wxyz=unit_quaternions(str(path), quats),
         opacities=(rows["rgba"][:, 3] / 255.0).astype(np.float32),
-        harmonics=((colors - 0.5) / SH_C0).astype(np.float32)[:, None, :],
+        harmonics=(((rows["rgba"][:, :3].astype(np.float64) / 255.0) - 0.5) / SH_C0).astype(np.float32)[:, None, :],
         labels=np.zeros(len(rows), dtype=np.uint8),
     )
     check_gaussians(str(path), gaussians)
@@ -297,8 +296,7 @@ def _quaternions(table: UInt8) -> Float32:
         others = SQRT_HALF * (fields & np.uint32(0x1FF)) / 511.0 * np.where(fields >> np.uint32(9), -1.0, 1.0)
         quats = np.zeros((len(words), 4))
         quats[np.arange(4) != largest] = others.ravel()
-        rest = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))
-        np.put_along_axis(quats, largest, rest[:, None], axis=1)
+        np.put_along_axis(quats, largest, np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))[:, None], axis=1)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     return np.roll(quats, 1, axis=1).astype(np.float32)
 

@@ -45,7 +45,9 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
     field.CreateOpacitiesAttr(arrays.FloatArray.FromNumpy(g.opacities))
     field.CreateRadianceSphericalHarmonicsDegreeAttr(int(np.sqrt(g.harmonics.shape[1])) - 1)
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(to_float3(g.harmonics.reshape(-1, 3)))
-    field.CreateExtentAttr(to_float3(_extent(g)))
+    reach = 3.0 * g.scales.max(axis=1, keepdims=True)
+    corners = np.stack([(g.centers - reach).min(axis=0), (g.centers + reach).max(axis=0)])  # at any rotation
+    field.CreateExtentAttr(to_float3(corners.astype(np.float32)))
     if (g.labels != Label.OBJECT).any():
         primvar = geometry.PrimvarsAPI(field).CreatePrimvar("label", kinds.IntArray, geometry.Tokens.vertex)
         primvar.Set(arrays.IntArray.FromNumpy(g.labels.astype(np.int32)))
@@ -99,12 +101,6 @@ def _library() -> tuple[Any, Any, Any, Any, Any]:
         error=UsageError,
     )
     return Usd, UsdGeom, UsdVol, Vt, Sdf.ValueTypeNames
-
-
-def _extent(gaussians: GaussianSet) -> Float32:
-    reach = 3.0 * gaussians.scales.max(axis=1, keepdims=True)
-    lower, upper = (gaussians.centers - reach).min(axis=0), (gaussians.centers + reach).max(axis=0)
-    return np.stack([lower, upper]).astype(np.float32)
 
 
 def _gaussians(path: Path, prim: Any, geometry: Any) -> GaussianSet:

@@ -108,18 +108,6 @@ def check_not_partial(folder: Path) -> None:
     )
 
 
-def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Raise UsageError if a written frame differs from the source's."""
-    differing = [name for name in now if before.get(name) != now[name]]
-    name = next(iter(differing), "")
-    refuse_if(
-        differing,
-        f"{folder}: --resume: {before.get('color')}: {name} was {before.get(name)}, is {now.get(name)}",
-        remedy="the source has changed; start over without --resume",
-        error=UsageError,
-    )
-
-
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
     with path.open(encoding="utf-8") as stream:
         for line in stream:
@@ -172,7 +160,14 @@ def write_capture(
             if kept is None:
                 journal.add(_write_frame(folder, item, row, cameras[item.camera]))
             else:
-                check_same_frame(folder, kept.row, row)
+                name = next((name for name in row if kept.row.get(name) != row[name]), "")
+                refuse_if(
+                    name,
+                    f"{folder}: --resume: {kept.row.get('color')}: {name} was {kept.row.get(name)}, is"
+                    f" {row.get(name)}",
+                    remedy="the source has changed; start over without --resume",
+                    error=UsageError,
+                )
                 num_resumed += 1
             if progress is not None:
                 progress(journal.num_entries)

@@ -58,7 +58,20 @@ def index_by_heads(file: McapFile) -> LogIndex:
             content = head[HEAD.size :]
             if opcode == CHUNK:
                 with suppress(BadBlockError):
-                    chunks.append(_chunk_index(content, offset, length))
+                    chunk: Chunk = parse_record(CHUNK, content)
+                    chunks.append(
+                        ChunkIndex(
+                            message_start_time=chunk.message_start_time,
+                            message_end_time=chunk.message_end_time,
+                            chunk_start_offset=offset,
+                            chunk_length=length + HEAD.size,
+                            message_index_offsets={},
+                            message_index_length=0,
+                            compression=chunk.compression,
+                            compressed_size=chunk.compressed_size,
+                            uncompressed_size=chunk.uncompressed_size,
+                        )
+                    )
             elif opcode == MESSAGE_INDEX and chunks:
                 channel, size = struct.unpack_from("<HI", content)
                 counts[channel] = counts.get(channel, 0) + size // 16
@@ -75,21 +88,6 @@ def index_by_heads(file: McapFile) -> LogIndex:
     notes = [] if offset + HEAD.size >= file.size else [f"counted up to byte {offset} of {file.size}"]
     span_ns = min(stamps, default=0), max(stamps, default=0)
     return counts, span_ns, tuple(chunks), ("has no summary: counted by the heads of its records", *notes)
-
-
-def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex:
-    chunk: Chunk = parse_record(CHUNK, content)
-    return ChunkIndex(
-        message_start_time=chunk.message_start_time,
-        message_end_time=chunk.message_end_time,
-        chunk_start_offset=offset,
-        chunk_length=length + HEAD.size,
-        message_index_offsets={},
-        message_index_length=0,
-        compression=chunk.compression,
-        compressed_size=chunk.compressed_size,
-        uncompressed_size=chunk.uncompressed_size,
-    )
 
 
 _MESSAGE = struct.Struct("<HIQQ")
@@ -115,8 +113,7 @@ class McapLog(RawLog):
         found, chunks = self._statistics, tuple(self._file.chunk_indexes())
         if found is None or len(chunks) != found.chunk_count:
             return index_by_heads(self._file)
-        span_ns = found.message_start_time, found.message_end_time
-        return dict(found.channel_message_counts), span_ns, chunks, ()
+        return dict(found.channel_message_counts), (found.message_start_time, found.message_end_time), chunks, ()
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.

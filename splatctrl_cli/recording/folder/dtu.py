@@ -152,8 +152,7 @@ def read_views(
 
 def check_lengths(where: str, views: Sequence[DtuView]) -> None:
     """Raise InputError if depth or camera distances are not millimetres."""
-    known = [view.depth[view.depth > 0] for view in views]
-    medians = [float(np.median(depth)) for depth in known if depth.size]
+    medians = [float(np.median(depth)) for depth in [view.depth[view.depth > 0] for view in views] if depth.size]
     if not medians:
         return
     median, (low, high) = float(np.median(medians)), PLAUSIBLE_DEPTH
@@ -341,8 +340,7 @@ def _camera_text(view: DtuView) -> str:
     pose, lens = (
         [" ".join(f"{value + 0.0:.10g}" for value in row) for row in matrix] for matrix in (T_camera_world, K)
     )
-    rows = ["extrinsic", *pose, "", "intrinsic", *lens, "", f"{near:g} {(far - near) / 191:.6g}"]
-    return "\n".join(rows) + "\n"
+    return "\n".join(["extrinsic", *pose, "", "intrinsic", *lens, "", f"{near:g} {(far - near) / 191:.6g}"]) + "\n"
 
 
 def _pairs(views: Sequence[DtuView]) -> str:

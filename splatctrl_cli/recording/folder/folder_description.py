@@ -275,13 +275,12 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         split=_optional(SplitTable, content, "split", path) or SplitTable(),
     )
     poses = description.poses
-    choices = [
+    for key, value, allowed in [
         *([] if poses is None else [("poses.format", poses.format, FORMATS)]),
         *([] if poses is None else [("poses.convention", poses.convention, CONVENTIONS)]),
         *([] if poses is None else [("poses.axes", poses.axes, AXES)]),
         ("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS),
-    ]
-    for key, value, allowed in choices:
+    ]:
         refuse_if(
             value not in allowed, f"{path}: {key}: expected one of {', '.join(allowed)}, got {value!r}", remedy=_HELP
         )

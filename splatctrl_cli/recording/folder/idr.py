@@ -35,8 +35,7 @@ PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
 
 def idr_scans(root: Path) -> dict[str, Path]:
     """Scan folders by name: `root`, or its children."""
-    folders = (root, *sorted(root.glob("*")))
-    scans = [path for path in folders if any((path / name).is_file() for name in CAMERAS)]
+    scans = [path for path in (root, *sorted(root.glob("*"))) if any((path / name).is_file() for name in CAMERAS)]
     return {path.name.removeprefix("dtu_"): path for path in (scans[:1] if root in scans else scans)}
 
 

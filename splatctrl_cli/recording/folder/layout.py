@@ -119,7 +119,6 @@ def pair_stamps(
 ) -> Description:
     """Pair files by stamp [ns] within the tolerance; the pose is at colour's stamp."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
-    pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
     views = [
         ListedView(
             name=f"{colors[i][0] / 1e9:.6f}",
@@ -128,7 +127,7 @@ def pair_stamps(
             matrix=pose_at(colors[i][0]),
             stamp_ns=colors[i][0],
         )
-        for i, j in pairs
+        for i, j in paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
     ]
     return list_views(path, views, len(colors), len(depths))
 

@@ -155,8 +155,7 @@ def trajectory(poses: Mapping[str, Float64 | None]) -> Callable[[int], Float64 |
         after = np.searchsorted(known_ns, stamp_ns)
         is_known = after < len(known_ns) and known_ns[after] == stamp_ns
         before = known_ns[after : after + 1] if is_known else known_ns[max(after - 1, 0) : after]
-        later = known_ns[after : after + 1]
-        first, last = (part[0] if len(part) else stamp_ns for part in (before, later))
+        first, last = (part[0] if len(part) else stamp_ns for part in (before, known_ns[after : after + 1]))
         is_lost = ((lost_ns >= first) & (lost_ns <= last)).any()
         return None if is_lost else tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
 

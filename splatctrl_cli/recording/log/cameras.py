@@ -134,8 +134,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
         info_folder = _parts(info.topic.name)[:-1]
         shared = len(common_prefix(info.topic.name, image.topic.name))
         is_near = shared > level or info_folder in {folder, folder[:level]}
-        is_same_view = view == (calibration.frame_id, calibration.width, calibration.height) and view[0] != ""
-        if is_near or is_same_view:
+        if is_near or (view == (calibration.frame_id, calibration.width, calibration.height) and view[0] != ""):
             found.append((-shared, len(info_folder), info.topic.name))
     return min(found)[2] if found else ""
 
@@ -182,10 +181,9 @@ def common_prefix(name: str, other: str) -> tuple[str, ...]:
 
 def _color_rank(topic: TopicSurvey) -> tuple[bool, bool, bool, bool, str]:
     name = topic.topic.name
-    is_infrared = any(part.startswith(("infra", "ir")) for part in _parts(name))
     return (
         topic.image.encoding in GRAY,
-        is_infrared,
+        any(part.startswith(("infra", "ir")) for part in _parts(name)),
         "rect" not in name,
         topic.topic.type_name == COMPRESSED_IMAGE,
         name,
@@ -323,10 +321,10 @@ def join_pose_topics(
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}
-    children = {
-        given[0]: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()
-    } or _odometries(log, survey, options, set(frames.values()))
-    for topic, child in children.items():
+    for topic, child in (
+        {given[0]: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()}
+        or _odometries(log, survey, options, set(frames.values()))
+    ).items():
         _add(log, survey, topic, child, only_first=only_first)
 
 

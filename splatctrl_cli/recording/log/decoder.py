@@ -73,7 +73,17 @@ class MessageDecoder:
         """Decode to an object with fields. Raises UndecodableMessageError."""
         topic = message.topic
         if topic.encoding == VIDEO:
-            return _unpack_image(message.data)
+            _, seconds, nanoseconds, height, width, length = _IMAGE_HEAD.unpack_from(message.data)
+            start, stamp = _IMAGE_HEAD.size + length, SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+            return SimpleNamespace(
+                header=SimpleNamespace(stamp=stamp, frame_id=message.data[_IMAGE_HEAD.size : start].decode()),
+                height=height,
+                width=width,
+                encoding="rgb8",
+                is_bigendian=0,
+                step=3 * width,
+                data=np.frombuffer(message.data, np.uint8, offset=start),
+            )
         store = None if is_foxglove(topic) else self._store(topic)
         with refuse_faults(
             f"{topic.name}: a {topic.schema or topic.type_name} that does not decode",
@@ -122,20 +132,6 @@ def pack_image(header: Any, pixels: NDArray[np.uint8]) -> bytes:
     frame, (height, width) = header.frame_id.strip("/").encode(), pixels.shape[:2]
     head = _IMAGE_HEAD.pack(b"\0\1\0\0", header.stamp.sec, header.stamp.nanosec, height, width, len(frame))
     return bytes(head + frame + pixels.tobytes())
-
-
-def _unpack_image(data: bytes) -> Any:
-    _, seconds, nanoseconds, height, width, length = _IMAGE_HEAD.unpack_from(data)
-    start, stamp = _IMAGE_HEAD.size + length, SimpleNamespace(sec=seconds, nanosec=nanoseconds)
-    return SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp, frame_id=data[_IMAGE_HEAD.size : start].decode()),
-        height=height,
-        width=width,
-        encoding="rgb8",
-        is_bigendian=0,
-        step=3 * width,
-        data=np.frombuffer(data, np.uint8, offset=start),
-    )
 
 
 def stamp_ns(header: Any) -> int:

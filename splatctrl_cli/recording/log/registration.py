@@ -260,8 +260,7 @@ def warp_depth(depth: Float32, own: Intrinsics, target: Intrinsics, T_color_dept
         for du in range(int(np.floor(2 * half_u)) + 1):
             column = first_u + du
             lands = is_row & (column < u + half_u) & (column >= 0) & (column < target.width)
-            pixels = (row[lands] * target.width + column[lands]).astype(np.int64)
-            np.minimum.at(nearest, pixels, depths[lands])
+            np.minimum.at(nearest, (row[lands] * target.width + column[lands]).astype(np.int64), depths[lands])
     nearest[np.isinf(nearest)] = 0.0
     return nearest.reshape(target.height, target.width)
 
@@ -348,5 +347,4 @@ def correct_lens(lens: Intrinsics, model: str, coefficients: Float64, valid: Boo
     grows = slice(1 + int(np.argmax(bent)))
     seen = np.minimum(np.maximum(np.interp(edges, bent[grows], r[grows]), 1e-9), WIDEST_RAY)
     share = min(1.0, float((edges / seen).min()))
-    result = replace(lens, fx=share * lens.fx, fy=share * lens.fy)
-    return undistort_lens(result, model, coefficients, recorded=lens)
+    return undistort_lens(replace(lens, fx=share * lens.fx, fy=share * lens.fy), model, coefficients, recorded=lens)

@@ -126,8 +126,7 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
 def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
     color, depth = np.sort(np.array(color_ns)), np.sort(np.array(depth_ns))
     after = np.clip(np.searchsorted(depth, color), 0, len(depth) - 1)
-    before = np.clip(after - 1, 0, None)
-    return int(np.minimum(np.abs(depth[after] - color), np.abs(depth[before] - color)).min())
+    return int(np.minimum(np.abs(depth[after] - color), np.abs(depth[np.clip(after - 1, 0, None)] - color)).min())
 
 
 def intrinsics_of(calibration: Calibration) -> Intrinsics:
@@ -197,8 +196,7 @@ class _Builder:
         topics = self._topics
         self._check_depth()
         self._check_clock()
-        calibration = self._calibration(topics.info, topics.color)
-        lens = self._lens(calibration, topics.info)
+        lens = self._lens(self._calibration(topics.info, topics.color), topics.info)
         lens = lens if self._is_registered else self._with_depth(lens)
         fixed = self._options.camera_poses.get(topics.name)
         return Camera(
@@ -384,8 +382,7 @@ class _Builder:
             remedy=f"{remedy}, or correct the frames",
         )
         if T_color_depth is None:
-            span = tf.span_ns(frame) or tf.span_ns(color_frame) or (0, 0)
-            T_color_depth = tf.lookup(color_frame, frame, span[0])
+            T_color_depth = tf.lookup(color_frame, frame, (tf.span_ns(frame) or tf.span_ns(color_frame) or (0, 0))[0])
         T_color_depth = require(
             T_color_depth,
             f"{what}, and tf does not join their frames {frame!r} and {color_frame!r};"

@@ -359,8 +359,7 @@ def _images(
         read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
         for message, lazily in zip(messages, kept, strict=False)
     ]
-    expected = (camera.intrinsics, (camera.depth_lens or camera).intrinsics)
-    for image, k in zip(images, expected, strict=False):
+    for image, k in zip(images, (camera.intrinsics, (camera.depth_lens or camera).intrinsics), strict=False):
         refuse_if(
             (image.width, image.height) != (k.width, k.height),
             f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}",

@@ -189,8 +189,7 @@ class JointStream(ColumnWriter):
         self.names = names
         self._stamps, self._log_times = array("q", stamp_ns.tolist()), array("q", log_time_ns.tolist())
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
-        shapes = {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}
-        super().__init__(shapes, columns or {})
+        super().__init__({name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}, columns or {})
         refuse_if(
             columns and len(self) != len(self._stamps),
             f"columns of other lengths than {len(self._stamps)}",

@@ -277,8 +277,7 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     before = after - 1
     position = unwrapped(other.select(order), loss).position
     gap = (at[after] - at[before]) * 1e-9
-    is_still = _is_still(position, before, after)
-    keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= STATES_BRIDGED) | is_still)
+    keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= STATES_BRIDGED) | _is_still(position, before, after))
     share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]
 
     names = ", ".join(other.names)

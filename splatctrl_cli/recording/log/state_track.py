@@ -158,7 +158,9 @@ def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
         loss.notes.append(f"{raw.where}: {len(gaps)} gaps between states, the longest {longest:.3f} s")
     num = len(ordered.stamp_ns)
     velocity = _with_velocity(ordered, loss) if num else ordered.velocity
-    num_without = num - _num_posed(ordered)
+    poses = [table for table in (ordered.T_base_ee, ordered.T_world_ee) if table is not None]
+    blocks = [[np.isfinite(T[first:last]).all(axis=(1, 2)) for T in poses] for first, last in ranges(len(ordered))]
+    num_without = num - sum(int(np.any(block, axis=0).sum()) for block in blocks)
     if 0 < num_without < num:
         loss.notes.append(f"{raw.where}: {num_without} of {num} states have no valid end-effector pose")
     return replace(ordered, velocity=velocity)
@@ -186,12 +188,6 @@ def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
     names = ", ".join(name for name, count in zip(raw.names, num, strict=True) if count)
     loss.notes.append(f"{raw.where}: {names}: {int(num.sum())} steps of a whole turn between states are taken out")
     return replace(raw, position=Rows(file))
-
-
-def _num_posed(raw: RawTrack) -> int:
-    poses = [table for table in (raw.T_base_ee, raw.T_world_ee) if table is not None]
-    blocks = [[np.isfinite(T[first:last]).all(axis=(1, 2)) for T in poses] for first, last in ranges(len(raw))]
-    return sum(int(np.any(block, axis=0).sum()) for block in blocks)
 
 
 def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:

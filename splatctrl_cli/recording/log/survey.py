@@ -299,8 +299,7 @@ def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
     if size < LARGE or not isinstance(inner, McapLog):
         return survey(log), ()
     counts, span_ns, chunks, notes = inner.index()
-    found = _sampled(inner, counts, span_ns, _first_chunks(counts, chunks), video)
-    return found, (
+    return _sampled(inner, counts, span_ns, _first_chunks(counts, chunks), video), (
         *notes,
         f"{size} bytes: described by index and first messages; neither checksums nor the rest were read",
     )

@@ -223,8 +223,7 @@ def _read_described(path: Path, name: str) -> LoggedTwists:
         f"{path}: {TABLE}: expected linear and angular of 3 columns and time_unit of {', '.join(TIME_UNITS_NS)}",
         remedy=_SEE,
     )
-    columns = columns_of(path, TABLE, table.file)
-    stamps, found = columns.read(
+    stamps, found = columns_of(path, TABLE, table.file).read(
         table.time, TIME_UNITS_NS[table.time_unit], {"twist": [*table.linear, *table.angular]}, table.epoch_ns
     )
     twists = found["twist"][: len(found["twist"])]

@@ -286,7 +286,7 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
         remedy=_SEE,
     )
     if table.preset and table.episode is not None:
-        return _of_episode(table, table.episode, path)
+        return _track(table, ParquetFile(Path(table.file), (EPISODE, table.episode)), path), Path(table.file)
     return _track(table, columns_of(path, "states", table.file), path), path.parent / table.file
 
 
@@ -298,12 +298,8 @@ def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
         f"{folder / INFO}: {POSITION} has no name for each joint",
         remedy="give a .toml: [states] preset, file, joints (splatctrl help replay, Logs)",
     )
-    return _of_episode(StatesTable(**found), found["episode"], folder)
-
-
-def _of_episode(table: StatesTable, episode: int, path: Path) -> tuple[RawTrack, Path]:
-    file = Path(table.file)
-    return _track(table, ParquetFile(file, (EPISODE, episode)), path), file
+    file = Path(found["file"])
+    return _track(StatesTable(**found), ParquetFile(file, (EPISODE, found["episode"])), folder), file
 
 
 def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
