@@ -252,8 +252,9 @@ class Adjustment:
         scale, bias = estimate.depth_of(frame.camera)
         depth = np.where(frame.depth > 0, scale * frame.depth + bias, 0.0).astype(np.float32)
         T, twist = self._placed(frame, estimate)
-        stamp_ns = frame.stamp_ns - round(estimate.clock * 1e9)
-        found = self.evidence.arm.rows(depth, frame.intrinsics, T, twist, stamp_ns, reach)
+        found = self.evidence.arm.rows(
+            depth, frame.intrinsics, T, twist, frame.stamp_ns - round(estimate.clock * 1e9), reach
+        )
         if found is None:
             return None
         step = max(1, len(found.residual) // fixed.CALIBRATION_ARM_POINTS)

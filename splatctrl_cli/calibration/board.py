@@ -80,8 +80,9 @@ def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
 
 def other_size(frame: RgbdFrame) -> tuple[int, int] | None:
     """Inner corners, larger number first, of any other chessboard in view, or None."""
-    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-    is_found, _, meta = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), cv2.CALIB_CB_LARGER)
+    is_found, _, meta = cv2.findChessboardCornersSBWithMeta(
+        cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), (3, 3), cv2.CALIB_CB_LARGER
+    )
     return (max(meta.shape), min(meta.shape)) if is_found and meta.size >= LEAST else None
 
 
@@ -341,8 +342,9 @@ def _hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> Float64:
     X = np.eye(4)
     R = X[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     rows = np.concatenate([A[:3, :3] - np.eye(3) for A in lefts])
-    moved = np.concatenate([R @ B[:3, 3] - A[:3, 3] for A, B in zip(lefts, rights, strict=True)])
-    X[:3, 3] = np.linalg.lstsq(rows, moved, rcond=None)[0]
+    X[:3, 3] = np.linalg.lstsq(
+        rows, np.concatenate([R @ B[:3, 3] - A[:3, 3] for A, B in zip(lefts, rights, strict=True)]), rcond=None
+    )[0]
     return X
 
 

@@ -37,8 +37,9 @@ class Certainty:
 
     def sigma_depth(self, camera: str) -> tuple[float, float]:
         """Sigma of scale and bias [m]; 0 if fixed."""
-        columns = self.unknowns.columns(camera)[POSE:]
-        scale, bias = (0.0 if at < 0 else float(np.sqrt(self.covariance[at, at])) for at in columns)
+        scale, bias = (
+            0.0 if at < 0 else float(np.sqrt(self.covariance[at, at])) for at in self.unknowns.columns(camera)[POSE:]
+        )
         return scale, bias
 
     @property
@@ -110,8 +111,9 @@ def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:
 
 def middle_of(adjustment: Adjustment, camera: str) -> tuple[Float64, float]:
     """Middle (3,) [m] of a camera's points, in its frame, and their radius [m]."""
-    points = [view.points for view in adjustment.evidence.views if view.camera == camera]
-    cloud = np.concatenate([*points, np.zeros((0, 3))])
+    cloud = np.concatenate(
+        [*(view.points for view in adjustment.evidence.views if view.camera == camera), np.zeros((0, 3))]
+    )
     if not len(cloud):
         return np.array([0.0, 0.0, 1.0]), 0.3
     middle = np.median(cloud, axis=0)

@@ -77,8 +77,9 @@ def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
         if found is None:
             return row
         left, T = found[0], T @ found[1]
-    is_far = left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED
-    if is_far or not _sees_links_in_place(arm, [_moved(frame, T) for frame in frames]):
+    if left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED or not _sees_links_in_place(
+        arm, [_moved(frame, T) for frame in frames]
+    ):
         return row
     return row | {"left_mm": left["distance_mm"], "T_recorded_camera": T.ravel().tolist()}
 

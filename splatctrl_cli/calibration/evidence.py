@@ -357,15 +357,16 @@ def _step(frame: RgbdFrame, num_averaged: int) -> int:
 def _robot_near(frame: RgbdFrame, arm: Arm | None) -> Bool:
     """Pixels (h, w) where the robot may appear, despite pose errors."""
     poses = None if arm is None else arm.surface_poses(frame.stamp_ns)
-    if arm is None or poses is None:
-        return np.zeros(frame.depth.shape, np.bool_)
-    shown = arm.surface.render(poses, frame.intrinsics, frame.T_world_camera, frame.depth).depth
+    shown = np.zeros(frame.depth.shape, np.float32)
+    if arm is not None and poses is not None:
+        shown = arm.surface.render(poses, frame.intrinsics, frame.T_world_camera, frame.depth).depth
     if not (shown > 0).any():
         return np.zeros(frame.depth.shape, np.bool_)
     pixels = fixed.CALIBRATION_ASIDE * frame.intrinsics.fx / float(np.median(shown[shown > 0]))
     reach = min(pixels, len(shown) / 8)  # a hand close to its camera would leave nothing
-    window = np.ones((2 * int(np.ceil(reach)) + 1,) * 2, np.uint8)
-    return np.asarray(cv2.dilate((shown > 0).astype(np.uint8), window) > 0)
+    return np.asarray(
+        cv2.dilate((shown > 0).astype(np.uint8), np.ones((2 * int(np.ceil(reach)) + 1,) * 2, np.uint8)) > 0
+    )
 
 
 def _pairs(views: Sequence[DepthView], moving: frozenset[str]) -> list[tuple[int, int]]:

@@ -196,8 +196,9 @@ class BandRatios:
             for column in range(2):
                 place = (self.channels, self.pairs[:, row], self.pairs[:, column])
                 np.add.at(A, place, self.weights * (1.0 if row == column else -1.0))
-        logs = np.linalg.solve(A, b[..., None])[..., 0].T
-        return np.asarray(np.exp(logs).reshape(self.num_images, self.num_bands, 3))
+        return np.asarray(
+            np.exp(np.linalg.solve(A, b[..., None])[..., 0].T).reshape(self.num_images, self.num_bands, 3)
+        )
 
     def misfit(self, gains: Float64) -> float:
         """Median absolute residual of log ratios, for gains (N, B or 1, 3)."""

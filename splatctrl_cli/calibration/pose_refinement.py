@@ -37,8 +37,9 @@ def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:
 
 def unbent(frame: RgbdFrame, grid: Float64) -> RgbdFrame:
     """The frame with disparity offsets (rows, columns) [1/m], bilinear, removed from depth."""
-    offset = (_weights(frame.depth.shape) @ grid.ravel()).reshape(frame.depth.shape)
-    factor, _ = stretch(frame.depth.astype(np.float64), offset)
+    factor, _ = stretch(
+        frame.depth.astype(np.float64), (_weights(frame.depth.shape) @ grid.ravel()).reshape(frame.depth.shape)
+    )
     return replace(frame, depth=(frame.depth * factor).astype(np.float32))
 
 
@@ -260,8 +261,9 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
         return FoundBends(unlike=unlike)
     gains = []
     for half, grids in zip(halves, reversed(told), strict=True):
-        kept = {name: grids[name] for name in chosen}
-        without, with_ = (refined_poses(part, scale).after for part in (half, freed(half, kept)))
+        without, with_ = (
+            refined_poses(part, scale).after for part in (half, freed(half, {name: grids[name] for name in chosen}))
+        )
         gains.append(1 - with_ / without if without else 0.0)
     is_told = min(gains) > fixed.BEND_GAIN
     return FoundBends(grids=_joint(views, chosen, scale) if is_told else {}, gains=tuple(gains), unlike=unlike)

@@ -271,6 +271,7 @@ def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
 
 
 def _far(solution: Solution, camera: str) -> float:
-    seen = [view.points[:, 2] for view in solution.adjustment.evidence.views if view.camera == camera]
-    depths = np.concatenate(seen)
+    depths = np.concatenate(
+        [view.points[:, 2] for view in solution.adjustment.evidence.views if view.camera == camera]
+    )
     return float(np.percentile(depths, 90)) if len(depths) else 0.0

@@ -236,8 +236,9 @@ def _own_offsets(
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():
-        its = thin_frames([frame for frame in frames if frame.camera == camera])
-        at_middle = arm_agreement(model, its, posture, offset_s=middle)
+        at_middle = arm_agreement(
+            model, thin_frames([frame for frame in frames if frame.camera == camera]), posture, offset_s=middle
+        )
         is_other = abs(offset_s - middle) > limits.TIME_OFFSET + limits.TIME_ERROR
         if not is_other or at_middle is None or misfit < limits.TIME_OWN * at_middle.misfit:
             kept[camera] = offset_s

@@ -141,13 +141,14 @@ def tf_findings(found: Survey, cameras: Sequence[CameraTopics], options: SourceO
     trees = {tf.root_of(image.frame_id) for image in images if image is not None and image.frame_id in tf.frames}
     text = f"{len(roots)} separate trees, with roots {', '.join(roots[:6])}"
     is_parted = len(trees) > 1 and not options.camera_poses
-    remedy = "record the transform that joins them (hand-eye calibration), or choose with --cameras"
     yield from judge(
         None if len(roots) < 2 else ERROR if is_parted else NOTE,
         "tf-roots",
         "tf",
         f"{text}; the cameras are in more than one" if is_parted else text,
-        remedy if is_parted else "give --world-frame if the wrong one is taken",
+        "record the transform that joins them (hand-eye calibration), or choose with --cameras"
+        if is_parted
+        else "give --world-frame if the wrong one is taken",
     )
 
 
@@ -241,8 +242,9 @@ def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> list[F
     given = options.intrinsics.get(topics.name)
     if given is not None and image is not None:
         fx, fy, cx, cy = given[:4]
-        lens = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=image.width, height=image.height)
-        return lens_findings(where, lens, "--intrinsics")
+        return lens_findings(
+            where, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=image.width, height=image.height), "--intrinsics"
+        )
     names = dict.fromkeys(name for name in (topics.info, topics.depth_info) if name)
     known = [(name, its) for name in names if (its := found.topics[name].calibration) is not None and its.width]
     return [finding for name, its in known for finding in lens_findings(where, intrinsics_of(its), name)]

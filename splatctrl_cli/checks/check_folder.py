@@ -236,22 +236,21 @@ def check_folder(
         of_states = robot_states(model, source.joint_names, logged)
         findings += of_states.findings
     stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
-    report = CheckReport(
-        path=str(path),
-        kind=kind,
-        duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
-        num_messages=len(stamps) + len(logged),
-        start_ns=min(stamps, default=None) if source.has_clock else None,
-        findings=findings,
-        rates=[camera.times.rate(is_read=True) for camera in cameras.values()] if source.has_clock else [],
-        lacks=find_lacks(
-            num_cameras=len(cameras),
-            num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
-            states_lack=of_states.lack,
-        ),
-    )
     return judge_frames(
-        report,
+        CheckReport(
+            path=str(path),
+            kind=kind,
+            duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
+            num_messages=len(stamps) + len(logged),
+            start_ns=min(stamps, default=None) if source.has_clock else None,
+            findings=findings,
+            rates=[camera.times.rate(is_read=True) for camera in cameras.values()] if source.has_clock else [],
+            lacks=find_lacks(
+                num_cameras=len(cameras),
+                num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
+                states_lack=of_states.lack,
+            ),
+        ),
         of_states.model,
         frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
         depth_units={name: camera.images.scale for name, camera in cameras.items()},

@@ -100,8 +100,9 @@ class ImageWatch:
         self.add_undecoded(encoding, width, height)
         self.num_decoded += 1
         if len(self.thumbnails) < limits.THUMBNAILS:
-            small = cv2.resize(image, thumbnail_size(width, height), interpolation=interpolation)
-            self.thumbnails.append((stamp_ns, small))
+            self.thumbnails.append(
+                (stamp_ns, cv2.resize(image, thumbnail_size(width, height), interpolation=interpolation))
+            )
 
     def _keep(self, stamp_ns: int, image: NDArray[Any], small: NDArray[Any]) -> None:
         height, width = image.shape[:2]
@@ -349,8 +350,9 @@ def _spectra(frame: RgbdFrame) -> tuple[Float64, Float64]:
 
 
 def _transformed(image: Float32) -> Float64:
-    window = np.outer(np.hanning(image.shape[0]) ** 0.25, np.hanning(image.shape[1]) ** 0.25)
-    centred = (image - image.mean()) * window
+    centred = (image - image.mean()) * np.outer(
+        np.hanning(image.shape[0]) ** 0.25, np.hanning(image.shape[1]) ** 0.25
+    )
     length = float(np.linalg.norm(centred))
     return np.asarray(np.fft.rfft2(centred / length if length > 0 else centred))
 

@@ -256,8 +256,9 @@ def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
     if not stamped:
         return []
     common = float(np.median([delay for _, delay in stamped]))
-    apart = max(abs(delay - common) for _, delay in stamped)
-    is_shifted = abs(common) > limits.STAMP_DELAYED and apart <= limits.DELAYS_APART
+    is_shifted = abs(common) > limits.STAMP_DELAYED and all(
+        abs(delay - common) <= limits.DELAYS_APART for _, delay in stamped
+    )
     shifted = judge(
         NOTE if is_shifted else None,
         "clock",

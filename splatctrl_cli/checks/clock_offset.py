@@ -77,8 +77,9 @@ def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) ->
         dx = (u[None] - intrinsics.cx) * (z / intrinsics.fx)[:, None] - x[:, None]
         dy = (v[None] - intrinsics.cy) * (z / intrinsics.fy)[:, None] - y[:, None]
         above = np.square(radii[is_ahead].astype(np.float32))[:, None] - dx * dx - dy * dy
-        front = np.where(above > 0, z[:, None] - np.sqrt(np.maximum(above, 0)), np.float32(np.inf))
-        nearest = front.min(axis=0, initial=np.inf)
+        nearest = np.where(above > 0, z[:, None] - np.sqrt(np.maximum(above, 0)), np.float32(np.inf)).min(
+            axis=0, initial=np.inf
+        )
         row[:] = np.where(np.isfinite(nearest), nearest, 0)
     return depth.reshape(len(centers), intrinsics.height, intrinsics.width)
 
@@ -215,8 +216,9 @@ def _pixel_scores(
     number = np.round((_since(camera, start) - offsets[:, None]) / step).astype(np.int64)  # (O, K + 1)
     is_inside = (number >= 0) & (number * step < seconds[-1] + step / 2)
     wanted = np.unique(number[is_inside])
-    centers = _at(seconds, robot[0].reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3)
-    depth = silhouettes(centers, robot[1], camera)
+    depth = silhouettes(
+        _at(seconds, robot[0].reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3), robot[1], camera
+    )
     changes = np.array(camera.changes)
     scores = np.zeros(len(offsets))
     for i, inside in enumerate(is_inside):

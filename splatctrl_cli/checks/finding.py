@@ -237,8 +237,7 @@ class CheckReport:
         return sorted(self.findings, key=lambda finding: ORDER.index(finding.severity))
 
     def blockers(self, command: str) -> list[Finding]:
-        errors = [f for f in self.sorted_findings if f.severity is ERROR]
-        return [f for f in errors if command in CHECKS[f.code].blocked]
+        return [f for f in self.sorted_findings if f.severity is ERROR and command in CHECKS[f.code].blocked]
 
     def obstacles(self, command: str) -> list[str]:
         """Needs a command lacks, and errors that block it; empty if it can start."""

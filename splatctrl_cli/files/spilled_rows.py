@@ -59,8 +59,9 @@ class RowFile:
         self._flush()
         num = max(min(last, self._num) - first, 0)
         self._file.seek(first * self._row_bytes)
-        content = bytearray(self._file.read(num * self._row_bytes))
-        return np.frombuffer(content, dtype=np.float64).reshape(num, *self.row_shape)
+        return np.frombuffer(bytearray(self._file.read(num * self._row_bytes)), dtype=np.float64).reshape(
+            num, *self.row_shape
+        )
 
     def _flush(self) -> None:
         if self._waiting:

@@ -189,8 +189,9 @@ class ArrayFile(ABC):
         if times.dtype.kind in "iu":
             return np.asarray(times.astype(np.int64) * unit_ns + epoch_ns)
         whole = np.floor(times)
-        parts = np.round((times - whole) * unit_ns).astype(np.int64)
-        return np.asarray(whole.astype(np.int64) * unit_ns + parts + epoch_ns)
+        return np.asarray(
+            whole.astype(np.int64) * unit_ns + np.round((times - whole) * unit_ns).astype(np.int64) + epoch_ns
+        )
 
     def _checked(self, name: str, *, least: int = 1, kinds: str = "iuf") -> tuple[tuple[int, ...], np.dtype[Any]]:
         header = self._header(name)
@@ -246,8 +247,9 @@ class NpzFile(ArrayFile):
             )
             for first in range(0, shape[0], step):
                 num = min(step, shape[0] - first)
-                values = np.frombuffer(_read(stream, num * prod(shape[1:]) * dtype.itemsize), dtype)
-                rows = values.reshape(num, *shape[1:], order="F" if is_by_columns else "C")
+                rows = np.frombuffer(_read(stream, num * prod(shape[1:]) * dtype.itemsize), dtype).reshape(
+                    num, *shape[1:], order="F" if is_by_columns else "C"
+                )
                 yield from (rows[start : start + BLOCK] for start in range(0, num, BLOCK))
 
     @contextmanager
@@ -353,8 +355,9 @@ class ParquetFile(ArrayFile):
     def _values(self, column: Any, name: str) -> Array:
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
-        lengths = column.value_lengths().to_numpy(zero_copy_only=False).tolist()
-        self._refuse_ragged(column.null_count or len(set(lengths)) > 1, name)
+        self._refuse_ragged(
+            column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1, name
+        )
         inner = self._values(column.flatten(), name)
         return inner.reshape(len(column), -1, *inner.shape[1:])
 

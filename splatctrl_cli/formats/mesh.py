@@ -72,8 +72,9 @@ def _opened(path: Path) -> tuple[BytesIO | Path, str]:
     if path.suffix.lower() == ".stl" and len(content) >= STL_HEADER:
         if end <= len(content):
             rest = len(content) - end
-            words = f"{path.name}: {rest} bytes after its {num} faces are ignored" if rest else ""
-            return BytesIO(content[:end]), words
+            return BytesIO(content[:end]), (
+                f"{path.name}: {rest} bytes after its {num} faces are ignored" if rest else ""
+            )
         refuse_if(
             b"facet" not in content.lower(),
             f"{path}: expected {end} bytes for {num} faces, got {len(content)}",

@@ -276,8 +276,9 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
         ),
         refuse_faults(f"{name}: no UTF-8 text", UnicodeDecodeError, remedy="give a CSV file"),
     ):
-        remedy = "give a CSV file with the columns x,y,z [m]"
-        first = require(next(lines, None), f"{name}: has no points", remedy=remedy)
+        first = require(
+            next(lines, None), f"{name}: has no points", remedy="give a CSV file with the columns x,y,z [m]"
+        )
         columns, rest = _axes(name, first[1]), lines
         if columns is None:
             columns, rest = [0, 1, 2], chain([first], lines)

@@ -57,17 +57,21 @@ class SourceOptions:
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
         """Raise InputError for a set option that does not apply to this input."""
-        flags = {"camera_topics": "camera", "human_topics": "human-topic"}
-        flags |= dict.fromkeys(["camera_poses", "camera_pose_topics"], "camera-pose")
+        flags = {
+            "camera_topics": "camera",
+            "human_topics": "human-topic",
+            **dict.fromkeys(["camera_poses", "camera_pose_topics"], "camera-pose"),
+        }
         default = SourceOptions()
         for name in names:
             flag = flags.get(name, name.replace("_", "-"))
             is_split = (name, kind) == ("holdout", "a capture")
-            ingest = "give it to `splatctrl ingest`, which makes a camera `holdout` of these views"
             refuse_if(
                 getattr(self, name) != getattr(default, name),
                 f"{path}: --{flag} does not apply to {kind}",
-                remedy=ingest if is_split else "leave it out",
+                remedy="give it to `splatctrl ingest`, which makes a camera `holdout` of these views"
+                if is_split
+                else "leave it out",
             )
 
 

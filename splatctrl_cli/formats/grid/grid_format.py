@@ -141,8 +141,9 @@ def x_fastest(values: Values) -> Iterator[Values]:
     for start in range(0, z, step):
         planes = np.empty((min(step, z - start), y, x, *values.shape[3:]), values.dtype)
         for at in range(0, x, TILE):
-            tile = values[at : at + TILE, :, start : start + step]
-            planes[:, :, at : at + TILE] = tile.transpose(2, 1, 0, *range(3, values.ndim))
+            planes[:, :, at : at + TILE] = values[at : at + TILE, :, start : start + step].transpose(
+                2, 1, 0, *range(3, values.ndim)
+            )
         yield planes
 
 

@@ -88,8 +88,9 @@ def read_vti(path: Path, *, with_values: bool = True) -> DistanceGrid:
     with _opened(path) as stream:
         grid, starts = _head(path, stream)
         if with_values:
-            channels = {name: _values(path, stream, grid, name, start) for name, start in starts.items()}
-            grid = replace(grid, channels=channels)
+            grid = replace(
+                grid, channels={name: _values(path, stream, grid, name, start) for name, start in starts.items()}
+            )
             check_finite(str(path), grid)
     return grid
 

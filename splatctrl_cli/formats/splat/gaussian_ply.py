@@ -152,8 +152,8 @@ def log_sigmas(ply: PlyFile) -> Float64:
     if len(ply) < 2 or logs.min() < 0:
         return logs
     centers = exact_centers(ply)
-    some = centers[:: -(-len(centers) // SPARSEST_SAMPLE)]
-    spacing = float(np.median(np.asarray(cKDTree(centers).query(some, k=2)[0])[:, 1]))
+    nearest = cKDTree(centers).query(centers[:: -(-len(centers) // SPARSEST_SAMPLE)], k=2)[0]
+    spacing = float(np.median(np.asarray(nearest)[:, 1]))
     refuse_if(
         spacing > 0 and np.percentile(logs.mean(axis=1), 5) > np.log(SPARSEST * spacing),
         f"{ply.path}: scale_*: expected log(sigma [m]), got {logs.min():.3g} to {logs.max():.3g}: splats of"

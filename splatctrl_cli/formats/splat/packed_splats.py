@@ -279,8 +279,7 @@ def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
     sizes = np.rint(511.0 * np.minimum(np.abs(others) / SQRT_HALF, 1.0)).astype(np.uint32)
     words = largest.astype(np.uint32)
     for index in range(3):
-        sign = (others[:, index] < 0).astype(np.uint32)
-        words = (words << np.uint32(10)) | (sign << np.uint32(9)) | sizes[:, index]
+        words = (words << np.uint32(10)) | (np.uint32(others[:, index] < 0) << np.uint32(9)) | sizes[:, index]
     return np.asarray(words, dtype="<u4")
 
 

@@ -54,12 +54,13 @@ HEADER_COMMENTS = {
 
 
 def as_gaussians(splats: SplatSet) -> GaussianSet:
+    coefficients = (splats.colors.astype(np.float64) - 0.5) / SH_C0
     return GaussianSet(
         centers=splats.centers,
         scales=np.repeat(splats.radii[:, None], 3, axis=1),
         quats_wxyz=np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (len(splats), 1)),
         opacities=splats.opacities,
-        harmonics=((splats.colors.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)[:, None, :],
+        harmonics=coefficients.astype(np.float32)[:, None, :],
         labels=splats.labels,
     )
 

@@ -49,8 +49,9 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
     corners = np.stack([(g.centers - reach).min(axis=0), (g.centers + reach).max(axis=0)])  # at any rotation
     field.CreateExtentAttr(to_float3(corners.astype(np.float32)))
     if (g.labels != Label.OBJECT).any():
-        primvar = geometry.PrimvarsAPI(field).CreatePrimvar("label", kinds.IntArray, geometry.Tokens.vertex)
-        primvar.Set(arrays.IntArray.FromNumpy(g.labels.astype(np.int32)))
+        geometry.PrimvarsAPI(field).CreatePrimvar("label", kinds.IntArray, geometry.Tokens.vertex).Set(
+            arrays.IntArray.FromNumpy(g.labels.astype(np.int32))
+        )
     layer = stage.GetRootLayer()
     layer.customLayerData = {"frame": "world", **comments}
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:

@@ -252,8 +252,9 @@ class CaptureSource(FrameSource):
             found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
             chosen = options if options.joint_topic is not None else replace(options, joint_topic=kept.chosen)
             self.joint_names, self.states = joint_records(found, chosen, loss, joints)
-            bare = merge_joints(self._loss, kept.loss, kept.first_note, sign=-1)
-            self._loss = merge_joints(bare, loss, kept.first_note)
+            self._loss = merge_joints(
+                merge_joints(self._loss, kept.loss, kept.first_note, sign=-1), loss, kept.first_note
+            )
 
     @property
     def loss(self) -> LossReport:

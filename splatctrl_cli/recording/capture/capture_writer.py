@@ -216,8 +216,9 @@ def _write_index(
     of_lenses = {
         name: digest for entry in journal.entries() for digest, name in entry.sums if name.startswith(LENSES)
     }
-    others = {name: sha256(folder / name) for name in [*names, "capture.json"]}
-    _write_sums(folder / SUMS, journal, of_lenses | others)
+    _write_sums(
+        folder / SUMS, journal, of_lenses | {name: sha256(folder / name) for name in [*names, "capture.json"]}
+    )
 
 
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:

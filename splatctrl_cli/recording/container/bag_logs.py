@@ -317,8 +317,9 @@ class Db3Log(RawLog):
         last, hole = -(1 << 62), 1  # hole: how many rows to pass over next
         for _ in range(1000):
             try:
-                query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id"
-                for number, *row in database.execute(query, (last,)):
+                for number, *row in database.execute(
+                    "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id", (last,)
+                ):
                     hole = min(hole, 1)
                     last = number
                     yield row[0], row[1], row[2]

@@ -101,8 +101,9 @@ class SessionLog(JoinedLog):
         If parts share a topic, all are read: skipping would reorder its messages between passes.
         """
         pushed = None if names is None or self._share(names) else names
-        parts = (part.messages(damage, pushed) for part in self._parts)
-        for message in heapq.merge(*parts, key=lambda message: message.log_time_ns):
+        for message in heapq.merge(
+            *(part.messages(damage, pushed) for part in self._parts), key=lambda message: message.log_time_ns
+        ):
             if names is None or message.topic.name in names:
                 yield message
 

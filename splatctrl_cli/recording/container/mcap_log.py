@@ -126,8 +126,9 @@ class McapLog(RawLog):
             if part.opcode == CHUNK and part.content:
                 yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
             elif part.opcode == MESSAGE and part.content:
-                size = len(part.content)
-                yield from filter(None, [self._message(part.content, 0, size, part.offset, damage, names)])
+                yield from filter(
+                    None, [self._message(part.content, 0, len(part.content), part.offset, damage, names)]
+                )
             elif part.opcode in {SCHEMA, CHANNEL}:
                 self._declare(part.opcode, part.content, damage)
         self._whole = state if damage.count == count else None

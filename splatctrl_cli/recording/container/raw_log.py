@@ -76,7 +76,8 @@ class Damage:
 
     def remark(self, text: str) -> None:
         """Count what is no damage; after MAX_NOTES, new remarks share one."""
-        self.remarks[text if (text in self.remarks or len(self.remarks) < MAX_NOTES) else "more of this kind"] += 1
+        is_room = text in self.remarks or len(self.remarks) < MAX_NOTES
+        self.remarks[text if is_room else "more of this kind"] += 1
 
     @property
     def all_notes(self) -> list[str]:

@@ -94,8 +94,9 @@ def choose_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tu
     """The scan of that name, or the only one. Raises InputError with the choices."""
     name = next(iter(folders)) if scan is None and len(folders) == 1 else scan or ""
     got = "several scans" if scan is None else f"no scan '{scan}'"
-    remedy = f"give --scan, one of: {', '.join(folders) or 'none is there'}"
-    return name, require(folders.get(name), f"{root}: {got}", remedy=remedy)
+    return name, require(
+        folders.get(name), f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(folders) or 'none is there'}"
+    )
 
 
 def read_views(
@@ -238,8 +239,9 @@ def _mask_file(folder: Path, number: int) -> Path:
     """``007.png`` or the like in the folder (RegNeRF) or ``mask`` (IDR)."""
     files = (path for place in (folder, folder / "mask") for path in sorted(place.glob("*.png")))
     found = next((path for path in files if path.stem.isdecimal() and int(path.stem) == number), None)
-    missing = f"{folder}: expected a mask {number:03d}.png, got none"
-    return require(found, missing, remedy="give the folder of this scan's masks")
+    return require(
+        found, f"{folder}: expected a mask {number:03d}.png, got none", remedy="give the folder of this scan's masks"
+    )
 
 
 def _camera_file(root: Path, number: int) -> Path:

@@ -211,8 +211,9 @@ class ImageFolderSource(FrameSource):
         if table.name not in self._lenses:
             lens = _corrected(table)
             if depth_camera is not None:
-                T_color_depth = self._description.T_color_depth
-                lens = replace(lens, depth_lens=_corrected(depth_camera), T_color_depth=T_color_depth)
+                lens = replace(
+                    lens, depth_lens=_corrected(depth_camera), T_color_depth=self._description.T_color_depth
+                )
             self._lenses[table.name] = lens
         return self._lenses[table.name]
 

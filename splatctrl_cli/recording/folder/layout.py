@@ -118,7 +118,6 @@ def pair_stamps(
     options: SourceOptions,
 ) -> Description:
     """Pair files by stamp [ns] within the tolerance; the pose is at colour's stamp."""
-    tolerance_ns = round(options.pairing_tolerance_s * 1e9)
     views = [
         ListedView(
             name=f"{colors[i][0] / 1e9:.6f}",
@@ -127,7 +126,9 @@ def pair_stamps(
             matrix=pose_at(colors[i][0]),
             stamp_ns=colors[i][0],
         )
-        for i, j in paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
+        for i, j in paired(
+            [stamp for stamp, _ in colors], [stamp for stamp, _ in depths], round(options.pairing_tolerance_s * 1e9)
+        ).tolist()
     ]
     return list_views(path, views, len(colors), len(depths))
 
@@ -192,8 +193,9 @@ def image_size(path: ImageFile) -> tuple[int, int]:
         data = path.read_bytes()
     if (head := image_head(data)) is not None:
         return head.width, head.height
-    said = f"{path}: not an image that can be read"
-    height, width, *_ = require(decode_file(data, color=False), said, remedy=_WHOLE).shape
+    height, width, *_ = require(
+        decode_file(data, color=False), f"{path}: not an image that can be read", remedy=_WHOLE
+    ).shape
     return int(width), int(height)
 
 

@@ -66,11 +66,12 @@ def with_transforms(description: Description) -> Description:
     stems = [Path(view.name).stem for view in views]
     is_short = len(set(stems)) == len(stems)  # else the path without suffix
     names = stems if is_short else [str(Path(view.name).with_suffix("")) for view in views]
-    named = (replace(view, name=name) for view, name in zip(views, names, strict=True))
     return replace(
         description,
         camera=views[0].camera,
-        listed=tuple(sorted(named, key=lambda v: v.name)),
+        listed=tuple(
+            sorted((replace(view, name=name) for view, name in zip(views, names, strict=True)), key=lambda v: v.name)
+        ),
         is_depth_resized=True,
         supply=SUPPLY,
     )

@@ -88,14 +88,17 @@ def read_sens(path: Path, options: SourceOptions) -> Description:
     color, depth = frames[0].color, frames[0].depth
     assert depth is not None
     lens = lens_option(options, color) or _lens(sens.color, color, f"{file} (colour)")
-    own = _lens(sens.depth, depth, f"{file} (depth)")
     return describe(
         move_poses(list_views(file, views, len(views), len(views)), lambda T: T @ sens.T_base_color),
         root,
         options,
         poses=PosesTable(format="sens", file=file.name),
         lens=lambda _: lens,
-        depth_camera=own_depth_camera(lens, own, invert_transform(sens.T_base_color) @ sens.T_base_depth),
+        depth_camera=own_depth_camera(
+            lens,
+            _lens(sens.depth, depth, f"{file} (depth)"),
+            invert_transform(sens.T_base_color) @ sens.T_base_depth,
+        ),
         depth=DepthTable(scale=sens.depth_scale),
         has_stamps=has_stamps,
         num_damaged=missing,

@@ -387,8 +387,9 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
 def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: bool) -> None:
     if survey.tf.root_of(child) != child:
         return  # added before
-    poses = _poses(log, survey, topic, survey.damage)
-    for parent, _, stamp, position, quat_xyzw in islice(poses, 1 if only_first else None):
+    for parent, _, stamp, position, quat_xyzw in islice(
+        _poses(log, survey, topic, survey.damage), 1 if only_first else None
+    ):
         try:
             survey.tf.add(parent, child, stamp, position, quat_xyzw, static=False, holds=only_first)
         except ValueError as error:

@@ -237,8 +237,9 @@ class Lens:
         """Map recorded depth [m] to colour's pixels (H, W)."""
         if self.depth_lens is None or self.T_color_depth is None:
             return self.remap(image)
-        depth = self.depth_lens.remap(image)
-        return warp_depth(depth, self.depth_lens.intrinsics, self.intrinsics, self.T_color_depth)
+        return warp_depth(
+            self.depth_lens.remap(image), self.depth_lens.intrinsics, self.intrinsics, self.T_color_depth
+        )
 
 
 def warp_depth(depth: Float32, own: Intrinsics, target: Intrinsics, T_color_depth: Float64) -> Float32:
@@ -321,8 +322,9 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
     if model == "equidistant":
         a = np.arctan(r)
         return r, a * (1 + k[0] * a**2 + k[1] * a**4 + k[2] * a**6 + k[3] * a**8)
-    bent = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
-    return r, np.asarray(bent)
+    return r, np.asarray(
+        r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
+    )
 
 
 def correct_lens(lens: Intrinsics, model: str, coefficients: Float64, valid: Bool | None = None) -> Lens:

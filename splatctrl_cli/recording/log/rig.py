@@ -72,8 +72,9 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
         raise no_camera(log, survey)
     known = {camera.name: camera for camera in found}
     names = tuple(known) if options.cameras is None else options.cameras
-    asked = (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics)
-    refuse_unknown_cameras(log.path, asked, known)
+    refuse_unknown_cameras(
+        log.path, (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics), known
+    )
     join_pose_topics(log, survey, options, [known[name] for name in names])
     check_mask_topics(log.path, survey, options.human_topics, tuple(known))
     try:

@@ -354,10 +354,10 @@ def _images(
 
     Raises UndecodableMessageError.
     """
-    kept = (False,) * 3 if is_whole else (*_keeps_files(camera), False)
+    is_lazy = camera.maps is None and not is_whole
     images = [
         read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
-        for message, lazily in zip(messages, kept, strict=False)
+        for message, lazily in zip(messages, (is_lazy, is_lazy and camera.depth_lens is None, False), strict=False)
     ]
     for image, k in zip(images, (camera.intrinsics, (camera.depth_lens or camera).intrinsics), strict=False):
         refuse_if(
@@ -368,16 +368,11 @@ def _images(
     return images
 
 
-def _keeps_files(camera: Camera) -> tuple[bool, bool]:
-    return camera.maps is None, camera.maps is None and camera.depth_lens is None
-
-
 def _stored_frame(
     planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, messages: Sequence[RawMessage]
 ) -> StoredFrame:
     camera = planned.camera
     is_counts = depth.is_counts and camera.depth_lens is None
-    keeps_color, keeps_depth = _keeps_files(camera)
     return StoredFrame(
         stamp_ns=planned.stamp_ns,
         camera=camera.name,
@@ -387,8 +382,8 @@ def _stored_frame(
         read_depth=lambda: camera.depth(depth_of(depth, camera.depth_scale)),
         human=human,
         valid=camera.valid,
-        color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
-        depth_file=depth.compressed if keeps_depth and depth.is_counts and is_kept(depth.compressed, PNG) else None,
+        color_file=color.compressed if camera.maps is None and is_kept(color.compressed) else None,
+        depth_file=depth.compressed if camera.maps is None and is_counts and is_kept(depth.compressed, PNG) else None,
         depth_unit=depth.unit(camera.depth_scale) if is_counts else None,
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
         places=tuple(replace(message, data=b"") for message in messages),

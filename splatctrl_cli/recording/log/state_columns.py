@@ -72,8 +72,9 @@ class StateColumns(Sequence[JointState]):
 
     def states(self, first: int, last: int) -> list[JointState]:
         """States from `first` up to, but not with, `last`."""
-        optional = (self.commanded_velocity, self.T_base_ee, self.T_world_ee)
-        commanded, base, world = (_optional(values, first, last) for values in optional)
+        commanded, base, world = (
+            _optional(values, first, last) for values in (self.commanded_velocity, self.T_base_ee, self.T_world_ee)
+        )
         position, velocity = self.position[first:last], self.velocity[first:last]
         return [
             JointState(

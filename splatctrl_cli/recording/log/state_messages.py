@@ -101,8 +101,9 @@ def _controller(message: Any, log_time_ns: int) -> RawJoints:
     actual, wanted = (
         _filled(message, fields, len(names)) for fields in (("feedback", "actual"), ("reference", "desired"))
     )
-    said = f"a controller state of {len(names)} joints without positions"
-    actual = require(actual, said, error=UndecodableMessageError)
+    actual = require(
+        actual, f"a controller state of {len(names)} joints without positions", error=UndecodableMessageError
+    )
     commanded = _NONE if wanted is None else _array(wanted.velocities)
     position, velocity = _array(actual.positions), _array(actual.velocities)
     return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
@@ -128,7 +129,6 @@ def _checked(
         f"{what} with {len(names)} names and {len(position)} positions",
         error=UndecodableMessageError,
     )
-    is_odd = len(velocity) not in (0, len(names))
     return RawJoints(
         stamp_ns=stamp_ns(message.header),
         names=names,
@@ -137,7 +137,9 @@ def _checked(
         log_time_ns=log_time_ns,
         commanded_velocity=commanded if len(commanded) == len(names) else _NONE,
         T_base_ee=T_base_ee,
-        note=f"{len(names)} names with {len(velocity)} velocities, which are not used" if is_odd else "",
+        note=""
+        if len(velocity) in {0, len(names)}
+        else f"{len(names)} names with {len(velocity)} velocities, which are not used",
     )
 
 

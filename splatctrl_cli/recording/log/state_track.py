@@ -22,8 +22,9 @@ def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
     steps = np.diff(stamp_ns)
     if not len(steps):
         return np.zeros(0, dtype=np.intp)
-    longest = max(fixed.STATES_GAP_PERIODS * float(np.median(steps)), fixed.STATES_GAP_SECONDS * 1e9)
-    return np.flatnonzero(steps > longest)
+    return np.flatnonzero(
+        steps > max(fixed.STATES_GAP_PERIODS * float(np.median(steps)), fixed.STATES_GAP_SECONDS * 1e9)
+    )
 
 
 def smoothed_seconds(stamp_ns: Stamps) -> Float64:
@@ -191,8 +192,9 @@ def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
 
 
 def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:
-    blocks = (np.isfinite(block).all(axis=1) for block in blocks_of(raw.position))
-    is_finite = np.concatenate([np.zeros(0, np.bool_), *blocks])
+    is_finite = np.concatenate(
+        [np.zeros(0, np.bool_), *(np.isfinite(block).all(axis=1) for block in blocks_of(raw.position))]
+    )
     num_broken = int((~is_finite).sum())
     if not num_broken:
         return raw
@@ -225,8 +227,9 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
 def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
     num_taken, is_zero, why = _missing_velocities(raw)
     if not num_taken:
-        thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED))
-        _compare_units(thinned, loss)
+        _compare_units(
+            raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED)), loss
+        )
         return raw.velocity
     loss.differentiated_velocities += num_taken
     loss.notes.append(f"{raw.where}: {why}; they are differences of the positions")
