@@ -194,7 +194,7 @@ class Adjustment:
         """T_world_camera, and its motion with the clock, camera frame."""
         T, twist = self.evidence.recorded(item, estimate.clock)
         correction = estimate.corrections[item.camera]
-        return T @ correction, _carried(twist, correction)
+        return T @ correction, _carry(twist, correction)
 
     def _overlap(
         self,
@@ -284,7 +284,7 @@ def _cells(points_world: Float64, depth: float) -> Index:
     return np.asarray((x * 1_000_003 + y) * 1_000_003 + z)
 
 
-def _carried(twist: Float64, T: Float64) -> Float64:
+def _carry(twist: Float64, T: Float64) -> Float64:
     """The motion (6,) of a frame fixed at T (4, 4) to one moving by `twist`, own axes."""
     if not twist.any():
         return twist

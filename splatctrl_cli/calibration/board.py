@@ -210,7 +210,7 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
                 _check_fit(off, f"{camera}, which moves,")
                 placed[camera], T_world_board = X, stays
             elif camera not in rig.moving and not stands and rig.arm is not None and not rig.held:
-                T_world_camera = _carried(rig.arm, by_camera[camera])
+                T_world_camera = _place_by_link(rig.arm, by_camera[camera])
                 placed[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ T_world_camera
         except NotEvaluableError as error:
             reasons.append(error.message.removeprefix("calibrate: "))
@@ -270,7 +270,7 @@ def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool
     return True
 
 
-def _carried(arm: Arm, sightings: Sequence[Sighting]) -> Float64:
+def _place_by_link(arm: Arm, sightings: Sequence[Sighting]) -> Float64:
     """T_world_camera of a camera that sees the board on the best-fitting link."""
     fits: list[HandEye] = []
     reasons = ["no joint states at its frames"]

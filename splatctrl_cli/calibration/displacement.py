@@ -34,7 +34,7 @@ def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[s
     none is: the robot may be off.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
-    found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
+    found = {camera: _correct_camera(arm, its) for camera, its in by_camera.items()}
     rows = {camera: row for camera, row in found.items() if row is not None}
     if any(is_displaced(row) and not is_corrected(row) for row in rows.values()):
         return {
@@ -56,14 +56,14 @@ def is_corrected(row: Mapping[str, Any]) -> bool:
 def placed(frame: RgbdFrame, cameras: Mapping[str, Mapping[str, Any]]) -> RgbdFrame:
     """The frame at its camera's corrected pose, if `cameras` has one."""
     row = cameras.get(frame.camera, {})
-    return _moved(frame, np.reshape(row["T_recorded_camera"], (4, 4))) if is_corrected(row) else frame
+    return _move(frame, np.reshape(row["T_recorded_camera"], (4, 4))) if is_corrected(row) else frame
 
 
-def _moved(frame: RgbdFrame, T_recorded_camera: Float64) -> RgbdFrame:
+def _move(frame: RgbdFrame, T_recorded_camera: Float64) -> RgbdFrame:
     return replace(frame, T_world_camera=frame.T_world_camera @ T_recorded_camera)
 
 
-def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
+def _correct_camera(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
     found = displacement_of(arm, frames)
     if found is None:
         return None
@@ -73,12 +73,12 @@ def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
         return row
     left = row
     for _ in range(2):
-        found = displacement_of(arm, [_moved(frame, T) for frame in frames])
+        found = displacement_of(arm, [_move(frame, T) for frame in frames])
         if found is None:
             return row
         left, T = found[0], T @ found[1]
     if left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED or not _sees_links_in_place(
-        arm, [_moved(frame, T) for frame in frames]
+        arm, [_move(frame, T) for frame in frames]
     ):
         return row
     return row | {"left_mm": left["distance_mm"], "T_recorded_camera": T.ravel().tolist()}

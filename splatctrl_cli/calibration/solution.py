@@ -87,7 +87,7 @@ def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution
         held = replace(solution.estimate, clock=start.clock)
         still = Adjustment(adjustment.evidence, replace(unknowns, has_clock=False))
         solution = _solution(still, still.solved(held, [solution.widths]))
-    return _with_depths(solution)
+    return _add_depths(solution)
 
 
 def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]:
@@ -169,29 +169,29 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
     )
 
 
-def _with_depths(solution: Solution) -> Solution:
+def _add_depths(solution: Solution) -> Solution:
     """Solve again with clearly supported depth scales and biases.
 
     All are tried together, as others compensate for a wrong fixed one. The least certain are fixed one by one, until
     all left differ by `CALIBRATION_DEPTH_SURE[0]` sigmas.
     """
     unknowns = solution.adjustment.unknowns
-    tried = _freed(solution, replace(unknowns, scales=unknowns.poses, biases=unknowns.cameras))
-    off, covariance, free = _narrowed(tried)
-    solution = replace(solution, noticed=_noticed(tried, free))
+    tried = _free_depths(solution, replace(unknowns, scales=unknowns.poses, biases=unknowns.cameras))
+    off, covariance, free = _narrow_depths(tried)
+    solution = replace(solution, noticed=_find_noticed(tried, free))
     if not any(_is_sure(tried, at, off[at], covariance[at, at]) for at in free):
         return solution
     scales, biases = (
         [camera for camera in some if tried.adjustment.unknowns.columns(camera)[POSE + number] in free]
         for number, some in enumerate((unknowns.poses, unknowns.cameras))
     )
-    found = _freed(solution, replace(unknowns, scales=scales, biases=biases))
+    found = _free_depths(solution, replace(unknowns, scales=scales, biases=biases))
     most_scale, most_bias = fixed.CALIBRATION_DEPTH_MOST
     depths = map(found.estimate.depth_of, unknowns.cameras)
     return solution if any(abs(scale - 1) > most_scale or abs(bias) > most_bias for scale, bias in depths) else found
 
 
-def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
+def _narrow_depths(tried: Solution) -> tuple[Float64, Float64, list[int]]:
     """Depth unknowns' offsets (P,) from 1 or 0, covariance (P, P), and free columns.
 
     If a scale and a bias explain the same, the likelier stays (`CALIBRATION_DEPTH_USUAL`).
@@ -212,11 +212,11 @@ def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
         least = int(np.argmin(ratios))
         if ratios[least] >= fixed.CALIBRATION_DEPTH_SURE[0]:
             break
-        off, covariance = _with_held(off, covariance, free.pop(least))
+        off, covariance = _hold(off, covariance, free.pop(least))
     return off, covariance, free
 
 
-def _with_held(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
+def _hold(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
     """Estimates (P,) and covariance (P, P), with one fixed at 0."""
     gain = covariance[:, at] / max(covariance[at, at], np.finfo(float).tiny)
     return off - gain * off[at], _positive(covariance - np.outer(gain, covariance[at]))
@@ -228,7 +228,7 @@ def _positive(covariance: Float64) -> Float64:
     return covariance
 
 
-def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
+def _find_noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
     """Least |scale - 1| and |bias| [m] that would be noticed, by camera, or inf."""
     unknowns = tried.adjustment.unknowns
     held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
@@ -239,7 +239,7 @@ def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, flo
             covariance = tried.certainty.covariance
             for other in held if at >= 0 else ():
                 if other != at:
-                    covariance = _with_held(np.zeros(unknowns.size), covariance, other)[1]
+                    covariance = _hold(np.zeros(unknowns.size), covariance, other)[1]
             if at >= 0:
                 per_metre = 1.0 if number else max(_far(tried, camera), 1e-3)
                 sure = fixed.CALIBRATION_DEPTH_SURE[1] * float(np.sqrt(max(covariance[at, at], 0.0)))
@@ -256,7 +256,7 @@ def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
     return bool(is_clear and abs(change) > fixed.CALIBRATION_DEPTH_LEAST)
 
 
-def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
+def _free_depths(solution: Solution, unknowns: Unknowns) -> Solution:
     """Solve again with scales and biases, from the best of several scales."""
     evidence = solution.adjustment.evidence
     adjustment, few = Adjustment(evidence, unknowns), Adjustment(evidence.thinned(), unknowns)

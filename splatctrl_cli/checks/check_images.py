@@ -304,11 +304,11 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
                 )
         elif (other := _other(camera, edges, _at_zero(surface))) is not None:
             others[camera] = other
-    exchanged = (_exchanged(camera, other, is_mutual=other[0] in others) for camera, other in others.items())
+    exchanged = (_judge_exchange(camera, other, is_mutual=other[0] in others) for camera, other in others.items())
     return [*found, *chain.from_iterable(exchanged)]
 
 
-def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> list[Finding]:
+def _judge_exchange(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> list[Finding]:
     """An error only if mutual: an exchange has two sides."""
     name, own, peak = other
     return judge(
@@ -346,10 +346,10 @@ def _spectra(frame: RgbdFrame) -> tuple[Float64, Float64]:
     is_edge = (far - near > limits.EDGE_STEP * near) & (near < 1e8)
     is_edge[: limits.EDGE_BORDER] = is_edge[-limits.EDGE_BORDER :] = False
     is_edge[:, : limits.EDGE_BORDER] = is_edge[:, -limits.EDGE_BORDER :] = False
-    return _transformed(slope), _transformed(is_edge.astype(np.float32))
+    return _transform(slope), _transform(is_edge.astype(np.float32))
 
 
-def _transformed(image: Float32) -> Float64:
+def _transform(image: Float32) -> Float64:
     centred = (image - image.mean()) * np.outer(
         np.hanning(image.shape[0]) ** 0.25, np.hanning(image.shape[1]) ** 0.25
     )

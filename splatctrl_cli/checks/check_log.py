@@ -46,7 +46,7 @@ from splatctrl_cli.checks.finding import (
 )
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
-from splatctrl_cli.recording.calibrated import correction_of
+from splatctrl_cli.recording.calibrated import read_correction
 from splatctrl_cli.recording.container.raw_log import Damage, JoinedLog, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.cameras import image_topics
 from splatctrl_cli.recording.log.decoder import (
@@ -216,12 +216,12 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
         own, target = strided_lens(camera.depth_lens.intrinsics, kept.stride), strided_lens(camera.intrinsics, stride)
         depth = warp_depth(depth, own, target, camera.T_color_depth)
     elif camera.maps is not None:
-        depth = camera.remap(_enlarged(depth, kept))[::stride, ::stride]
+        depth = camera.remap(_enlarge(depth, kept))[::stride, ::stride]
     pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
     if color is not None and color.pixels.ndim == 3:
         pixels = color.pixels
         if camera.maps is not None:
-            pixels = camera.remap(_enlarged(pixels, color), cv2.INTER_LINEAR)[:: color.stride, :: color.stride]
+            pixels = camera.remap(_enlarge(pixels, color), cv2.INTER_LINEAR)[:: color.stride, :: color.stride]
     if pixels.shape[:2] != depth.shape:
         pixels = np.zeros((*depth.shape, 3), np.uint8)
     return RgbdFrame(
@@ -234,7 +234,7 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
     )
 
 
-def _enlarged(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
+def _enlarge(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
     return np.repeat(np.repeat(image, kept.stride, axis=0)[: kept.height], kept.stride, axis=1)[:, : kept.width]
 
 
@@ -309,8 +309,8 @@ def check_log(
         findings += camera_findings(found, topics, camera, options)
     if any(finding.code == "pose-missing" for finding in findings):
         findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
-    findings += [error("missing", log.path.name, *_parted(lack)) for lack in _lacks(log, found, options)]
-    correction = correction_of(options, log.path.name)
+    findings += [error("missing", log.path.name, *_split_remedy(lack)) for lack in _lacks(log, found, options)]
+    correction = read_correction(options, log.path.name)
     late_ns = {c.name: correction.late_ns(c.name) for _, c in rig if correction is not None and c is not None}
     whole = [(topics, camera) for topics, camera in rig if camera is not None]
     frames = {c.name: reduced_frames(t, c, watch.images, found.tf, options, late_ns) for t, c in whole}
@@ -366,7 +366,7 @@ def _lacks(log: RawLog, found: Survey, options: SourceOptions) -> list[str]:
     return [lack for lack in missing(log, found, options) if not any(words in lack for words in SAID)]
 
 
-def _parted(lack: str) -> tuple[str, str]:
+def _split_remedy(lack: str) -> tuple[str, str]:
     what, _, remedy = lack.rpartition("; ")
     return (what, remedy) if what else (remedy, "")
 

@@ -162,8 +162,8 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
     difference = _spread(links[near], logged)
     if difference.is_small:
         return PoseAgreement("agree", near, len(chosen), difference, np.eye(4), difference)
-    tools = {link: _explained(poses, logged) for link, poses in links.items()}
-    bases = {link: _explained(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
+    tools = {link: _explain(poses, logged) for link, poses in links.items()}
+    bases = {link: _explain(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
     tool = min(tools, key=lambda link: (round(_cost(tools[link][1]), 6), _cost(_spread(links[link], logged))))
     base = min(bases, key=lambda link: _cost(bases[link][1]))
     travel = _spread(np.broadcast_to(logged[0], logged.shape), logged)
@@ -191,7 +191,7 @@ def _world(model: RobotModel, state: JointState) -> Float64:
     return np.asarray(model.T_world_base @ state.T_base_ee)
 
 
-def _explained(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
+def _explain(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
     """X (4, 4) of logged = poses X, by mean rotation and median position; rest."""
     relative = _inverse(poses) @ logged
     U, _, Vt = np.linalg.svd(relative[:, :3, :3].sum(axis=0))

@@ -315,11 +315,11 @@ def _fitting(
 def _fitted(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
     is_far = _cost(views, _with(views, pairs, camera))[1] < limits.MOVE_GOOD_SHARE
     starts = [limits.MOVE_WIDTHS, (*limits.MOVE_WIDE, *limits.MOVE_WIDTHS)] if is_far else [limits.MOVE_WIDTHS]
-    found = [T for widths in starts if (T := _descended(views, pairs, camera, widths)) is not None]
+    found = [T for widths in starts if (T := _descend(views, pairs, camera, widths)) is not None]
     return min(found, key=lambda T: _cost(_moved(views, camera, T), pairs)[0], default=None)
 
 
-def _descended(
+def _descend(
     views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera: str, widths: Sequence[float]
 ) -> Float64 | None:
     """T_camera_corrected by Gauss-Newton on point-to-plane residuals, with Tukey's biweight."""

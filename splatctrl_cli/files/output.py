@@ -193,7 +193,7 @@ def output_path(
         remedy="give another --out",
         error=UsageError,
     ):
-        path = followed(path)
+        path = follow_link(path)
         _check_replaceable(path, is_folder=is_folder)
         _check_not_there(path, force=force)
         partial = partial_path(path)
@@ -234,7 +234,7 @@ def output_path(
             raise
 
 
-def followed(path: Path) -> Path:
+def follow_link(path: Path) -> Path:
     """Target of a link, else the path itself. Raises UsageError for a loop."""
     if not path.is_symlink():
         return path
@@ -245,14 +245,14 @@ def followed(path: Path) -> Path:
 
 def partial_path(path: Path) -> Path:
     """``NAME.partial`` next to the path, or to a link's target."""
-    target = followed(path)
+    target = follow_link(path)
     return target.with_name(target.name + PARTIAL)
 
 
 def check_can_be_written(path: Path) -> None:
     """Raise UsageError early if the nearest folder is not writable."""
     try:
-        above = next(folder for folder in followed(path).absolute().parents if folder.exists())
+        above = next(folder for folder in follow_link(path).absolute().parents if folder.exists())
         is_good = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
         reason = "" if is_good else f"{above} is {'read-only' if above.is_dir() else 'no folder'}"
     except OSError as error:

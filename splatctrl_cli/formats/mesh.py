@@ -40,7 +40,7 @@ def load_mesh(path: Path) -> TriangleMesh:
     """
     refuse_if(not path.is_file(), f"{path}: expected a mesh, got no such file")
     kind = path.suffix.lower()
-    source, note = _opened(path) if kind in {".stl", ".obj", ".off"} else (path, "")
+    source, note = _open_mesh(path) if kind in {".stl", ".obj", ".off"} else (path, "")
     with refuse_faults(
         lambda error: f"{path}: expected a mesh, got {type(error).__name__}: {error}",
         Exception,
@@ -65,7 +65,7 @@ def load_mesh(path: Path) -> TriangleMesh:
     )
 
 
-def _opened(path: Path) -> tuple[BytesIO | Path, str]:
+def _open_mesh(path: Path) -> tuple[BytesIO | Path, str]:
     content = path.read_bytes()
     num = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
     end = STL_HEADER + STL_FACE * num  # of a text: gigabytes

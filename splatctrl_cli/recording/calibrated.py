@@ -119,7 +119,7 @@ def _with_depth(stored: StoredFrame, T: Float64, read_depth: Callable[[], Float3
     return replace(stored, T_world_camera=T, read_depth=read_depth, depth_unit=None, depth_file=None)
 
 
-def correction_of(options: SourceOptions, where: str) -> Correction | None:
+def read_correction(options: SourceOptions, where: str) -> Correction | None:
     """The options' correction, or None. Raises InputError for an invalid file."""
     if options.calibration is None:
         return None
@@ -131,7 +131,7 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 
     Raises InputError for another recording's calibration, UsageError as `Perturbation.of`.
     """
-    correction, perturbation = correction_of(options, source.name), Perturbation.of(options.perturb)
+    correction, perturbation = read_correction(options, source.name), Perturbation.of(options.perturb)
     if correction is not None:
         refuse_if(
             isinstance(source, CaptureSource) and sha256(correction.file) in source.made_of,

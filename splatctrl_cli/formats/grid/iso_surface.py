@@ -56,7 +56,7 @@ def iso_surface(grid: DistanceGrid) -> Any:
         remedy="bake with a smaller voxel",
         error=NotEvaluableError,
     )
-    return _joined(grid, np.concatenate(vertices), np.concatenate(faces))
+    return _join(grid, np.concatenate(vertices), np.concatenate(faces))
 
 
 def write_surface(path: Path, surface: Any) -> None:
@@ -93,7 +93,7 @@ def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64
     return vertices.astype(np.float64), faces
 
 
-def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Any:
+def _join(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Any:
     unique, index = np.unique(np.round(vertices / STEP), axis=0, return_inverse=True)
     joined = index.reshape(-1)[faces]
     first, second, third = joined.T

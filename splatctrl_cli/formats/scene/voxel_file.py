@@ -78,7 +78,7 @@ def _evidence(known: KnownVoxels) -> dict[str, Values]:
 
 
 @contextmanager
-def _refused(path: Path, what: str) -> Iterator[None]:
+def _refuse(path: Path, what: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
@@ -89,7 +89,7 @@ def _refused(path: Path, what: str) -> Iterator[None]:
 
 def read_states(path: Path) -> OccupancyGrid:
     """Read a `write_states` grid. Raises InputError otherwise; never unpickles."""
-    with _refused(path, _STATES):
+    with _refuse(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         header = json.loads(str(arrays["header"]))
         states = _voxels(arrays["states"], "states", np.uint8, header)
@@ -101,7 +101,7 @@ def read_seen(path: Path) -> SeenVoxels | None:
 
     None for an older file. Raises InputError for another one.
     """
-    with _refused(path, _OURS):
+    with _refuse(path, _OURS):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
@@ -127,14 +127,14 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 def read_occupancy(path: Path) -> OccupancyGrid:
     """Read the ``occupancy.npz`` grid. Raises InputError otherwise; never unpickles."""
-    with _refused(path, _OCCUPANCY):
+    with _refuse(path, _OCCUPANCY):
         arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
         return _grid_of(arrays, json.loads(str(arrays["header"])))
 
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
     """Read all of ``occupancy.npz``; None if older. Raises as `read_occupancy`."""
-    with _refused(path, _OCCUPANCY):
+    with _refuse(path, _OCCUPANCY):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
@@ -158,7 +158,7 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
 
 def read_unrepresented(path: Path) -> Balls | None:
     """Read only unrepresented voxels; None if older. Raises InputError for another file."""
-    with _refused(path, _OURS):
+    with _refuse(path, _OURS):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None

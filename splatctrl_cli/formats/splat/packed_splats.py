@@ -177,17 +177,17 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
     """Fraction bits and bytes (N, width) by attribute. Raises InputError for another length."""
     start = content[:4]
     if start == PLAIN:
-        num, bits, widths = _parsed(path, content, (4,), len(content))
+        num, bits, widths = _parse_head(path, content, (4,), len(content))
         parts = _streams(path, content, [num * width for width in widths])
     elif start[:2] == GZIP:
-        num, bits, widths, body = _unzipped(path, content)
+        num, bits, widths, body = _unzip(path, content)
         parts = [body[i:j] for i, j in pairwise(np.cumsum([0, *widths]) * num)]
     else:
         raise InputError(f"{path}: no .spz file: expected it to start as gzip or with NGSP, got {start.hex()}")
     return bits, [np.frombuffer(part, np.uint8).reshape(num, w) for part, w in zip(parts, widths, strict=True)]
 
 
-def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
+def _parse_head(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
     """Number of Gaussians, fraction bits, bytes per attribute; size: the file's."""
     refuse_if(
         len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC,
@@ -215,7 +215,7 @@ def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tu
     return num, bits, widths
 
 
-def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
+def _unzip(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
     with (
         refuse_faults(
             f"{path}: no whole .spz file",
@@ -226,7 +226,7 @@ def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], by
         ),
         gzip.GzipFile(fileobj=BytesIO(content)) as stream,
     ):
-        num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
+        num, bits, widths = _parse_head(path, stream.read(HEADER.size), (2, 3), len(content))
         expected = num * sum(widths)
         body = stream.read(expected + 1)
     got = "more" if len(body) > expected else len(body)

@@ -100,7 +100,7 @@ def differences(a: GaussianSet, b: GaussianSet, centers: Float64 | None = None) 
         rotation=_largest(_angles(a.quats_wxyz, b.quats_wxyz)),
         color=SH_C0 * _largest(a.harmonics[:, 0].astype(np.float64) - b.harmonics[:, 0]),
         opacity=_largest(a.opacities.astype(np.float64) - b.opacities),
-        harmonics=_largest(_padded(a.harmonics)[:, 1:] - _padded(b.harmonics)[:, 1:]),
+        harmonics=_largest(_pad(a.harmonics)[:, 1:] - _pad(b.harmonics)[:, 1:]),
     )
 
 
@@ -108,7 +108,7 @@ def _largest(values: Float64) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def _padded(harmonics: Float32) -> Float64:
+def _pad(harmonics: Float32) -> Float64:
     padded = np.zeros((len(harmonics), 16, 3))
     padded[:, : harmonics.shape[1]] = harmonics
     return padded

@@ -20,7 +20,7 @@ from urllib.parse import quote
 from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
-from splatctrl_cli.recording.container.foxglove import standing_in
+from splatctrl_cli.recording.container.foxglove import add_ros_type
 from splatctrl_cli.recording.container.mcap_log import ros_type_name
 from splatctrl_cli.recording.container.raw_log import Damage, Part, RawLog, RawMessage, Topic
 from splatctrl_cli.records import SECOND_NS
@@ -111,7 +111,7 @@ class Bag1Log(RawLog):
             encoding="ros1",
             definition=told.get("message_definition", b"").decode("utf-8", "replace"),
         )
-        self.channels[number(fields, "conn")] = standing_in(topic)
+        self.channels[number(fields, "conn")] = add_ros_type(topic)
 
     def records(self, damage: Damage) -> Iterator[Part]:
         """Yield all records in order; only chunks, connections and messages have bodies. Losses go to `damage`."""
@@ -358,5 +358,5 @@ def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
             definition=str(text) if definition_format in {"ros2msg", "ros2idl"} else "",
             definition_format="idl" if definition_format == "ros2idl" else "msg",
         )
-        topics[number] = standing_in(topic)
+        topics[number] = add_ros_type(topic)
     return topics

@@ -86,17 +86,17 @@ _TEXTS = {  # by the topic, what a text of the SDK stands for; metadata say the 
 }
 
 
-def stands_for(schema: str) -> str:
+def find_ros_type(schema: str) -> str:
     """The ROS type of a Foxglove schema, "" for others."""
     match = re.match(r"foxglove(?:\.|_msgs/(?:msg/)?)(.*)", schema, re.DOTALL)
     return _STANDS_FOR.get(match[1], "") if match else ""
 
 
-def standing_in(topic: Topic) -> Topic:
+def add_ros_type(topic: Topic) -> Topic:
     """The topic with its ROS type, if of foxglove_msgs or SDK texts."""
     texts = _TEXTS if topic.type_name == TEXT else {}
     said = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
-    ros_type = said or stands_for(topic.type_name)
+    ros_type = said or find_ros_type(topic.type_name)
     return replace(topic, type_name=ros_type, schema=topic.type_name) if ros_type else topic
 
 

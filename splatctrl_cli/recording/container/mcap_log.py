@@ -13,7 +13,7 @@ from pathlib import Path
 
 from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.formats.unpacking import BadBlockError, Budget, unpacked_start
-from splatctrl_cli.recording.container.foxglove import standing_in, stands_for
+from splatctrl_cli.recording.container.foxglove import add_ros_type, find_ros_type
 from splatctrl_cli.recording.container.mcap_file import (
     CHANNEL,
     CHUNK,
@@ -222,7 +222,7 @@ def _topic(channel: Channel, schema: Schema | None) -> Topic:
     if schema is None:
         return Topic(name=channel.topic, type_name="", encoding=channel.message_encoding)
     is_ros, is_protobuf = schema.encoding in {"ros2msg", "ros2idl", "ros1msg"}, schema.encoding == "protobuf"
-    type_name, ros_type = ros_type_name(schema.name) if is_ros else schema.name, stands_for(schema.name)
+    type_name, ros_type = ros_type_name(schema.name) if is_ros else schema.name, find_ros_type(schema.name)
     topic = Topic(
         name=channel.topic,
         type_name=ros_type or type_name,
@@ -231,7 +231,7 @@ def _topic(channel: Channel, schema: Schema | None) -> Topic:
         definition_format={"ros2idl": "idl", "protobuf": "protobuf"}.get(schema.encoding, "msg"),
         schema=type_name if ros_type else "",
     )
-    return standing_in(topic) if is_ros else topic
+    return add_ros_type(topic) if is_ros else topic
 
 
 def ros_type_name(name: str) -> str:

@@ -234,10 +234,10 @@ def read_rig(path: Path, root: Path | None = None) -> list[Description]:
         f"{path}: [[cameras]] beside [camera], [frames] or [split]",
         remedy="leave the single tables out",
     )
-    return [_read(_of_camera(content, camera, path), path, root) for camera in cameras]
+    return [_read(_describe_camera(content, camera, path), path, root) for camera in cameras]
 
 
-def _of_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> dict[str, Any]:
+def _describe_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> dict[str, Any]:
     for key in ("color", "depth", "poses"):
         refuse_if(not isinstance(camera.get(key), str), f"{path}: [[cameras]]: {key} is missing", remedy=_HELP)
     return {
@@ -336,10 +336,10 @@ def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> 
             f"{path}: {name}.{key} is missing",
             remedy=_HELP,
         )
-    return kind(**{key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()})
+    return kind(**{key: _convert(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()})
 
 
-def _typed(value: Any, hint: Any, where: str) -> Any:
+def _convert(value: Any, hint: Any, where: str) -> Any:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     good = {
         int: isinstance(value, int) and is_number,

@@ -49,9 +49,9 @@ def read_idr(
     scan, folder = choose_scan(root, idr_scans(root), scan)
     path = next(folder / name for name in CAMERAS if (folder / name).is_file())
     projections = _projections(path)
-    images = _numbered(folder / "image", len(projections))
+    images = _number_images(folder / "image", len(projections))
     refuse_if(not images, f"{folder / 'image'}: expected images such as 000000.png, got none")
-    masks = _numbered(folder / "mask", len(projections))
+    masks = _number_images(folder / "mask", len(projections))
     missing = [number for number in images if number not in masks]
     if masks and missing:
         raise InputError(f"{folder / 'mask'}: expected a mask for each image, got none for image {missing[0]}")
@@ -133,7 +133,7 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
     return K / K[2, 2], pose_at(-np.linalg.solve(M, P[:, 3]) / MILLIMETRES, R.T)
 
 
-def _numbered(folder: Path, num: int) -> dict[int, Path]:
+def _number_images(folder: Path, num: int) -> dict[int, Path]:
     """Images by camera number: in order if there are `num`, else by name.
 
     Raises InputError for another name.

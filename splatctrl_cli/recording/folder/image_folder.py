@@ -34,7 +34,7 @@ from splatctrl_cli.recording.folder.folder_description import (
 from splatctrl_cli.recording.folder.folder_views import UNITS, View, find_files, length_unit, views_of
 from splatctrl_cli.recording.folder.idr import idr_scans
 from splatctrl_cli.recording.folder.layout import Layout, images_of
-from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
+from splatctrl_cli.recording.folder.layout_nerfstudio import fill_transforms
 from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
 from splatctrl_cli.recording.log.registration import Lens, correct_lens
 from splatctrl_cli.recording.log.stored_frame import (
@@ -64,7 +64,7 @@ class ImageFolderSource(FrameSource):
     def __init__(self, path: Path, options: SourceOptions, *descriptions: Description) -> None:
         options.refuse(_NOT_FOR_FOLDERS, "an image folder", path)
         self.name = path.name
-        self._descriptions = tuple(map(with_transforms, descriptions))
+        self._descriptions = tuple(map(fill_transforms, descriptions))
         self._description = self._descriptions[0]
         stamps = self._description.stamps
         self.has_clock = stamps.rate is not None or stamps.names

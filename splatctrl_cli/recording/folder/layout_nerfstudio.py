@@ -35,12 +35,12 @@ def read(folder: Path, options: SourceOptions) -> Description:
     """Describe the folder; depth defaults to millimetres."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
-    return with_transforms(
+    return fill_transforms(
         Description(path=folder / file, root=folder, poses=PosesTable(format="nerfstudio", file=file, axes="opengl"))
     )
 
 
-def with_transforms(description: Description) -> Description:
+def fill_transforms(description: Description) -> Description:
     table = description.poses
     is_whole = bool(description.listed or (description.camera and description.frames))
     if is_whole or table is None or table.format != "nerfstudio":

@@ -89,7 +89,7 @@ def read(path: Path, options: SourceOptions) -> Description:
     """Describe clouds; --depth-scale is metres per length of points and VIEWPOINT."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"), key=lambda p: number_key(p.stem))
     heads, unit = [_head(file) for file in files], options.depth_scale or 1.0
-    k, is_world, notes = _fitted(files[0], options)
+    k, is_world, notes = _fit_lens(files[0], options)
     stamps = [stamp_of_text(file.stem) if "." in file.stem else None for file in files]
     has_stamps = None not in stamps
     views = []
@@ -128,7 +128,7 @@ def read(path: Path, options: SourceOptions) -> Description:
     )
 
 
-def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
+def _fit_lens(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
     (written, _, T), given = read_cloud(path), options.intrinsics.get(CAMERA)
     fits, (height, width) = [], written.shape[:2]
     for is_world in (False, True):

@@ -82,7 +82,7 @@ def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraT
         taken.update(c.topic.name for c in free)
         color = min(free, key=_color_rank)
         cameras.append(_camera(survey, namespace, color, groups[namespace]))
-    return _with_unique_names(cameras)
+    return _name_cameras(cameras)
 
 
 def _camera(
@@ -195,7 +195,7 @@ def _parts(name: str) -> tuple[str, ...]:
     return parts[:-1] if len(parts) > 1 and parts[-1] in {"compressed", "compressedDepth"} else parts
 
 
-def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
+def _name_cameras(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
     """Name cameras by the namespace's last part if unique, else all of it.
 
     Names are folders: other characters than letters, digits, ``_``, ``-``, ``.`` become ``_``.

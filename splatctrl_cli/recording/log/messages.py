@@ -127,7 +127,7 @@ def read_image(message: Any, type_name: str, *, lazily: bool = False) -> ImageMe
     packed = _packed(message.format, bytes(message.data))
     if lazily and (found := _plain(packed)) is not None:
         encoding, size, color = found
-        return _image(message, encoding, size, partial(_decoded, packed, color=color), packed.file)
+        return _image(message, encoding, size, partial(_decode, packed, color=color), packed.file)
     pixels, encoding, compressed = _compressed_depth(packed) if packed.is_depth else _compressed_pixels(packed)
     return _image(message, encoding, pixels.shape, lambda: pixels, compressed, packed.remark)
 
@@ -226,7 +226,7 @@ def _plain(packed: _Packed) -> tuple[str, tuple[int, int], bool] | None:
     return ("mono8" if head.channels == 1 else "rgb8", size, head.channels != 1)
 
 
-def _decoded(packed: _Packed, *, color: bool) -> NDArray[Any]:
+def _decode(packed: _Packed, *, color: bool) -> NDArray[Any]:
     what = f"compressed image ({packed.form}): {len(packed.file)} bytes that are not an image file"
     error = UndecodableMessageError if packed.file.startswith(_FILES) else UnreadFormError
     return require(decode_file(packed.file, color=color), what, error=error)
@@ -338,8 +338,8 @@ def metres(counts: NDArray[Any], scale: float) -> Float32:
 def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]:
     form, data, recorded = packed.form, packed.file, packed.recorded
     if data.startswith(JPEG) and (head := image_head(data)) is not None and head.channels == 3:
-        return _decoded(packed, color=True), "rgb8", data
-    pixels = _decoded(packed, color=False)
+        return _decode(packed, color=True), "rgb8", data
+    pixels = _decode(packed, color=False)
     if pixels.ndim == 2 and recorded in _MOSAICS and pixels.dtype == (np.uint8 if recorded in BAYER else np.uint16):
         return pixels, recorded, None  # a mosaic in a file: its bytes are not a colour image
     if pixels.ndim == 2 and pixels.dtype == np.uint16:
@@ -347,7 +347,7 @@ def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None
     if pixels.ndim == 2 and pixels.dtype == np.float32:  # TIFF, as compressed_image_transport stores 32FC1
         return pixels, "32FC1", None
     if pixels.ndim == 3 and (pixels.dtype != np.uint8 or pixels.shape[2] != 3):
-        return _decoded(packed, color=True), "rgb8", data
+        return _decode(packed, color=True), "rgb8", data
     refuse_if(
         pixels.dtype != np.uint8,
         f"compressed image ({form}): pixels of {pixels.dtype}, neither colour nor depth",

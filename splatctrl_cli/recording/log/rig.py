@@ -143,7 +143,7 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
     )
 
 
-def _rectified(calibration: Calibration) -> Calibration:
+def _rectify(calibration: Calibration) -> Calibration:
     """The rectified camera: P if set, without distortion; valid if the lens is known."""
     pinhole = replace(
         calibration,
@@ -274,7 +274,7 @@ class _Builder:
         lens = image_lens(self._survey, image_topic, sized)
         if lens == "contradicted":
             raise self._contradicted(sized, info, image_topic)
-        return _rectified(sized) if lens == "rectified" else sized
+        return _rectify(sized) if lens == "rectified" else sized
 
     def _contradicted(self, calibration: Calibration, info: str, image_topic: str) -> InputError:
         k = intrinsics_of(calibration)

@@ -99,7 +99,7 @@ def _controller(message: Any, log_time_ns: int) -> RawJoints:
     """Filled `feedback` and `reference`, else the older `actual` and `desired` (control_msgs)."""
     names = tuple(str(name) for name in message.joint_names)
     actual, wanted = (
-        _filled(message, fields, len(names)) for fields in (("feedback", "actual"), ("reference", "desired"))
+        _find_filled(message, fields, len(names)) for fields in (("feedback", "actual"), ("reference", "desired"))
     )
     actual = require(
         actual, f"a controller state of {len(names)} joints without positions", error=UndecodableMessageError
@@ -109,7 +109,7 @@ def _controller(message: Any, log_time_ns: int) -> RawJoints:
     return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
 
 
-def _filled(message: Any, fields: tuple[str, ...], num_joints: int) -> Any:
+def _find_filled(message: Any, fields: tuple[str, ...], num_joints: int) -> Any:
     there = [getattr(message, name) for name in fields if name in message.__dataclass_fields__]
     return next((point for point in there if len(point.positions) == num_joints), None)
 

@@ -25,7 +25,7 @@ from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, range
 from splatctrl_cli.recording.log.decoder import JOINT_STATE
 from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.recording.log.state_messages import STANDARD_TYPES, STATE_TYPES, TRAJECTORY, JointStream
-from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, unwrapped
+from splatctrl_cli.recording.log.state_track import RawTrack, clean_states, unwrap
 from splatctrl_cli.recording.log.survey import Survey, TopicSurvey
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, Index, LossReport, Stamps
@@ -59,7 +59,7 @@ def joint_records(
         loss.notes.append(wrong.message)
     loss.notes += [f"{t.topic.name}: {note} ({num} states)" for t in topics for note, num in t.joints.notes.items()]
     raw = track_of_topic(main_topic(topics, loss), loss) if wanted is None else track_of_joints(topics, wanted, loss)
-    states = cleaned(raw, loss)
+    states = clean_states(raw, loss)
     return (raw.names, states) if len(states) else ((), NO_STATES)
 
 
@@ -117,7 +117,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Other joints are
     interpolated. States outside their times, or in gaps over `STATES_BRIDGED` with motion, are left out with a note.
     """
-    streams = _renamed(_streams(topics), wanted, loss)
+    streams = _rename_joints(_streams(topics), wanted, loss)
     base = _base(streams, wanted)
     track = _raw(base, base.names, loss)
     missing = [name for name in wanted if name not in base.names]
@@ -127,7 +127,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
         added = tuple(name for name in missing if name in best.names)
         if not added:
             break
-        track = _filled(track, _raw(best, added, loss), loss)
+        track = _fill_joints(track, _raw(best, added, loss), loss)
         missing = [name for name in missing if name not in added]
         used.append(best.where)
     others = sorted({t.topic.name for t in topics} - set(used))
@@ -175,7 +175,7 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
     if wanted is None:
         base = max(streams, key=lambda s: (s.where == main_topic(topics, LossReport()).topic.name, len(s.names)))
     else:
-        streams = _renamed(streams, wanted, LossReport())
+        streams = _rename_joints(streams, wanted, LossReport())
         base = _base(streams, wanted)
     names = base.names if wanted is None else tuple(name for name in base.names if name in wanted)
     for other in streams:
@@ -232,10 +232,10 @@ def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
     return num
 
 
-def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
+def _rename_joints(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
     found = dict.fromkeys(name for stream in streams for name in stream.names)
     unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
-    names = with_prefix(unknown, missing)
+    names = match_prefix(unknown, missing)
     if not names:
         return streams
     name, meant = next(iter(names.items()))
@@ -243,7 +243,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
     return [replace(s, names=tuple(names.get(name, name) for name in s.names)) for s in streams]
 
 
-def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
+def match_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
     """Map a log's joint names to the robot's by the best prefix, else empty."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(found):
@@ -267,7 +267,7 @@ def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
     ).of_names(names)
 
 
-def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
+def _fill_joints(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     order = np.argsort(other.stamp_ns, kind="stable")
     at = other.stamp_ns[order]
     stamps = track.stamp_ns
@@ -275,7 +275,7 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     if len(at) == 1:
         at, order = np.repeat(at, 2), np.repeat(order, 2)
     before = after - 1
-    position = unwrapped(other.select(order), loss).position
+    position = unwrap(other.select(order), loss).position
     gap = (at[after] - at[before]) * 1e-9
     keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= STATES_BRIDGED) | _is_still(position, before, after))
     share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]

@@ -98,7 +98,7 @@ def _numbers(seconds: Float64, period: float) -> Float64:
     return numbers
 
 
-def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
+def differentiate(stamp_ns: Stamps, position: Float64) -> Float64:
     """Velocities (T, J) [1/s] of positions (T, J) at rising stamps (T,) [ns].
 
     The slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for uneven steps), on
@@ -108,7 +108,7 @@ def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
 
 
 def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
-    """Yield `differentiated` by block: first state, velocities (K, J)."""
+    """Yield `differentiate` by block: first state, velocities (K, J)."""
     for start, end in pairwise([0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]):
         if end - start == 1:
             yield start, np.zeros((1, *position.shape[1:]))
@@ -145,20 +145,20 @@ class RawTrack(StateColumns):
         return replace(self.of_joints(order), names=tuple(names))
 
 
-def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
+def clean_states(raw: RawTrack, loss: LossReport) -> StateColumns:
     """Sort states by stamp, each stamp once, each with velocities; changes are noted in `loss`.
 
     States with a position that is not finite are damage, and left out. Velocities that are absent, NaN, or always
     zero for a moving joint become position differences.
     """
-    ordered = unwrapped(_in_order(_finite(raw, loss), loss), loss)
+    ordered = unwrap(_sort(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)
     if len(gaps):
         longest = float(np.max(np.diff(ordered.stamp_ns)[gaps])) * 1e-9
         loss.state_gaps += len(gaps)
         loss.notes.append(f"{raw.where}: {len(gaps)} gaps between states, the longest {longest:.3f} s")
     num = len(ordered.stamp_ns)
-    velocity = _with_velocity(ordered, loss) if num else ordered.velocity
+    velocity = _add_velocity(ordered, loss) if num else ordered.velocity
     poses = [table for table in (ordered.T_base_ee, ordered.T_world_ee) if table is not None]
     blocks = [[np.isfinite(T[first:last]).all(axis=(1, 2)) for T in poses] for first, last in ranges(len(ordered))]
     num_without = num - sum(int(np.any(block, axis=0).sum()) for block in blocks)
@@ -167,7 +167,7 @@ def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     return replace(ordered, velocity=velocity)
 
 
-def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
+def unwrap(raw: RawTrack, loss: LossReport) -> RawTrack:
     """Remove whole turns between states in time order, such as pi to -pi."""
     position, file = raw.position, RowFile(raw.position.shape[1:])
     turns: Float64 = np.zeros(position.shape[1])
@@ -203,7 +203,7 @@ def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:
     return raw.select(np.flatnonzero(is_finite))
 
 
-def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
+def _sort(raw: RawTrack, loss: LossReport) -> RawTrack:
     num_back = int((np.diff(raw.stamp_ns) < 0).sum())
     if num_back:
         loss.unsorted_states += num_back
@@ -224,7 +224,7 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
     return raw.select(np.flatnonzero(~is_again))
 
 
-def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
+def _add_velocity(raw: RawTrack, loss: LossReport) -> Table:
     num_taken, is_zero, why = _missing_velocities(raw)
     if not num_taken:
         _compare_units(
@@ -266,7 +266,7 @@ def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
 
 def _compare_units(raw: RawTrack, loss: LossReport) -> None:
     position, velocity = raw.position[: len(raw.stamp_ns)], raw.velocity[: len(raw.stamp_ns)]
-    slopes: Float64 = differentiated(raw.stamp_ns, position)
+    slopes: Float64 = differentiate(raw.stamp_ns, position)
     is_fast = np.abs(slopes) > fixed.STATES_SPEED
     if is_fast.sum() < 10:
         return

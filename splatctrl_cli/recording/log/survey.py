@@ -299,13 +299,13 @@ def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
     if size < LARGE or not isinstance(inner, McapLog):
         return survey(log), ()
     counts, span_ns, chunks, notes = inner.index()
-    return _sampled(inner, counts, span_ns, _first_chunks(counts, chunks), video), (
+    return _sample(inner, counts, span_ns, _first_chunks(counts, chunks), video), (
         *notes,
         f"{size} bytes: described by index and first messages; neither checksums nor the rest were read",
     )
 
 
-def _sampled(
+def _sample(
     log: McapLog,
     counts: Mapping[int, int],
     span_ns: tuple[int, int],

@@ -20,8 +20,8 @@ from splatctrl_cli.recording.folder.image_folder import has_views
 from splatctrl_cli.recording.log.decoder import MessageDecoder, UndecodableMessageError, is_ros, stamp_ns
 from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_columns import StateColumns
-from splatctrl_cli.recording.log.state_topics import joint_records, with_prefix
-from splatctrl_cli.recording.log.state_track import RawTrack, cleaned
+from splatctrl_cli.recording.log.state_topics import joint_records, match_prefix
+from splatctrl_cli.recording.log.state_track import RawTrack, clean_states
 from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.log.video import open_log
@@ -33,9 +33,9 @@ from splatctrl_cli.recording.state.state_table import (
     TIME_UNITS_NS,
     columns_of,
     dataset_track,
-    described_track,
     libfranka_track,
     read_csv,
+    read_described_track,
 )
 from splatctrl_cli.records import Float64, LossReport, Stamps
 
@@ -75,8 +75,8 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
         return _libfranka(path, joints)
     if path.suffix == ".toml" and has_table(path, "states"):
         options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
-        raw, file = described_track(path)
-        return _of_table(path, (path, file), raw, LossReport())
+        raw, file = read_described_track(path)
+        return _open_table(path, (path, file), raw, LossReport())
     refuse_if(
         path.suffix.lower() in ARRAY_FILES,
         f"{path}: a file of arrays, of which none is known to be joint states",
@@ -85,15 +85,17 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
     if (path / INFO).is_file() and (path / "data").is_dir():
         options.refuse(_NOT_FOR_TABLES, "a LeRobot dataset", path)
         raw, file = dataset_track(path)
-        return _of_table(path, (file,), raw, LossReport(notes=["times are seconds from the episode's begin"]))
+        return _open_table(path, (file,), raw, LossReport(notes=["times are seconds from the episode's begin"]))
     if is_capture(path):
         return calibrated(CaptureSource(path, options, joints), options)
     if path.suffix == ".toml" or has_views(path):
         return open_source(path, options)
-    return _of_log(path, open_log(path), options, joints)
+    return _open_log_states(path, open_log(path), options, joints)
 
 
-def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
+def _open_log_states(
+    path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]
+) -> FrameSource | StateSource:
     default = SourceOptions()
     try:
         return calibrated(RosLogSource(log, options, joints), options)
@@ -118,15 +120,15 @@ def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[st
 
 def _libfranka(path: Path, joints: Sequence[str]) -> StateSource:
     raw = libfranka_track(read_csv(path))
-    names = with_prefix(raw.names, joints)
+    names = match_prefix(raw.names, joints)
     loss = LossReport(notes=["times are those of the robot, in ms since it was switched on"])
     if len(names) == len(raw.names):
         raw = replace(raw, names=tuple(names[name] for name in raw.names))
-    return _of_table(path, (path,), raw, loss)
+    return _open_table(path, (path,), raw, loss)
 
 
-def _of_table(path: Path, files: Sequence[Path], raw: RawTrack, loss: LossReport) -> StateSource:
-    states = cleaned(raw, loss)
+def _open_table(path: Path, files: Sequence[Path], raw: RawTrack, loss: LossReport) -> StateSource:
+    states = clean_states(raw, loss)
     refuse_if(not states, f"{path}: expected joint states, got none that is finite", remedy="check the file")
     return StateSource(path.name, files, raw.names, states, loss)
 

@@ -265,9 +265,9 @@ class StatesTable:
     episode: int | None = None
 
 
-def described_track(path: Path) -> tuple[RawTrack, Path]:
+def read_described_track(path: Path) -> tuple[RawTrack, Path]:
     """Read described states, and their file. Raises InputError naming key or column."""
-    table = read_table(StatesTable, path, "states", beside=("twists",), fill=lambda given: with_preset(path, given))
+    table = read_table(StatesTable, path, "states", beside=("twists",), fill=lambda given: fill_preset(path, given))
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),
         "time_unit": tuple(TIME_UNITS_NS),
@@ -302,7 +302,7 @@ def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
     return _track(StatesTable(**found), ParquetFile(file, (EPISODE, found["episode"])), folder), file
 
 
-def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
+def fill_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
     """Fill [states] of TOML file `path` by its preset."""
     name = given.get("preset", "")
     if not name:
