@@ -157,7 +157,7 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
                 group[name] = group[a]
     anchored = group[ROBOT] | {name for camera in evidence.moving for name in group[camera]}
     parts = list({id(part): part for name, part in group.items() if name != ROBOT}.values())
-    if len([part for part in parts if not part & anchored]) + bool(anchored - {ROBOT}) < 2:
+    if sum(not part & anchored for part in parts) + bool(anchored - {ROBOT}) < 2:
         return
     names = " | ".join(sorted(", ".join(sorted(part - {ROBOT})) for part in parts))
     robot = "" if evidence.arm is None else ", nor the robot"

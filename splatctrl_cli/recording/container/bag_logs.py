@@ -155,7 +155,7 @@ class Bag1Log(RawLog):
         kind, fields, length = head
         end = stream.tell() + length
         is_cut = end > self._size
-        body = stream.read(min(length, MAX_BLOCK)) if (kind in {MESSAGE, CHUNK, CONNECTION} or is_cut) else b""
+        body = stream.read(min(length, MAX_BLOCK)) if is_cut or kind in {MESSAGE, CHUNK, CONNECTION} else b""
         stream.seek(min(end, self._size))
         return Part(offset, kind, body, is_cut, fields)
 

@@ -153,7 +153,7 @@ def read_views(
 
 def check_lengths(where: str, views: Sequence[DtuView]) -> None:
     """Raise InputError if depth or camera distances are not millimetres."""
-    medians = [float(np.median(depth)) for depth in [view.depth[view.depth > 0] for view in views] if depth.size]
+    medians = [float(np.median(view.depth[view.depth > 0])) for view in views if (view.depth > 0).any()]
     if not medians:
         return
     median, (low, high) = float(np.median(medians)), PLAUSIBLE_DEPTH
