@@ -4,11 +4,13 @@ Wording is ``thing: expected X, got Y``; the remedy follows a semicolon.
 """
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar
 
 DAMAGED = 3  # exit code: done, but part of the recording is damaged
 DAMAGE = "part of the recording is damaged and left out"
+T = TypeVar("T")
 
 
 def did_you_mean(word: str, known: Iterable[str], otherwise: str, *, prefix: str = "", cutoff: float = 0.6) -> str:
@@ -40,13 +42,32 @@ class InputError(SplatCtrlError):
     exit_code = 4
 
 
+def refuse_if(is_bad: object, what: str, *, remedy: str = "", error: Callable[..., Exception] = InputError) -> None:
+    """Raise an error that says `what` if the condition holds."""
+    if is_bad:
+        raise error(what, remedy=remedy) if remedy else error(what)
+
+
+def require(value: T | None, what: str, *, remedy: str = "", error: Callable[..., Exception] = InputError) -> T:
+    """The value. Raises an error that says `what` if it is None."""
+    if value is None:
+        raise error(what, remedy=remedy) if remedy else error(what)
+    return value
+
+
 @contextmanager
-def refuse_faults(what: str, *faults: type[Exception], remedy: str = "") -> Iterator[None]:
-    """Raise InputError ``what: fault`` for one of these faults in the block."""
+def refuse_faults(
+    what: str | Callable[[Any], str],
+    *faults: type[BaseException],
+    remedy: str = "",
+    error: Callable[..., Exception] = InputError,
+) -> Iterator[None]:
+    """Raise an error ``what: fault``, or `what` of the fault, for one of these faults in the block."""
     try:
         yield
     except faults as fault:
-        raise InputError(f"{what}: {fault}", remedy=remedy) from None
+        said = f"{what}: {fault}" if isinstance(what, str) else what(fault)
+        raise (error(said, remedy=remedy) if remedy else error(said)) from None
 
 
 class NotEvaluableError(SplatCtrlError):

@@ -8,7 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.calibration.evidence import DEPTH, OF_CAMERA, POSE, Estimate, Evidence, Unknowns, twist_between
+from splatctrl_cli.calibration.evidence import (
+    DEPTH,
+    HELD,
+    OF_CAMERA,
+    POSE,
+    Estimate,
+    Evidence,
+    Unknowns,
+    twist_between,
+)
 from splatctrl_cli.calibration.views import DepthView, depth_sigma, landed, overlap_rows
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, transform_points
@@ -37,12 +46,8 @@ class Rows:
     num_hidden: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Widths:
-    """Limits of residuals that count: reach [m], and cut [sigma] (default: the reach alone)."""
-
-    reach: float
-    cut: float = np.inf
+Widths = tuple[float, float]
+"""Limits of residuals that count: reach [m], and cut [sigma], inf for the reach alone."""
 
 
 @dataclass(kw_only=True)
@@ -66,6 +71,7 @@ class Adjustment:
         """basis (P, K): directions of steps, None for all."""
         self.evidence = evidence
         self.unknowns = unknowns
+        self._clock = [unknowns.size - 1 if unknowns.has_clock else HELD]  # its column
         self._basis = np.eye(unknowns.size) if basis is None else basis
 
     def solved(
@@ -109,19 +115,18 @@ class Adjustment:
         return 1 / np.square(sigma), offset
 
     def normal(self, estimate: Estimate, widths: Widths, *, with_robot: bool = True) -> Normal:
-        """The normal equations, optionally without the robot."""
-        P = self.unknowns.size
+        P, (reach, cut) = self.unknowns.size, widths
         H, g = np.zeros((P, P)), np.zeros(P)
         scores: list[Float64] = []
         numbers: dict[tuple[str, int], int] = {}
         counts: dict[tuple[str, str], int] = {}
         deviations: list[Float64] = []
-        for rows in self.rows(estimate, widths.reach, with_robot=with_robot):
+        for rows in self.rows(estimate, reach, with_robot=with_robot):
             if not len(rows.residual):
                 continue
             deviation = np.abs(rows.residual) / rows.sigma
-            cut = np.minimum(widths.reach / rows.sigma, widths.cut)
-            weight = np.where(deviation < cut, np.square(1 - np.square(deviation / cut)), 0.0)
+            width = np.minimum(reach / rows.sigma, cut)
+            weight = np.where(deviation < width, np.square(1 - np.square(deviation / width)), 0.0)
             is_free = rows.columns >= 0
             columns, J = rows.columns[is_free], rows.jacobian[:, is_free] / rows.sigma[:, None]
             weighed = J * weight[:, None]
@@ -183,15 +188,13 @@ class Adjustment:
         for i, j in self.evidence.pairs:
             yield self._overlap(views[i], views[j], *placed[i], *placed[j], estimate, reach)
         for frame in self.evidence.frames if with_robot else ():
-            rows = self._robot(frame, estimate, reach)
-            if rows is not None:
-                yield rows
+            yield from filter(None, [self._robot(frame, estimate, reach)])
 
     def _placed(self, item: DepthView | RgbdFrame, estimate: Estimate) -> tuple[Float64, Float64]:
         """T_world_camera, and its motion with the clock, camera frame."""
         T, twist = self.evidence.recorded(item, estimate.clock)
         correction = estimate.corrections[item.camera]
-        return T @ correction, _carried(twist, correction)
+        return T @ correction, _carry(twist, correction)
 
     def _overlap(
         self,
@@ -240,9 +243,7 @@ class Adjustment:
                     by_a @ twist_a + by_b @ twist_b,
                 ]
             ),
-            columns=np.concatenate(
-                [self.unknowns.columns(a.camera), self.unknowns.columns(b.camera), [self.unknowns.clock_column]]
-            ),
+            columns=np.concatenate([self.unknowns.columns(a.camera), self.unknowns.columns(b.camera), self._clock]),
             clusters=_cells(transform_points(T_b, there[which]), self.evidence.scale),
         )
 
@@ -251,8 +252,9 @@ class Adjustment:
         scale, bias = estimate.depth_of(frame.camera)
         depth = np.where(frame.depth > 0, scale * frame.depth + bias, 0.0).astype(np.float32)
         T, twist = self._placed(frame, estimate)
-        stamp_ns = frame.stamp_ns - round(estimate.clock * 1e9)
-        found = self.evidence.arm.rows(depth, frame.intrinsics, T, twist, stamp_ns, reach)
+        found = self.evidence.arm.rows(
+            depth, frame.intrinsics, T, twist, frame.stamp_ns - round(estimate.clock * 1e9), reach
+        )
         if found is None:
             return None
         step = max(1, len(found.residual) // fixed.CALIBRATION_ARM_POINTS)
@@ -270,9 +272,7 @@ class Adjustment:
             residual=found.residual[some],
             sigma=np.hypot(slope * depth_sigma(z), fixed.CALIBRATION_NOISE[0]),
             jacobian=jacobian,
-            columns=np.concatenate(
-                [self.unknowns.columns(frame.camera), np.full(OF_CAMERA, -1), [self.unknowns.clock_column]]
-            ),
+            columns=np.concatenate([self.unknowns.columns(frame.camera), np.full(OF_CAMERA, -1), self._clock]),
             clusters=found.links[some] * int(np.prod(fixed.CALIBRATION_TILES)) + found.tiles[some],
             num_hidden=found.num_hidden // step,
         )
@@ -284,7 +284,7 @@ def _cells(points_world: Float64, depth: float) -> Index:
     return np.asarray((x * 1_000_003 + y) * 1_000_003 + z)
 
 
-def _carried(twist: Float64, T: Float64) -> Float64:
+def _carry(twist: Float64, T: Float64) -> Float64:
     """The motion (6,) of a frame fixed at T (4, 4) to one moving by `twist`, own axes."""
     if not twist.any():
         return twist

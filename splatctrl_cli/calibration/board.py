@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8, spread
 
@@ -60,11 +60,12 @@ def board_of(text: str) -> Board:
     """Parse ``COLUMNSxROWS:SQUARE``. Raises UsageError for another form."""
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2}):(\d*\.?\d+)", text)
     columns, rows, square = (int(match[1]), int(match[2]), float(match[3])) if match else (0, 0, 0.0)
-    if not (min(columns, rows) >= 3 and 0.002 <= square <= 1.0):
-        raise UsageError(
-            f"--board {text}: expected inner corners, 3 to 99 each way, and the edge of a square, 0.002 to 1 m",
-            remedy="give it as 9x6:0.025, for 10x7 squares of 25 mm",
-        )
+    refuse_if(
+        not (min(columns, rows) >= 3 and 0.002 <= square <= 1.0),
+        f"--board {text}: expected inner corners, 3 to 99 each way, and the edge of a square, 0.002 to 1 m",
+        remedy="give it as 9x6:0.025, for 10x7 squares of 25 mm",
+        error=UsageError,
+    )
     return Board(columns=columns, rows=rows, square=square)
 
 
@@ -79,8 +80,9 @@ def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
 
 def other_size(frame: RgbdFrame) -> tuple[int, int] | None:
     """Inner corners, larger number first, of any other chessboard in view, or None."""
-    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-    is_found, _, meta = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), cv2.CALIB_CB_LARGER)
+    is_found, _, meta = cv2.findChessboardCornersSBWithMeta(
+        cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), (3, 3), cv2.CALIB_CB_LARGER
+    )
     return (max(meta.shape), min(meta.shape)) if is_found and meta.size >= LEAST else None
 
 
@@ -182,13 +184,8 @@ class Rig:
     held: Sequence[str] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class HandEye:
-    """X (4, 4) that keeps ``A X B`` constant (stays); distance [m]: median deviation."""
-
-    X: Float64
-    stays: Float64
-    distance: float
+HandEye = tuple[Float64, Float64, float]
+"""X (4, 4) that keeps ``A X B`` constant, that constant, and the median deviation [m] from it."""
 
 
 def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[str, Float64]:
@@ -207,21 +204,24 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
     for camera in [camera for camera in rig.recorded if camera not in rig.held]:
         try:
             if camera in rig.moving and stands:
-                found = hand_eye([(rig.recorded[camera][s.stamp_ns], s.T_camera_board) for s in by_camera[camera]])
-                _check_fit(found, f"{camera}, which moves,")
-                placed[camera], T_world_board = found.X, found.stays
+                X, stays, off = hand_eye(
+                    [(rig.recorded[camera][s.stamp_ns], s.T_camera_board) for s in by_camera[camera]]
+                )
+                _check_fit(off, f"{camera}, which moves,")
+                placed[camera], T_world_board = X, stays
             elif camera not in rig.moving and not stands and rig.arm is not None and not rig.held:
-                found = _carried(rig.arm, by_camera[camera])
-                placed[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ found.X
+                T_world_camera = _place_by_link(rig.arm, by_camera[camera])
+                placed[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ T_world_camera
         except NotEvaluableError as error:
             reasons.append(error.message.removeprefix("calibrate: "))
-    if not placed:
-        raise NotEvaluableError(
-            "calibrate: the board is tied to no robot: "
-            + ("; ".join(dict.fromkeys(reasons)) or "it stands still, and no camera that moves sees it"),
-            remedy="let the gripper hold the board, or a camera on the wrist see it stand still, from ten sides; or"
-            " leave --urdf out",
-        )
+    refuse_if(
+        not placed,
+        "calibrate: the board is tied to no robot: "
+        + ("; ".join(dict.fromkeys(reasons)) or "it stands still, and no camera that moves sees it"),
+        remedy="let the gripper hold the board, or a camera on the wrist see it stand still, from ten sides; or"
+        " leave --urdf out",
+        error=NotEvaluableError,
+    )
     while missing := [camera for camera in rig.recorded if camera not in placed]:
         votes = {camera: _votes(camera, by_camera, placed, T_world_board, rig, stands) for camera in missing}
         best = max(missing, key=lambda camera: len(votes[camera]))
@@ -239,38 +239,38 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
 def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> None:
     fewest = fixed.CALIBRATION_BOARD_FEWEST
     few = [f"{camera} in {len(its)}" for camera, its in by_camera.items() if len(its) < fewest]
-    if few:
-        seen = [camera for camera, its in by_camera.items() if len(its) >= fewest]
-        only = f"; only {seen[0]} sees it" if len(seen) == 1 and len(by_camera) > 1 else ""
-        raise NotEvaluableError(
-            f"calibrate: too few views of the board of {board} inner corners: {', '.join(few)} frames (expected"
-            f" {fewest}){only}",
-            remedy=f"hold its printed side, whole and lit, in view of every camera; {SHOW}",
-        )
+    seen = [camera for camera, its in by_camera.items() if len(its) >= fewest]
+    only = f"; only {seen[0]} sees it" if len(seen) == 1 and len(by_camera) > 1 else ""
+    refuse_if(
+        few,
+        f"calibrate: too few views of the board of {board} inner corners: {', '.join(few)} frames (expected"
+        f" {fewest}){only}",
+        remedy=f"hold its printed side, whole and lit, in view of every camera; {SHOW}",
+        error=NotEvaluableError,
+    )
     ratios = [s.depth_ratio for its in by_camera.values() for s in its if s.depth_ratio is not None]
     ratio = float(np.median(ratios)) if ratios else 1.0
     low, high = fixed.CALIBRATION_BOARD_DEPTH
-    if not low < ratio < high:
-        raise NotEvaluableError(
-            f"calibrate: the squares of the board measure about {1e3 * ratio * board.square:.0f} mm by the cameras'"
-            f" depth, expected {1e3 * board.square:g}",
-            remedy=f"measure a square: --board {board}:{ratio * board.square:.3f}; or the depth unit is wrong"
-            " (--depth-scale)",
-        )
+    refuse_if(
+        not low < ratio < high,
+        f"calibrate: the squares of the board measure about {1e3 * ratio * board.square:.0f} mm by the cameras'"
+        f" depth, expected {1e3 * board.square:g}",
+        remedy=f"measure a square: --board {board}:{ratio * board.square:.3f}; or the depth unit is wrong"
+        " (--depth-scale)",
+        error=NotEvaluableError,
+    )
 
 
 def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool:
-    """True unless a stationary camera sees the board move."""
     for camera, its in by_camera.items():
         places = np.array([s.T_camera_board[:3, 3] for s in its])
-        if camera not in rig.moving and len(its) > 1:
-            away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-            if np.median(away) > fixed.CALIBRATION_BOARD_MOVED:
-                return False
+        away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+        if camera not in rig.moving and len(its) > 1 and np.median(away) > fixed.CALIBRATION_BOARD_MOVED:
+            return False
     return True
 
 
-def _carried(arm: Arm, sightings: Sequence[Sighting]) -> HandEye:
+def _place_by_link(arm: Arm, sightings: Sequence[Sighting]) -> Float64:
     """T_world_camera of a camera that sees the board on the best-fitting link."""
     fits: list[HandEye] = []
     reasons = ["no joint states at its frames"]
@@ -280,34 +280,35 @@ def _carried(arm: Arm, sightings: Sequence[Sighting]) -> HandEye:
             fits.append(hand_eye([(invert_transform(at), seen) for at, seen in poses if at is not None]))
         except NotEvaluableError as error:
             reasons.append(error.message)
-    if not fits:
-        raise NotEvaluableError(reasons[-1])
-    best = min(fits, key=lambda fit: fit.distance)
-    _check_fit(best, f"the board before {sightings[0].camera}, on the link that fits best,")
-    return best
+    refuse_if(not fits, reasons[-1], error=NotEvaluableError)
+    X, _, off = min(fits, key=lambda fit: fit[2])
+    _check_fit(off, f"the board before {sightings[0].camera}, on the link that fits best,")
+    return X
 
 
-def _check_fit(found: HandEye, what: str) -> None:
-    if found.distance > fixed.CALIBRATION_BOARD_FIT:
-        raise NotEvaluableError(
-            f"calibrate: {what} does not move with the robot: {1e3 * found.distance:.0f} mm off (expected"
-            f" {1e3 * fixed.CALIBRATION_BOARD_FIT:.0f})"
-        )
+def _check_fit(off: float, what: str) -> None:
+    refuse_if(
+        off > fixed.CALIBRATION_BOARD_FIT,
+        f"calibrate: {what} does not move with the robot: {1e3 * off:.0f} mm off (expected"
+        f" {1e3 * fixed.CALIBRATION_BOARD_FIT:.0f})",
+        error=NotEvaluableError,
+    )
 
 
 def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
-    """X (4, 4) with the same ``A X B`` for all pairs (A, B).
+    """X (4, 4) with the same ``A X B`` for all pairs (A, B), that product, and their median deviation [m].
 
     From ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: X turns the right's rotation vectors into the left's, and its
     translation is linear (after Park and Martin, Robot sensor calibration, 1994). Outliers are dropped once. Raises
     NotEvaluableError for too few pairs, or rotation about fewer than two axes.
     """
     pairs = spread(pairs, fixed.CALIBRATION_FRAMES)
-    if len(pairs) < fixed.CALIBRATION_BOARD_VIEWS:
-        raise NotEvaluableError(
-            f"calibrate: too few views of the board by one camera: {len(pairs)} (expected"
-            f" {fixed.CALIBRATION_BOARD_VIEWS})"
-        )
+    refuse_if(
+        len(pairs) < fixed.CALIBRATION_BOARD_VIEWS,
+        f"calibrate: too few views of the board by one camera: {len(pairs)} (expected"
+        f" {fixed.CALIBRATION_BOARD_VIEWS})",
+        error=NotEvaluableError,
+    )
     for is_last in (False, True):
         X = _hand_eye(pairs)
         ends = [A @ X @ B for A, B in pairs]
@@ -317,7 +318,7 @@ def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
             break
         near = away <= 3 * np.median(away) + 1e-9
         pairs = [pair for pair, is_near in zip(pairs, near.tolist(), strict=True) if is_near]
-    return HandEye(X=X, stays=stays, distance=float(np.median(away)))
+    return X, stays, float(np.median(away))
 
 
 def _hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> Float64:
@@ -330,18 +331,20 @@ def _hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> Float64:
         np.array([cv2.Rodrigues(T[:3, :3])[0].ravel() for T in some]) for some in (lefts, rights)
     )
     spreads = np.linalg.svd(turned_left, compute_uv=False) / np.sqrt(len(turned_left))
-    if spreads[1] < fixed.CALIBRATION_BOARD_TURN:
-        raise NotEvaluableError(
-            "calibrate: the robot hardly turns the board, or the camera that sees it, about two axes:"
-            f" {np.degrees(spreads[1]):.1f} degrees about the second (expected"
-            f" {np.degrees(fixed.CALIBRATION_BOARD_TURN):.0f})"
-        )
+    refuse_if(
+        spreads[1] < fixed.CALIBRATION_BOARD_TURN,
+        "calibrate: the robot hardly turns the board, or the camera that sees it, about two axes:"
+        f" {np.degrees(spreads[1]):.1f} degrees about the second (expected"
+        f" {np.degrees(fixed.CALIBRATION_BOARD_TURN):.0f})",
+        error=NotEvaluableError,
+    )
     U, _, Vt = np.linalg.svd(turned_left.T @ turned_right)
     X = np.eye(4)
     R = X[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     rows = np.concatenate([A[:3, :3] - np.eye(3) for A in lefts])
-    moved = np.concatenate([R @ B[:3, 3] - A[:3, 3] for A, B in zip(lefts, rights, strict=True)])
-    X[:3, 3] = np.linalg.lstsq(rows, moved, rcond=None)[0]
+    X[:3, 3] = np.linalg.lstsq(
+        rows, np.concatenate([R @ B[:3, 3] - A[:3, 3] for A, B in zip(lefts, rights, strict=True)]), rcond=None
+    )[0]
     return X
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.geometry import quat_from_rotation, transform_from
@@ -45,7 +45,6 @@ class CalibratedCamera:
 
     @property
     def moves(self) -> bool:
-        """True if the camera moves."""
         return self.recorded is None
 
 
@@ -71,7 +70,6 @@ class Calibration:
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """The TOML text of a calibration."""
     lines = [
         f"format = {_text(FORMAT)}",
         f"version = {VERSION}",
@@ -85,11 +83,16 @@ def calibration_text(calibration: Calibration) -> str:
     for name, camera in calibration.cameras.items():
         where = "T_recorded_camera" if camera.moves else "T_world_camera"
         axes = "its own" if camera.moves else "the world's"
+        poses = {"mount" if camera.moves else "pose": camera.T, "recorded": camera.recorded}
+        texts = {
+            key: _numbers([*T[:3, 3], *quat_from_rotation(T[:3, :3])]) for key, T in poses.items() if T is not None
+        }
+        pose, *recorded = (f"{key} = {text}" for key, text in texts.items())
         lines += [
             "",
             f"[cameras.{_text(name)}]",
-            f"{'mount' if camera.moves else 'pose'} = {_pose_text(camera.T)}  # {where}: x, y, z [m], qx, qy, qz, qw",
-            *([] if camera.recorded is None else [f"recorded = {_pose_text(camera.recorded)}"]),
+            f"{pose}  # {where}: x, y, z [m], qx, qy, qz, qw",
+            *recorded,
             f"depth_scale = {float(camera.scale)!r}",
             f"depth_bias = {float(camera.bias)!r}  # [m]",
             f"sigma_position = {_numbers(camera.sigma_position)}  # [m], along {axes} axes",
@@ -112,12 +115,24 @@ def read_calibration(path: Path) -> Calibration:
     """Read a calibration. Raises InputError for a missing, another or a damaged file."""
     with refuse_faults(f"{path}: not TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=AGAIN):
         content = tomllib.loads(read_text(path, "give what calibrate wrote"))
-    if content.get("format") != FORMAT:
-        raise InputError(f"{path}: expected a calibration, got another file", remedy="give what calibrate wrote")
-    if content.get("version") != VERSION:
-        found = content.get("version")
-        raise InputError(f"{path}: expected version {VERSION}, got {found}", remedy="use a newer splatctrl")
-    try:
+    refuse_if(
+        content.get("format") != FORMAT,
+        f"{path}: expected a calibration, got another file",
+        remedy="give what calibrate wrote",
+    )
+    refuse_if(
+        content.get("version") != VERSION,
+        f"{path}: expected version {VERSION}, got {content.get('version')}",
+        remedy="use a newer splatctrl",
+    )
+    with refuse_faults(
+        lambda error: f"{path}: damaged: {type(error).__name__}: {error}",
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        remedy=AGAIN,
+    ):
         clock = content.get("clock")
         return Calibration(
             recording=str(content["recording"]),
@@ -128,8 +143,6 @@ def read_calibration(path: Path) -> Calibration:
             clock=None if clock is None else _finite([clock["offset"]], 1)[0],
             sigma_clock=0.0 if clock is None else _finite([clock["sigma"]], 1)[0],
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: damaged: {type(error).__name__}: {error}", remedy=AGAIN) from None
 
 
 def is_calibration(path: Path) -> bool:
@@ -139,7 +152,6 @@ def is_calibration(path: Path) -> bool:
 
 
 def describe_calibration(path: Path) -> Summary:
-    """Summarise a calibration file."""
     calibration = read_calibration(path)
     rows = [
         [
@@ -168,11 +180,9 @@ def describe_calibration(path: Path) -> Summary:
 def _camera(entry: Mapping[str, Any]) -> CalibratedCamera:
     moves = "mount" in entry
     scale, bias = _finite([entry["depth_scale"], entry["depth_bias"]], 2)
-    if not 0.01 < scale < 100:
-        raise ValueError(f"depth_scale: {scale}")
+    refuse_if(not 0.01 < scale < 100, f"depth_scale: {scale}", error=ValueError)
     covariance = np.array([_finite(row, 6) for row in entry["covariance"]])
-    if covariance.shape != (6, 6):
-        raise ValueError("covariance: expected 6 rows")
+    refuse_if(covariance.shape != (6, 6), "covariance: expected 6 rows", error=ValueError)
     return CalibratedCamera(
         T=_pose(entry["mount" if moves else "pose"]),
         recorded=None if moves else _pose(entry["recorded"]),
@@ -190,20 +200,22 @@ def _camera(entry: Mapping[str, Any]) -> CalibratedCamera:
 
 def _finite(values: Sequence[Any], count: int) -> tuple[float, ...]:
     numbers = tuple(float(value) for value in values)
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise ValueError(f"expected {count} finite numbers, got {list(values)}")
+    refuse_if(
+        len(numbers) != count or not np.isfinite(numbers).all(),
+        f"expected {count} finite numbers, got {list(values)}",
+        error=ValueError,
+    )
     return numbers
 
 
 def _pose(values: Sequence[Any]) -> Float64:
     numbers = _finite(values, 7)
-    if abs(np.linalg.norm(numbers[3:]) - 1) > 1e-3:
-        raise ValueError(f"expected a unit quaternion, got {list(numbers[3:])}")
+    refuse_if(
+        abs(np.linalg.norm(numbers[3:]) - 1) > 1e-3,
+        f"expected a unit quaternion, got {list(numbers[3:])}",
+        error=ValueError,
+    )
     return transform_from(numbers[:3], numbers[3:])
-
-
-def _pose_text(T: Float64) -> str:
-    return _numbers([*T[:3, 3], *quat_from_rotation(T[:3, :3])])
 
 
 def _numbers(values: Any) -> str:

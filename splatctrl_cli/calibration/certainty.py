@@ -37,8 +37,9 @@ class Certainty:
 
     def sigma_depth(self, camera: str) -> tuple[float, float]:
         """Sigma of scale and bias [m]; 0 if fixed."""
-        columns = self.unknowns.columns(camera)[POSE:]
-        scale, bias = (0.0 if at < 0 else float(np.sqrt(self.covariance[at, at])) for at in columns)
+        scale, bias = (
+            0.0 if at < 0 else float(np.sqrt(self.covariance[at, at])) for at in self.unknowns.columns(camera)[POSE:]
+        )
         return scale, bias
 
     @property
@@ -83,8 +84,7 @@ def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> 
     A = H_robot + np.column_stack(changes) @ axes.T
     values, vectors = np.linalg.eigh(0.5 * (A + A.T))
     error = np.sqrt(np.maximum(np.einsum("pk,pq,qk->k", vectors, M, vectors), 0.0))
-    surely = np.maximum(values, np.maximum(error / fixed.CALIBRATION_UNKNOWN, floor))
-    inverse = vectors / surely @ vectors.T
+    inverse = vectors / np.maximum(values, np.maximum(error / fixed.CALIBRATION_UNKNOWN, floor)) @ vectors.T
     covariance = fixed.CALIBRATION_INFLATION**2 * back @ inverse @ M @ inverse @ back.T
     return Certainty(unknowns=adjustment.unknowns, covariance=0.5 * (covariance + covariance.T), reach=reach)
 
@@ -111,8 +111,9 @@ def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:
 
 def middle_of(adjustment: Adjustment, camera: str) -> tuple[Float64, float]:
     """Middle (3,) [m] of a camera's points, in its frame, and their radius [m]."""
-    points = [view.points for view in adjustment.evidence.views if view.camera == camera]
-    cloud = np.concatenate([*points, np.zeros((0, 3))])
+    cloud = np.concatenate(
+        [*(view.points for view in adjustment.evidence.views if view.camera == camera), np.zeros((0, 3))]
+    )
     if not len(cloud):
         return np.array([0.0, 0.0, 1.0]), 0.3
     middle = np.median(cloud, axis=0)
@@ -155,8 +156,7 @@ def unobserved(certainty: Certainty, camera: str, T_world_camera: Float64, plane
 def _share(unknown: Float64, direction: Float64, T_world_camera: Float64) -> float:
     """Share of a direction (6,), world, in the unknown ones (6, K), camera frame."""
     R = T_world_camera[:3, :3].T
-    own = np.concatenate([R @ direction[:3], R @ direction[3:]])
-    return float(np.sum(np.square(unknown.T @ own)))
+    return float(np.sum(np.square(unknown.T @ np.concatenate([R @ direction[:3], R @ direction[3:]]))))
 
 
 def _named_directions(plane: Plane | None) -> Sequence[tuple[str, tuple[Float64, Float64]]]:

@@ -34,7 +34,7 @@ def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[s
     none is: the robot may be off.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
-    found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
+    found = {camera: _correct_camera(arm, its) for camera, its in by_camera.items()}
     rows = {camera: row for camera, row in found.items() if row is not None}
     if any(is_displaced(row) and not is_corrected(row) for row in rows.values()):
         return {
@@ -50,22 +50,20 @@ def is_displaced(row: Mapping[str, Any]) -> bool:
 
 
 def is_corrected(row: Mapping[str, Any]) -> bool:
-    """True if a row has a corrected pose."""
     return "T_recorded_camera" in row
 
 
 def placed(frame: RgbdFrame, cameras: Mapping[str, Mapping[str, Any]]) -> RgbdFrame:
     """The frame at its camera's corrected pose, if `cameras` has one."""
     row = cameras.get(frame.camera, {})
-    return _moved(frame, np.reshape(row["T_recorded_camera"], (4, 4))) if is_corrected(row) else frame
+    return _move(frame, np.reshape(row["T_recorded_camera"], (4, 4))) if is_corrected(row) else frame
 
 
-def _moved(frame: RgbdFrame, T_recorded_camera: Float64) -> RgbdFrame:
+def _move(frame: RgbdFrame, T_recorded_camera: Float64) -> RgbdFrame:
     return replace(frame, T_world_camera=frame.T_world_camera @ T_recorded_camera)
 
 
-def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
-    """A camera's row; each correction is measured and corrected in turn."""
+def _correct_camera(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
     found = displacement_of(arm, frames)
     if found is None:
         return None
@@ -75,13 +73,13 @@ def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
         return row
     left = row
     for _ in range(2):
-        found = displacement_of(arm, [_moved(frame, T) for frame in frames])
+        found = displacement_of(arm, [_move(frame, T) for frame in frames])
         if found is None:
             return row
         left, T = found[0], T @ found[1]
-    if left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED:
-        return row
-    if not _sees_links_in_place(arm, [_moved(frame, T) for frame in frames]):
+    if left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED or not _sees_links_in_place(
+        arm, [_move(frame, T) for frame in frames]
+    ):
         return row
     return row | {"left_mm": left["distance_mm"], "T_recorded_camera": T.ravel().tolist()}
 
@@ -130,10 +128,9 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, An
         return {"distance_mm": 1e3 * DISPLACED_WIDTH, "sigma_mm": 0.0, "num_pixels": len(points)}, T
     moved = points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]
     by_pose = np.hstack([np.cross(np.eye(POSE // 2), points.mean(axis=0)).T, np.eye(POSE // 2)])  # of their middle
-    variance = float(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T))
     return {
         "distance_mm": round(1e3 * float(np.sqrt(np.square(moved).sum(axis=1).mean())), 2),
-        "sigma_mm": round(1e3 * variance**0.5, 2),
+        "sigma_mm": round(1e3 * float(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T)) ** 0.5, 2),
         "num_pixels": len(points),
     }, T
 

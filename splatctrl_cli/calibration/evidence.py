@@ -56,7 +56,6 @@ class Unknowns:
 
     @property
     def size(self) -> int:
-        """The number P of unknowns."""
         return POSE * len(self.poses) + len(self.scales) + len(self.biases) + self.has_clock
 
     def columns(self, camera: str) -> Index:
@@ -71,13 +70,7 @@ class Unknowns:
             first += len(named)
         return at
 
-    @property
-    def clock_column(self) -> int:
-        """The clock's column, `HELD` if fixed."""
-        return self.size - 1 if self.has_clock else HELD
-
     def moved(self, estimate: Estimate, step: Float64) -> Estimate:
-        """The estimate after a step (P,)."""
         corrections, depth = dict(estimate.corrections), dict(estimate.depth)
         for camera in self.poses:
             corrections[camera] = corrections[camera] @ transform_of(step[self.columns(camera)[:POSE]])
@@ -140,7 +133,6 @@ class Arm:
         self.surface_poses = lru_cache(maxsize=REMEMBERED)(self._surface_poses)
 
     def is_posed(self, stamp_ns: int) -> bool:
-        """True if joint states are near a time [ns]."""
         return self._posture(stamp_ns) is not None
 
     def link_pose(self, link: str, stamp_ns: int) -> Float64 | None:
@@ -217,16 +209,12 @@ class Arm:
 
     def travel(self, stamps: list[int]) -> float:
         """The largest distance [m] of any link from its first pose."""
-        places = []
-        for stamp in stamps:
-            poses = self.surface_poses(stamp)
-            if poses is not None:
-                places.append(
-                    np.concatenate([poses[:, :3, 3], *[transform_points(T, 0.1 * np.eye(3)) for T in poses]])
-                )
-        if len(places) < 2:
-            return 0.0
-        return float(np.linalg.norm(np.array(places) - places[0], axis=2).max())
+        posed = [poses for stamp in stamps if (poses := self.surface_poses(stamp)) is not None]
+        places = [
+            np.concatenate([poses[:, :3, 3], *[transform_points(T, 0.1 * np.eye(3)) for T in poses]])
+            for poses in posed
+        ]
+        return 0.0 if len(places) < 2 else float(np.linalg.norm(np.array(places) - places[0], axis=2).max())
 
 
 def _velocities(before: Float64, after: Float64, poses: Float64, T_world_camera: Float64) -> Float64:
@@ -246,7 +234,6 @@ def _around(shows: Bool) -> tuple[tuple[slice, slice], tuple[int, int]]:
 
 
 def _inside_links(link: NDArray[np.int16], depth: Float32) -> Bool:
-    """Pixels whose neighbours show the same link, without a depth edge."""
     inside = np.zeros(link.shape, np.bool_)
     middle = link[1:-1, 1:-1]
     around = (link[1:-1, 2:], link[1:-1, :-2], link[2:, 1:-1], link[:-2, 1:-1])
@@ -271,7 +258,6 @@ class Evidence:
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """All cameras with a view or frame."""
         return tuple(sorted({v.camera for v in self.views} | {f.camera for f in self.frames}))
 
     @cached_property
@@ -348,7 +334,6 @@ def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
 
 
 def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
-    """The cameras whose recorded poses differ."""
     first: dict[str, Float64] = {}
     moving = set()
     for frame in frames:
@@ -372,15 +357,16 @@ def _step(frame: RgbdFrame, num_averaged: int) -> int:
 def _robot_near(frame: RgbdFrame, arm: Arm | None) -> Bool:
     """Pixels (h, w) where the robot may appear, despite pose errors."""
     poses = None if arm is None else arm.surface_poses(frame.stamp_ns)
-    if arm is None or poses is None:
-        return np.zeros(frame.depth.shape, np.bool_)
-    shown = arm.surface.render(poses, frame.intrinsics, frame.T_world_camera, frame.depth).depth
+    shown = np.zeros(frame.depth.shape, np.float32)
+    if arm is not None and poses is not None:
+        shown = arm.surface.render(poses, frame.intrinsics, frame.T_world_camera, frame.depth).depth
     if not (shown > 0).any():
         return np.zeros(frame.depth.shape, np.bool_)
     pixels = fixed.CALIBRATION_ASIDE * frame.intrinsics.fx / float(np.median(shown[shown > 0]))
     reach = min(pixels, len(shown) / 8)  # a hand close to its camera would leave nothing
-    window = np.ones((2 * int(np.ceil(reach)) + 1,) * 2, np.uint8)
-    return np.asarray(cv2.dilate((shown > 0).astype(np.uint8), window) > 0)
+    return np.asarray(
+        cv2.dilate((shown > 0).astype(np.uint8), np.ones((2 * int(np.ceil(reach)) + 1,) * 2, np.uint8)) > 0
+    )
 
 
 def _pairs(views: Sequence[DepthView], moving: frozenset[str]) -> list[tuple[int, int]]:

@@ -28,7 +28,6 @@ class GrayView:
 
 
 def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
-    """The frame's view at about `REFINE_ROWS` rows."""
     stride = max(1, round(frame.depth.shape[0] / fixed.REFINE_ROWS))
     depth = cv2.medianBlur(np.ascontiguousarray(frame.depth / np.float32(scale)), 5)
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
@@ -119,7 +118,7 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
         residuals=distance * weight,
         by_twists=by_twists(own, there, normals, T) * weight[:, None],
         own=number,
-        by_own=_stretched(own, normals, T) * weight,
+        by_own=np.einsum("ki,ki->k", normals @ T[:3, :3], own) * weight,  # a farther point moves along its ray
         other=v * b.gray.shape[1] + u,
         by_other=-np.einsum("ki,ki->k", normals, surface) * weight,
     )
@@ -137,15 +136,10 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
         residuals=np.concatenate([depth.residuals, difference * weight]),
         by_twists=np.vstack([depth.by_twists, by_twists(own, there, gradient, T) * weight[:, None]]),
         own=np.tile(depth.own, 2),
-        by_own=np.concatenate([depth.by_own, _stretched(own, gradient, T) * weight]),
+        by_own=np.concatenate([depth.by_own, np.einsum("ki,ki->k", gradient @ T[:3, :3], own) * weight]),
         other=np.tile(depth.other, 2),
         by_other=np.concatenate([depth.by_other, np.zeros(len(own))]),
     )
-
-
-def _stretched(own: Float64, gradient: Float64, T: Float64) -> Float64:
-    """Derivatives by log-depth (K,) of a value with gradient (K, 3), at T (4, 4)."""
-    return np.asarray(np.einsum("ki,ki->k", gradient @ T[:3, :3], own))
 
 
 def on_surface(
@@ -202,8 +196,9 @@ class BandRatios:
             for column in range(2):
                 place = (self.channels, self.pairs[:, row], self.pairs[:, column])
                 np.add.at(A, place, self.weights * (1.0 if row == column else -1.0))
-        logs = np.linalg.solve(A, b[..., None])[..., 0].T
-        return np.asarray(np.exp(logs).reshape(self.num_images, self.num_bands, 3))
+        return np.asarray(
+            np.exp(np.linalg.solve(A, b[..., None])[..., 0].T).reshape(self.num_images, self.num_bands, 3)
+        )
 
     def misfit(self, gains: Float64) -> float:
         """Median absolute residual of log ratios, for gains (N, B or 1, 3)."""
@@ -243,7 +238,9 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
             for channel in range(3):
                 some = ratios[is_of_pair & is_known[:, channel], channel]
                 if len(some) >= fixed.REFINE_FEWEST:
-                    found.append((channel, a, b, *_median_ratio(some)))
+                    ratio = float(np.median(some))
+                    spread = 1.4826 * float(np.median(np.abs(some - ratio)))
+                    found.append((channel, a, b, ratio, 1 / (fixed.EXPOSURE_ERROR**2 + spread**2 / len(some))))
     numbers, values = np.array([row[:3] for row in found], np.int64), np.array([row[3:] for row in found])
     numbers, values = numbers.reshape(-1, 3), values.reshape(-1, 2)
     return BandRatios(
@@ -254,12 +251,6 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
         ratios=values[:, 0],
         weights=values[:, 1],
     )
-
-
-def _median_ratio(ratios: Float64) -> tuple[float, float]:
-    ratio = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
-    return ratio, 1 / (fixed.EXPOSURE_ERROR**2 + spread**2 / len(ratios))
 
 
 def exposed(frame: RgbdFrame, gain: Float64) -> RgbdFrame:

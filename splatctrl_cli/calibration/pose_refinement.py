@@ -37,8 +37,9 @@ def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:
 
 def unbent(frame: RgbdFrame, grid: Float64) -> RgbdFrame:
     """The frame with disparity offsets (rows, columns) [1/m], bilinear, removed from depth."""
-    offset = (_weights(frame.depth.shape) @ grid.ravel()).reshape(frame.depth.shape)
-    factor, _ = stretch(frame.depth.astype(np.float64), offset)
+    factor, _ = stretch(
+        frame.depth.astype(np.float64), (_weights(frame.depth.shape) @ grid.ravel()).reshape(frame.depth.shape)
+    )
     return replace(frame, depth=(frame.depth * factor).astype(np.float32))
 
 
@@ -98,8 +99,7 @@ class BentViews:
         self._weights = {shape: _weights(shape) for shape in {view.gray.shape for view in self.recorded}}
         self._pixels = [_pixels(view) for view in self.recorded]
         self._basis, self._num = bends_alone(), max(self.cameras) + 1
-        prior = (_roughness() + np.eye(len(self._basis))) / fixed.BEND_PRIOR**2
-        self._prior = self._basis.T @ prior @ self._basis
+        self._prior = self._basis.T @ ((_roughness() + np.eye(len(self._basis))) / fixed.BEND_PRIOR**2) @ self._basis
         self._free = np.zeros((self._num, self._basis.shape[1]))
         self._bend()
 
@@ -124,8 +124,7 @@ class BentViews:
     def by_offsets(self, i: int, j: int, rows: Rows) -> csr_array:
         """(R, C G) derivatives of view i's residuals on view j by offsets."""
         size, parts = len(self._basis), []
-        own = self._pixels[i][rows.own]
-        for k, pixels, by_stretch in ((i, own, rows.by_own), (j, rows.other, rows.by_other)):
+        for k, pixels, by_stretch in ((i, self._pixels[i][rows.own], rows.by_own), (j, rows.other, rows.by_other)):
             if self.cameras[k] == HELD:
                 parts.append(csr_array((len(pixels), self._num * size)))
                 continue
@@ -145,7 +144,6 @@ class BentViews:
         )
 
     def move(self, step: Float64) -> None:
-        """Take a step in the free coordinates."""
         self._free += step.reshape(self._free.shape)
         self._bend()
 
@@ -252,22 +250,26 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
         return FoundBends()
     halves = [[view for view, of_half in zip(views, rank % 2 == k, strict=True) if of_half] for k in (0, 1)]
     told = [_joint(half, chosen, scale) for half in halves]
-    alike = {name: _likeness(told[0][name], told[1][name]) for name in chosen}
+    both = {name: (told[0][name], told[1][name]) for name in chosen}
+    alike = {
+        name: float(np.vdot(a, b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
+        for name, (a, b) in both.items()
+    }
     unlike = tuple(name for name in chosen if alike[name] < fixed.BEND_ALIKE)
     chosen = [name for name in chosen if name not in unlike]
     if not chosen:
         return FoundBends(unlike=unlike)
     gains = []
     for half, grids in zip(halves, reversed(told), strict=True):
-        kept = {name: grids[name] for name in chosen}
-        without, with_ = (refined_poses(part, scale).after for part in (half, freed(half, kept)))
+        without, with_ = (
+            refined_poses(part, scale).after for part in (half, freed(half, {name: grids[name] for name in chosen}))
+        )
         gains.append(1 - with_ / without if without else 0.0)
     is_told = min(gains) > fixed.BEND_GAIN
     return FoundBends(grids=_joint(views, chosen, scale) if is_told else {}, gains=tuple(gains), unlike=unlike)
 
 
 def freed(frames: Sequence[RgbdFrame], grids: Mapping[str, Float64]) -> list[RgbdFrame]:
-    """The frames without the bends of their cameras."""
     return [unbent(frame, grids[frame.camera]) if frame.camera in grids else frame for frame in frames]
 
 
@@ -283,10 +285,6 @@ def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) ->
     return dict(zip(cameras, np.round(bends.grids / scale, 7), strict=True))
 
 
-def _likeness(a: Float64, b: Float64) -> float:
-    return float(np.vdot(a, b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
-
-
 def _solved(
     views: Sequence[GrayView],
     recorded: Sequence[Float64],
@@ -294,7 +292,6 @@ def _solved(
     is_free: Bool,
     bends: BentViews | None = None,
 ) -> list[Float64]:
-    """Poses after rounds of narrowing width; `bends` are solved in place."""
     poses, column = list(recorded), np.cumsum(is_free) - 1
     size = POSE * int(is_free.sum())
     prior = np.tile(np.repeat(1 / np.square(fixed.REFINE_PRIOR), 3), int(is_free.sum()))

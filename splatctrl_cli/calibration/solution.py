@@ -12,8 +12,8 @@ from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Float64
 
-WIDE = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_REACHES)
-FREED = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_FREED)
+WIDE = tuple((reach, np.inf) for reach in fixed.CALIBRATION_REACHES)
+FREED = tuple((reach, np.inf) for reach in fixed.CALIBRATION_FREED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,6 @@ class Solution:
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Cameras whose pose is fixed."""
         unknowns = self.adjustment.unknowns
         return tuple(camera for camera in unknowns.cameras if camera not in unknowns.poses)
 
@@ -88,19 +87,18 @@ def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution
         held = replace(solution.estimate, clock=start.clock)
         still = Adjustment(adjustment.evidence, replace(unknowns, has_clock=False))
         solution = _solution(still, still.solved(held, [solution.widths]))
-    return _with_depths(solution)
+    return _add_depths(solution)
 
 
 def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]:
     """Misfits; inf with few comparable points, where a good fit means little."""
-    fits = [adjustment.cost(one, WIDE[-1].reach) for one in estimates]
+    fits = [adjustment.cost(one, WIDE[-1][0]) for one in estimates]
     most = max(num for _, num in fits)
     return [cost if 2 * num >= most else np.inf for cost, num in fits]
 
 
 def _better(a: Solution, b: Solution) -> Solution:
-    """The better of two solutions. Raises NotEvaluableError if they fit alike."""
-    (cost_a, num_a), (cost_b, num_b) = (one.adjustment.cost(one.estimate, WIDE[-1].reach) for one in (a, b))
+    (cost_a, num_a), (cost_b, num_b) = (one.adjustment.cost(one.estimate, WIDE[-1][0]) for one in (a, b))
     if 2 * num_a < num_b or 2 * num_b < num_a:
         return a if num_a > num_b else b
     if abs(cost_a - cost_b) < fixed.CALIBRATION_OTHER[1] * min(cost_a, cost_b):
@@ -123,7 +121,7 @@ def _solution(adjustment: Adjustment, estimate: Estimate) -> Solution:
 def narrow(adjustment: Adjustment, estimate: Estimate) -> Widths:
     """Final widths: Tukey's, by the residuals' actual spread."""
     spread = adjustment.normal(estimate, WIDE[-1]).spread
-    return Widths(reach=WIDE[-1].reach, cut=fixed.CALIBRATION_TUKEY * max(spread, fixed.CALIBRATION_LEAST_SPREAD))
+    return WIDE[-1][0], fixed.CALIBRATION_TUKEY * max(spread, fixed.CALIBRATION_LEAST_SPREAD)
 
 
 def _starts(unknowns: Unknowns, start: Estimate) -> list[Estimate]:
@@ -159,8 +157,7 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
                 group[name] = group[a]
     anchored = group[ROBOT] | {name for camera in evidence.moving for name in group[camera]}
     parts = list({id(part): part for name, part in group.items() if name != ROBOT}.values())
-    loose = [part for part in parts if not part & anchored]
-    if len(loose) + bool(anchored - {ROBOT}) < 2:
+    if sum(not part & anchored for part in parts) + bool(anchored - {ROBOT}) < 2:
         return
     names = " | ".join(sorted(", ".join(sorted(part - {ROBOT})) for part in parts))
     robot = "" if evidence.arm is None else ", nor the robot"
@@ -172,29 +169,29 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
     )
 
 
-def _with_depths(solution: Solution) -> Solution:
+def _add_depths(solution: Solution) -> Solution:
     """Solve again with clearly supported depth scales and biases.
 
     All are tried together, as others compensate for a wrong fixed one. The least certain are fixed one by one, until
     all left differ by `CALIBRATION_DEPTH_SURE[0]` sigmas.
     """
     unknowns = solution.adjustment.unknowns
-    tried = _freed(solution, replace(unknowns, scales=unknowns.poses, biases=unknowns.cameras))
-    off, covariance, free = _narrowed(tried)
-    solution = replace(solution, noticed=_noticed(tried, free))
+    tried = _free_depths(solution, replace(unknowns, scales=unknowns.poses, biases=unknowns.cameras))
+    off, covariance, free = _narrow_depths(tried)
+    solution = replace(solution, noticed=_find_noticed(tried, free))
     if not any(_is_sure(tried, at, off[at], covariance[at, at]) for at in free):
         return solution
     scales, biases = (
         [camera for camera in some if tried.adjustment.unknowns.columns(camera)[POSE + number] in free]
         for number, some in enumerate((unknowns.poses, unknowns.cameras))
     )
-    found = _freed(solution, replace(unknowns, scales=scales, biases=biases))
+    found = _free_depths(solution, replace(unknowns, scales=scales, biases=biases))
     most_scale, most_bias = fixed.CALIBRATION_DEPTH_MOST
     depths = map(found.estimate.depth_of, unknowns.cameras)
     return solution if any(abs(scale - 1) > most_scale or abs(bias) > most_bias for scale, bias in depths) else found
 
 
-def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
+def _narrow_depths(tried: Solution) -> tuple[Float64, Float64, list[int]]:
     """Depth unknowns' offsets (P,) from 1 or 0, covariance (P, P), and free columns.
 
     If a scale and a bias explain the same, the likelier stays (`CALIBRATION_DEPTH_USUAL`).
@@ -215,11 +212,11 @@ def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
         least = int(np.argmin(ratios))
         if ratios[least] >= fixed.CALIBRATION_DEPTH_SURE[0]:
             break
-        off, covariance = _with_held(off, covariance, free.pop(least))
+        off, covariance = _hold(off, covariance, free.pop(least))
     return off, covariance, free
 
 
-def _with_held(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
+def _hold(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
     """Estimates (P,) and covariance (P, P), with one fixed at 0."""
     gain = covariance[:, at] / max(covariance[at, at], np.finfo(float).tiny)
     return off - gain * off[at], _positive(covariance - np.outer(gain, covariance[at]))
@@ -231,7 +228,7 @@ def _positive(covariance: Float64) -> Float64:
     return covariance
 
 
-def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
+def _find_noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
     """Least |scale - 1| and |bias| [m] that would be noticed, by camera, or inf."""
     unknowns = tried.adjustment.unknowns
     held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
@@ -242,7 +239,7 @@ def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, flo
             covariance = tried.certainty.covariance
             for other in held if at >= 0 else ():
                 if other != at:
-                    covariance = _with_held(np.zeros(unknowns.size), covariance, other)[1]
+                    covariance = _hold(np.zeros(unknowns.size), covariance, other)[1]
             if at >= 0:
                 per_metre = 1.0 if number else max(_far(tried, camera), 1e-3)
                 sure = fixed.CALIBRATION_DEPTH_SURE[1] * float(np.sqrt(max(covariance[at, at], 0.0)))
@@ -252,7 +249,6 @@ def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, flo
 
 
 def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
-    """True if a scale or bias clearly differs from 1 or 0."""
     unknowns = tried.adjustment.unknowns
     camera = next(camera for camera in unknowns.cameras if at in unknowns.columns(camera))
     change = off if at == unknowns.columns(camera)[-1] else off * _far(tried, camera)
@@ -260,7 +256,7 @@ def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
     return bool(is_clear and abs(change) > fixed.CALIBRATION_DEPTH_LEAST)
 
 
-def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
+def _free_depths(solution: Solution, unknowns: Unknowns) -> Solution:
     """Solve again with scales and biases, from the best of several scales."""
     evidence = solution.adjustment.evidence
     adjustment, few = Adjustment(evidence, unknowns), Adjustment(evidence.thinned(), unknowns)
@@ -275,6 +271,7 @@ def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
 
 
 def _far(solution: Solution, camera: str) -> float:
-    seen = [view.points[:, 2] for view in solution.adjustment.evidence.views if view.camera == camera]
-    depths = np.concatenate(seen)
+    depths = np.concatenate(
+        [view.points[:, 2] for view in solution.adjustment.evidence.views if view.camera == camera]
+    )
     return float(np.percentile(depths, 90)) if len(depths) else 0.0

@@ -32,13 +32,12 @@ class DepthView:
 
     @classmethod
     def of(cls, frame: RgbdFrame, num_points: int, step: int = 1) -> "DepthView":
-        """A frame's view with at most `num_points` points; step: of `surface_normals`."""
         surface = back_project(frame.intrinsics, frame.depth)
         normals = surface_normals(surface, step)
         normals[bend(frame.depth, step) > fixed.CALIBRATION_CREASE * depth_sigma(frame.depth)] = 0.0
         known = np.flatnonzero(np.any(normals != 0, axis=-1))
         spread = np.linspace(0, len(known) - 1, min(num_points // 2, len(known))).astype(np.int64)
-        chosen = known[np.union1d(spread, _of_all_directions(normals.reshape(-1, 3)[known], num_points // 2))]
+        chosen = known[np.union1d(spread, _balance_directions(normals.reshape(-1, 3)[known], num_points // 2))]
         return cls(
             camera=frame.camera,
             stamp_ns=frame.stamp_ns,
@@ -51,7 +50,7 @@ class DepthView:
         )
 
 
-def _of_all_directions(normals: Float64, most: int) -> Index:
+def _balance_directions(normals: Float64, most: int) -> Index:
     """Numbers, in order, of at most `most` normals (N, 3), balanced over directions.
 
     A table outnumbers its objects, which alone constrain the camera along it. Normal-space sampling after

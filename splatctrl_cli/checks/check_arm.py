@@ -7,8 +7,8 @@ from itertools import combinations
 import numpy as np
 
 from splatctrl_cli.checks import limits
-from splatctrl_cli.checks.check_views import rescaled
-from splatctrl_cli.checks.clock_offset import ImageMotion, estimate_clock_offset, states_asked
+from splatctrl_cli.checks.check_views import rescale_remedy
+from splatctrl_cli.checks.clock_offset import ImageMotion, estimate_clock_offset, select_states
 from splatctrl_cli.checks.finding import Finding, note, warning
 from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.recording.log.state_columns import StateColumns
@@ -41,8 +41,7 @@ class ArmAgreement:
         return is_there and self.misfit <= limits.ARM_MISFIT
 
 
-def reduced(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Frames of at most `limits.ARM_ROWS` rows."""
+def thin_frames(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     strides = [max(1, -(-frame.depth.shape[0] // limits.ARM_ROWS)) for frame in frames]
     return [
         replace(f, depth=f.depth[::s, ::s], color=f.color[::s, ::s], intrinsics=strided_lens(f.intrinsics, s))
@@ -121,14 +120,12 @@ def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Post
     """Two joints whose exchange puts the arm where depth shows it, or None."""
     few = spread(frames, limits.SWAPPED_FRAMES)
     plain = arm_agreement(model, few, posture)
-    best: tuple[float, tuple[int, int]] | None = None
-    for i, j in combinations(range(model.num_joints), 2):
-        agreement = arm_agreement(model, few, _exchanged(posture, i, j))
-        if agreement is not None and agreement.is_good and (best is None or agreement.misfit < best[0]):
-            best = agreement.misfit, (i, j)
-    if best is None or plain is None or best[0] > limits.SWAPPED_MISFIT * plain.misfit:
-        return None
-    return best[1]
+    tried = (
+        (arm_agreement(model, few, _exchanged(posture, *p)), p) for p in combinations(range(model.num_joints), 2)
+    )
+    good = ((agreement.misfit, pair) for agreement, pair in tried if agreement is not None and agreement.is_good)
+    best = min(good, default=None)
+    return None if best is None or plain is None or best[0] > limits.SWAPPED_MISFIT * plain.misfit else best[1]
 
 
 def _exchanged(posture: Posture, i: int, j: int) -> Posture:
@@ -143,44 +140,6 @@ def _exchanged(posture: Posture, i: int, j: int) -> Posture:
     return exchanged
 
 
-def arm_finding(where: str, agreement: ArmAgreement, units: Iterable[float | None]) -> Finding:
-    """Finding of a camera that shows the arm in place or scaled (units: `rescaled`)."""
-    share = f"{100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
-    seen = f"in {agreement.num_frames} depth images {share} show what is behind it"
-    if agreement.is_good and agreement.scale is None:
-        return note(
-            "arm",
-            where,
-            f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); {seen}",
-            value=round(1e3 * agreement.median, 1),
-            unit="mm",
-        )
-    assert agreement.scale is not None
-    return warning(
-        "arm",
-        where,
-        f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say",
-        f"{rescaled(units, 1 / agreement.scale)}, or check --base and the camera's pose",
-        value=round(agreement.scale, 3),
-    )
-
-
-def misplaced_finding(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
-    """Finding of cameras that show the arm elsewhere; cause: the correction, or ""."""
-    where = f"camera{'s' if len(bad) > 1 else ''} {', '.join(bad)}"
-    off = ", ".join(f"{1e3 * agreement.misfit:.0f}" for agreement in bad.values())
-    through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
-    return warning(
-        "arm",
-        where,
-        f"the arm is not where the joints say: {off} mm off in the mean (each pixel counted as"
-        f" {1e3 * limits.ARM_NEAR:.0f} mm at most); {through} % of its pixels show what is behind it",
-        cause or "check the URDF, --base, the joints' zeros and the camera's pose; robot labels will be wrong",
-        value=round(1e3 * max(agreement.misfit for agreement in bad.values()), 1),
-        unit="mm",
-    )
-
-
 def motion_findings(
     frames: Sequence[RgbdFrame],
     motion: ImageMotion,
@@ -190,7 +149,7 @@ def motion_findings(
 ) -> list[Finding]:
     """Findings on joint states (in the model's order, if any) by the cameras.
 
-    frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescaled`.
+    frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescale_remedy`.
     """
     found: list[Finding] = []
     offsets: dict[str, float] = {}
@@ -198,18 +157,13 @@ def motion_findings(
         offsets, found = _arm_findings(model, frames, states, units)
     if offsets:
         return [*_timing_findings(offsets), *found]
-    asked = states.select(states_asked(states.stamp_ns, motion))
     if not motion.cameras:
         return found
-    offset = estimate_clock_offset(list(asked), motion)
+    offset = estimate_clock_offset(list(states.select(select_states(states.stamp_ns, motion))), motion)
     if offset.offset_s is None or offset.uncertainty_s is None:
         return [note("robot-clock", "joint states", offset.sentence), *found]
-    return [
-        _clock_finding(
-            "joint states", offset.sentence, offset.offset_s, limits.TIME_OFFSET + 2 * offset.uncertainty_s
-        ),
-        *found,
-    ]
+    least_s = limits.TIME_OFFSET + 2 * offset.uncertainty_s
+    return [_clock_finding("joint states", offset.sentence, offset.offset_s, least_s, 1e3 * offset.offset_s), *found]
 
 
 def _arm_findings(
@@ -221,7 +175,7 @@ def _arm_findings(
     timings: dict[str, tuple[float, float]] = {}
     bad: dict[str, ArmAgreement] = {}
     for camera in sorted({frame.camera for frame in frames}):
-        its = reduced([frame for frame in frames if frame.camera == camera])
+        its = thin_frames([frame for frame in frames if frame.camera == camera])
         where = f"camera {camera}"
         agreement = arm_agreement(model, its, posture)
         if agreement is None:
@@ -231,12 +185,47 @@ def _arm_findings(
         if timing is not None:
             timings[camera] = timing
             agreement = arm_agreement(model, its, posture, offset_s=timing[0]) or agreement
-        if agreement.is_good or agreement.scale is not None:
-            found.append(arm_finding(where, agreement, units))
+        if agreement.scale is not None:
+            found.append(
+                warning(
+                    "arm",
+                    where,
+                    f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say",
+                    f"{rescale_remedy(units, 1 / agreement.scale)}, or check --base and the camera's pose",
+                    value=round(agreement.scale, 3),
+                )
+            )
+        elif agreement.is_good:
+            found.append(
+                note(
+                    "arm",
+                    where,
+                    f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); in"
+                    f" {agreement.num_frames} depth images {100 * agreement.seen_through:.0f} % of"
+                    f" {agreement.num_pixels} pixels show what is behind it",
+                    value=round(1e3 * agreement.median, 1),
+                    unit="mm",
+                )
+            )
         else:
             bad[camera] = agreement
     if bad:
-        found.insert(0, misplaced_finding(bad, _swap(model, frames, posture)))
+        off = [1e3 * agreement.misfit for agreement in bad.values()]
+        through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
+        found.insert(
+            0,
+            warning(
+                "arm",
+                f"camera{'s' if len(bad) > 1 else ''} {', '.join(bad)}",
+                f"the arm is not where the joints say: {', '.join(f'{each:.0f}' for each in off)} mm off in the mean"
+                f" (each pixel counted as {1e3 * limits.ARM_NEAR:.0f} mm at most); {through} % of its pixels show"
+                " what is behind it",
+                _swap(model, frames, posture)
+                or "check the URDF, --base, the joints' zeros and the camera's pose; robot labels will be wrong",
+                value=round(max(off), 1),
+                unit="mm",
+            ),
+        )
     return _own_offsets(timings, model, frames, posture), found
 
 
@@ -247,8 +236,9 @@ def _own_offsets(
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():
-        its = reduced([frame for frame in frames if frame.camera == camera])
-        at_middle = arm_agreement(model, its, posture, offset_s=middle)
+        at_middle = arm_agreement(
+            model, thin_frames([frame for frame in frames if frame.camera == camera]), posture, offset_s=middle
+        )
         is_other = abs(offset_s - middle) > limits.TIME_OFFSET + limits.TIME_ERROR
         if not is_other or at_middle is None or misfit < limits.TIME_OWN * at_middle.misfit:
             kept[camera] = offset_s
@@ -256,7 +246,7 @@ def _own_offsets(
 
 
 def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> str:
-    pair = swapped_joints(model, reduced(frames), posture)
+    pair = swapped_joints(model, thin_frames(frames), posture)
     if pair is None:
         return ""
     a, b = (model.joint_names[i] for i in pair)
@@ -264,7 +254,6 @@ def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> s
 
 
 def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
-    """A finding for the common clock, and one per other camera."""
     middle = float(np.median(list(offsets.values())))
     apart = limits.TIME_OFFSET + limits.TIME_ERROR
     others = {c: offset for c, offset in offsets.items() if abs(offset - middle) > apart and len(offsets) > 2}
@@ -277,28 +266,20 @@ def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
 
 
 def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
-    error = limits.TIME_ERROR
-    return replace(
-        _clock_finding(
-            where,
-            f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * error:.0f} ms, by where"
-            f" depth shows the arm){rest}",
-            offset_s,
-            limits.TIME_OFFSET + error,
-        ),
-        value=round(1e3 * offset_s, 1),
+    return _clock_finding(
+        where,
+        f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * limits.TIME_ERROR:.0f} ms,"
+        f" by where depth shows the arm){rest}",
+        offset_s,
+        limits.TIME_OFFSET + limits.TIME_ERROR,
+        round(1e3 * offset_s, 1),
     )
 
 
-def _clock_finding(where: str, text: str, offset_s: float, least_s: float) -> Finding:
-    """A warning beyond `least_s` [s], else a note."""
-    is_off = abs(offset_s) > least_s
-    make = warning if is_off else note
-    return make(
-        "robot-clock",
-        where,
-        text,
-        LATE.format("late" if offset_s > 0 else "early") if is_off else "",
-        value=1e3 * offset_s,
-        unit="ms",
+def _clock_finding(where: str, text: str, offset_s: float, least_s: float, value: float) -> Finding:
+    """A warning beyond `least_s` [s], else a note; value: the offset [ms]."""
+    if abs(offset_s) <= least_s:
+        return note("robot-clock", where, text, "", value=value, unit="ms")
+    return warning(
+        "robot-clock", where, text, LATE.format("late" if offset_s > 0 else "early"), value=value, unit="ms"
     )

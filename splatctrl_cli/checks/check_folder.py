@@ -1,7 +1,7 @@
 """Checks of a capture or image folder in one pass, judged as logs are."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +16,16 @@ from splatctrl_cli.checks.check_times import TimesWatch, time_findings
 from splatctrl_cli.checks.check_views import are_far, check_views
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import (
+    ERROR,
+    NOTE,
+    WARNING,
     CheckReport,
     Finding,
-    Severity,
     damage_findings,
     error,
-    needs,
+    find_lacks,
+    judge,
     note,
-    warning,
 )
 from splatctrl_cli.config.fixed import SCALE_DEPTH
 from splatctrl_cli.errors import InputError
@@ -39,49 +41,40 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.scale import RecordedDepth
 
 
-@dataclass(frozen=True, kw_only=True)
-class Evidence:
-    """Data that a check keeps of a recording, in bounded memory.
-
-    frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
-    of the first images. states: in the model's order. cut: says that not all was read. is_guessed: the unit of
-    lengths is.
-    """
-
-    frames: Sequence[RgbdFrame]
-    depth_units: Mapping[str, float | None]
-    motion: ImageMotion
-    states: StateColumns | None
-    cut: str = ""
-    is_guessed: bool = False
-
-
-def judged(
-    report: CheckReport, evidence: Evidence, model: RobotModel | None, *, only_errors: bool = False
+def judge_frames(
+    report: CheckReport,
+    model: RobotModel | None,
+    *,
+    frames: Sequence[RgbdFrame],
+    depth_units: Mapping[str, float | None],
+    motion: ImageMotion,
+    states: StateColumns | None,
+    cut: str = "",
+    is_guessed: bool = False,
+    only_errors: bool = False,
 ) -> CheckReport:
     """Add findings on frames, and on frames against states, to a report.
 
-    only_errors: skip checks that yield only notes and warnings.
+    frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
+    of the first images. states: in the model's order. cut: says that not all was read. is_guessed: the unit of
+    lengths is. only_errors: skip checks that yield only notes and warnings.
     """
-    findings = [*report.findings, *alignment_findings(evidence.frames)]
-    frames, is_still = usable_frames(evidence.frames, findings), report.start_ns is None
+    findings = [*report.findings, *alignment_findings(frames)]
+    usable, is_still = usable_frames(frames, findings), report.start_ns is None
     wrong, scaled, corrected = check_views(
-        frames,
-        evidence.depth_units,
-        is_sure=not is_still or not (evidence.is_guessed or are_far(frames)),
-        only_errors=only_errors,
+        usable, depth_units, is_sure=not is_still or not (is_guessed or are_far(usable)), only_errors=only_errors
     )
     findings += wrong if only_errors else [*wrong, *exposure_findings(corrected)]
-    states = None if only_errors else evidence.states
-    if states is not None and not any(finding.code == "joints-degrees" for finding in findings):
-        findings += motion_findings(corrected, evidence.motion, states, model, evidence.depth_units.values())
-    findings += [note("quick", Path(report.path).name, evidence.cut)] if evidence.cut else []
+    is_known = states is not None and not any(finding.code == "joints-degrees" for finding in findings)
+    if states is not None and is_known and not only_errors:
+        findings += motion_findings(corrected, motion, states, model, depth_units.values())
+    findings += [note("quick", Path(report.path).name, cut)] if cut else []
     return replace(report, findings=findings, frames=scaled)
 
 
 def usable_frames(frames: Sequence[RgbdFrame], findings: Sequence[Finding]) -> list[RgbdFrame]:
     """Frames of cameras with correct lens and depth; others would seem misplaced."""
-    wrong = {f.where for f in findings if f.severity is Severity.ERROR and f.code in {"alignment", "principal-point"}}
+    wrong = {f.where for f in findings if f.severity is ERROR and f.code in {"alignment", "principal-point"}}
     return [frame for frame in frames if f"camera {frame.camera}" not in wrong]
 
 
@@ -98,30 +91,29 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
     gains = band_ratios(chosen, scale, is_free, 1).gains(is_free)
     rows = _rows(band_ratios(chosen, scale, is_free, limits.EXPOSURE_BANDS), gains)
     for camera in cameras:
-        is_own = [frame.camera == camera for frame in chosen]
+        is_own, where = [frame.camera == camera for frame in chosen], f"camera {camera}"
         own = gains[is_own, 0]
         ratio = float((own.max(axis=0) / own.min(axis=0)).max()) - 1
-        if ratio > limits.EXPOSURE_RATIO:
-            yield note(
-                "exposure",
-                f"camera {camera}",
-                f"one image shows a surface up to {100 * ratio:.0f} % brighter or more coloured than another",
-                "fix exposure and white balance in its driver;"
-                " 'reconstruct --refine-exposure' corrects a still scene",
-                value=round(100 * ratio, 1),
-                unit="%",
-            )
+        yield from judge(
+            NOTE if ratio > limits.EXPOSURE_RATIO else None,
+            "exposure",
+            where,
+            f"one image shows a surface up to {100 * ratio:.0f} % brighter or more coloured than another",
+            "fix exposure and white balance in its driver; 'reconstruct --refine-exposure' corrects a still scene",
+            value=round(100 * ratio, 1),
+            unit="%",
+        )
         uneven = float(np.exp(np.ptp(rows[is_own] - np.median(rows[is_own], axis=0), axis=1).max())) - 1
-        if uneven > limits.EXPOSURE_UNEVEN:
-            yield note(
-                "exposure-rows",
-                f"camera {camera}",
-                f"rows of one image differ in exposure by up to {100 * uneven:.0f} %, unlike those of its others",
-                "set the driver's anti-flicker to the mains frequency, or expose for whole periods of the lamp;"
-                " 'reconstruct --refine-exposure' has one gain for a whole image and leaves this as it is",
-                value=round(100 * uneven, 1),
-                unit="%",
-            )
+        yield from judge(
+            NOTE if uneven > limits.EXPOSURE_UNEVEN else None,
+            "exposure-rows",
+            where,
+            f"rows of one image differ in exposure by up to {100 * uneven:.0f} %, unlike those of its others",
+            "set the driver's anti-flicker to the mains frequency, or expose for whole periods of the lamp;"
+            " 'reconstruct --refine-exposure' has one gain for a whole image and leaves this as it is",
+            value=round(100 * uneven, 1),
+            unit="%",
+        )
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
@@ -137,11 +129,11 @@ def _rows(bands: BandRatios, gains: Float64) -> Float64:
     return np.asarray(logs - logs @ curves @ curves.T)
 
 
-_LOST = {
-    "unpaired_color": "colour images without a depth image of their time",
-    "unpaired_depth": "depth images without a colour image of their time",
-    "without_pose": "images without a pose",
-    "without_intrinsics": "images without intrinsics",
+_LOST = {  # the finding, and what was lost, by the field of a loss
+    "unpaired_color": ("pairing", "colour images without a depth image of their time"),
+    "unpaired_depth": ("pairing", "depth images without a colour image of their time"),
+    "without_pose": ("pose-missing", "images without a pose"),
+    "without_intrinsics": ("pairing", "images without intrinsics"),
 }
 
 
@@ -154,7 +146,6 @@ class _CameraWatch:
         self.poses: list[Float64] = []
 
     def add(self, stored: StoredFrame, motion: ImageMotion) -> None:
-        """Take a frame, decoding images if wanted."""
         self.times.add(stored.stamp_ns, stored.stamp_ns)
         self.stamps.append(stored.stamp_ns)
         self.poses.append(stored.T_world_camera)
@@ -189,7 +180,6 @@ def _read(
     motion: ImageMotion,
     num_images: int | None,
 ) -> bool:
-    """Take all (True), or at most `num_images` per camera."""
     for item in source.stored():
         if isinstance(item, JointState):
             states.add(item)
@@ -222,7 +212,7 @@ def check_folder(
             num_messages=0,
             start_ns=None,
             findings=[error("refused", path.name, wrong.message.removeprefix(f"{path}: "), wrong.remedy)],
-            needs=needs(num_cameras=0, num_frames=0, states_lack=""),
+            lacks=find_lacks(num_cameras=0, num_frames=0, states_lack=""),
         )
     cameras: dict[str, _CameraWatch] = {}
     states, motion, is_whole = StateCollector(len(source.joint_names)), ImageMotion(), True
@@ -246,31 +236,28 @@ def check_folder(
         of_states = robot_states(model, source.joint_names, logged)
         findings += of_states.findings
     stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
-    report = CheckReport(
-        path=str(path),
-        kind=kind,
-        duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
-        num_messages=len(stamps) + len(logged),
-        start_ns=min(stamps, default=None) if source.has_clock else None,
-        findings=findings,
-        rates=[camera.times.rate(is_read=True) for camera in cameras.values()] if source.has_clock else [],
-        needs=needs(
-            num_cameras=len(cameras),
-            num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
-            states_lack=of_states.lack,
-        ),
-    )
-    return judged(
-        report,
-        Evidence(
-            frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
-            depth_units={name: camera.images.scale for name, camera in cameras.items()},
-            motion=motion,
-            states=of_states.states,
-            is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
-            cut="" if is_whole else f"only the first {num_images} frames of a camera were read",
+    return judge_frames(
+        CheckReport(
+            path=str(path),
+            kind=kind,
+            duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
+            num_messages=len(stamps) + len(logged),
+            start_ns=min(stamps, default=None) if source.has_clock else None,
+            findings=findings,
+            rates=[camera.times.rate(is_read=True) for camera in cameras.values()] if source.has_clock else [],
+            lacks=find_lacks(
+                num_cameras=len(cameras),
+                num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
+                states_lack=of_states.lack,
+            ),
         ),
         of_states.model,
+        frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
+        depth_units={name: camera.images.scale for name, camera in cameras.items()},
+        motion=motion,
+        states=of_states.states,
+        is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
+        cut="" if is_whole else f"only the first {num_images} frames of a camera were read",
         only_errors=only_errors,
     )
 
@@ -281,14 +268,13 @@ def _losses(source: FrameSource, where: str) -> Iterator[Finding]:
         yield from damage_findings(where, loss.notes[:50])
     else:
         yield from (note("loss", where, text) for text in loss.notes[:50])
-    for name, words in _LOST.items():
+    for name, (code, words) in _LOST.items():
         count = getattr(loss, name)
-        if count:
-            code = "pose-missing" if name == "without_pose" else "pairing"
-            yield warning(code, where, f"{count} {words}", "they are left out", value=count)
-    if loss.invalid_depth:
-        text = f"{loss.invalid_depth} depth pixels are NaN, infinite, negative or 65535: they count as none"
-        yield note("depth-invalid", where, text, value=loss.invalid_depth)
+        yield from judge(
+            WARNING if count else None, code, where, f"{count} {words}", "they are left out", value=count
+        )
+    num, text = loss.invalid_depth, "depth pixels are NaN, infinite, negative or 65535: they count as none"
+    yield from judge(NOTE if num else None, "depth-invalid", where, f"{num} {text}", value=num)
 
 
 def _camera_findings(camera: _CameraWatch, *, has_clock: bool) -> Iterator[Finding]:

@@ -1,8 +1,9 @@
 """Checks of images: encodings, sizes, depth, and registration of depth to colour by edges."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import cv2
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_times import Thinned
-from splatctrl_cli.checks.finding import Finding, error, note, warning
+from splatctrl_cli.checks.finding import ERROR, NOTE, WARNING, Finding, error, judge, note
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
 from splatctrl_cli.records import MILLIMETRE, Float32, Float64, Intrinsics, RgbdFrame, UInt8
 
@@ -70,47 +71,42 @@ class ImageWatch:
     def add_color(self, stamp_ns: int, color: UInt8, encoding: str) -> None:
         """Take a colour image (H, W, 3)."""
         height, width = color.shape[:2]
-        self.add_undecoded(encoding, width, height)
-        self.num_decoded += 1
-        self._add_thumbnail(stamp_ns, color, cv2.INTER_AREA)
+        stride = stride_of(height)
+        size = (-(-width // stride), -(-height // stride))
+        self._add(stamp_ns, color, encoding, cv2.INTER_AREA)
         if self.kept.is_next():
-            stride = stride_of(height)
-            small = cv2.resize(color, (-(-width // stride), -(-height // stride)), interpolation=cv2.INTER_AREA)
-            self.kept.add(
-                Kept(
-                    stamp_ns=stamp_ns,
-                    stride=stride,
-                    width=width,
-                    height=height,
-                    pixels=np.asarray(small, dtype=np.uint8),
-                )
-            )
+            self._keep(stamp_ns, color, np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA), np.uint8))
 
     def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
         """Take a depth image (H, W) [m], 0 = none."""
-        height, width = depth.shape
-        self.add_undecoded(encoding, width, height)
-        self.num_decoded += 1
+        stride = stride_of(depth.shape[0])
+        small = depth[::stride, ::stride]
+        valid = small[small > 0]
+        self._add(stamp_ns, depth, encoding, cv2.INTER_NEAREST)
         self.num_invalid += num_invalid
         self.num_repeats += bool(depth.any()) and np.array_equal(depth, self._last_depth)
         self._last_depth = depth
-        stride = stride_of(height)
-        small = depth[::stride, ::stride]
-        valid = small[small > 0]
-        if self.shares.is_next():
-            self.shares.add(valid.size / small.size)
         self.num_without_depth += valid.size == 0
         self.constants.update(_constant(valid))
+        if self.shares.is_next():
+            self.shares.add(valid.size / small.size)
         if self.medians.is_next():
             self.medians.add(float(np.median(valid)) if valid.size else 0.0)
         if self.kept.is_next():
-            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, pixels=small.copy()))
-        self._add_thumbnail(stamp_ns, depth, cv2.INTER_NEAREST)
+            self._keep(stamp_ns, depth, small.copy())
 
-    def _add_thumbnail(self, stamp_ns: int, image: NDArray[Any], interpolation: int) -> None:
+    def _add(self, stamp_ns: int, image: NDArray[Any], encoding: str, interpolation: int) -> None:
+        height, width = image.shape[:2]
+        self.add_undecoded(encoding, width, height)
+        self.num_decoded += 1
         if len(self.thumbnails) < limits.THUMBNAILS:
-            size = thumbnail_size(image.shape[1], image.shape[0])
-            self.thumbnails.append((stamp_ns, cv2.resize(image, size, interpolation=interpolation)))
+            self.thumbnails.append(
+                (stamp_ns, cv2.resize(image, thumbnail_size(width, height), interpolation=interpolation))
+            )
+
+    def _keep(self, stamp_ns: int, image: NDArray[Any], small: NDArray[Any]) -> None:
+        height, width = image.shape[:2]
+        self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride_of(height), width=width, height=height, pixels=small))
 
     def rescale(self, scale: float) -> None:
         """Set the scale [m per count] of a log that names it."""
@@ -119,8 +115,8 @@ class ImageWatch:
         if factor != 1.0:
             self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
             self.medians[:] = [float(median * factor) for median in self.medians]
-            self.kept[:] = [replace(kept, pixels=_scaled(kept.pixels, factor)) for kept in self.kept]
-            self.thumbnails = [(stamp_ns, _scaled(image, factor)) for stamp_ns, image in self.thumbnails]
+            self.kept[:] = [replace(k, pixels=k.pixels * factor) if k.pixels.ndim == 2 else k for k in self.kept]
+            self.thumbnails = [(ns, image * factor if image.ndim == 2 else image) for ns, image in self.thumbnails]
 
     @property
     def is_float(self) -> bool:
@@ -136,11 +132,6 @@ class ImageWatch:
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
-
-
-def _scaled(image: NDArray[Any], factor: np.float32) -> NDArray[Any]:
-    """The image, times a factor if it is depth."""
-    return image * factor if image.ndim == 2 else image
 
 
 def _constant(depth: Float32) -> list[float]:
@@ -170,123 +161,120 @@ def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
     return Intrinsics(fx=lens.fx * across, fy=lens.fy * down, cx=cx, cy=cy, width=width, height=height)
 
 
-def image_findings(images: ImageWatch) -> Iterator[Finding]:
-    where = images.where
-    if images.num_bad:
-        severity = error if images.num_bad == images.count else warning
-        yield severity(
+def image_findings(images: ImageWatch) -> list[Finding]:
+    where, num_bad = images.where, images.num_bad
+    most = [(f"{width}x{height}", num) for (width, height), num in images.sizes.most_common(4)]
+    sizes, encodings = (
+        ", ".join(f"{kind} ({num})" for kind, num in kinds) for kinds in (most, images.encodings.most_common(4))
+    )
+    return [
+        *judge(
+            None if not num_bad else ERROR if num_bad == images.count else WARNING,
             "undecodable",
             where,
-            f"{images.num_bad} of {images.count} images do not decode; the first: {images.first_bad}",
-            value=images.num_bad,
+            f"{num_bad} of {images.count} images do not decode; the first: {images.first_bad}",
+            value=num_bad,
             stamp_ns=images.first_bad_ns,
-        )
-    if len(images.sizes) > 1:
-        sizes = ", ".join(f"{w}x{h} ({n})" for (w, h), n in images.sizes.most_common(4))
-        yield warning("image-size", where, f"the size of the images changes: {sizes}")
-    if len(images.encodings) > 1:
-        kinds = ", ".join(f"{name} ({n})" for name, n in images.encodings.most_common(4))
-        yield warning("encoding", where, f"the encoding of the images changes: {kinds}", "record one encoding")
-
-
-def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
-    """A note that not every image was decoded, if so."""
-    few = [images for images in topics if images.num_decoded + images.num_bad < images.count and images.num_decoded]
-    if not few:
-        return []
-    decoded, count = sum(images.num_decoded for images in few), sum(images.count for images in few)
-    return [
-        note(
-            "sampled",
-            "images",
-            f"{decoded} of {count} images were decoded, the first {limits.DECODED_IMAGES} of a topic and"
-            " fewer and fewer later; of the others only head, closing mark and checksum were read",
-            value=decoded / count,
-        )
+        ),
+        *judge(
+            WARNING if len(images.sizes) > 1 else None,
+            "image-size",
+            where,
+            f"the size of the images changes: {sizes}",
+        ),
+        *judge(
+            WARNING if len(images.encodings) > 1 else None,
+            "encoding",
+            where,
+            f"the encoding of the images changes: {encodings}",
+            "record one encoding",
+        ),
     ]
 
 
-def depth_findings(images: ImageWatch) -> Iterator[Finding]:
-    where = images.where
-    if images.num_without_depth:
-        every = images.num_without_depth == images.num_decoded
-        num = "all" if every else str(images.num_without_depth)
-        severity = error if every else warning
-        yield severity(
-            "depth-empty",
-            where,
-            f"{num} of {images.num_decoded} depth images hold no depth at all",
-            value=images.num_without_depth,
-        )
-        if every:
-            return
+def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
+    few = [images for images in topics if images.num_decoded + images.num_bad < images.count and images.num_decoded]
+    decoded, count = sum(images.num_decoded for images in few), sum(images.count for images in few)
+    return judge(
+        NOTE if few else None,
+        "sampled",
+        "images",
+        f"{decoded} of {count} images were decoded, the first {limits.DECODED_IMAGES} of a topic and"
+        " fewer and fewer later; of the others only head, closing mark and checksum were read",
+        value=decoded / max(count, 1),
+    )
+
+
+def depth_findings(images: ImageWatch) -> list[Finding]:
+    where, num, num_empty = images.where, images.num_decoded, images.num_without_depth
+    is_empty = 0 < num_empty == num
+    found = judge(
+        None if not num_empty else ERROR if is_empty else WARNING,
+        "depth-empty",
+        where,
+        f"{'all' if is_empty else num_empty} of {num} depth images hold no depth at all",
+        value=num_empty,
+    )
+    if is_empty:
+        return found
     share = float(np.median(images.shares))
-    if share < limits.SOME_DEPTH:
-        severity = warning if share < limits.LITTLE_DEPTH else note
-        yield severity(
-            "depth-share", where, f"{100 * share:.0f} % of the pixels have depth (median of the images)", value=share
-        )
-    if images.num_invalid:
-        yield note(
+    ((constant, times),) = images.constants.most_common(1) or [(0.0, 0)]
+    is_code = times and times >= limits.CONSTANT_IMAGES * num
+    return [
+        *found,
+        *judge(
+            None if share >= limits.SOME_DEPTH else WARNING if share < limits.LITTLE_DEPTH else NOTE,
+            "depth-share",
+            where,
+            f"{100 * share:.0f} % of the pixels have depth (median of the images)",
+            value=share,
+        ),
+        *judge(
+            NOTE if images.num_invalid else None,
             "depth-invalid",
             where,
-            f"{images.num_invalid} depth pixels of {images.num_decoded} images are NaN, infinite, negative or 65535"
+            f"{images.num_invalid} depth pixels of {num} images are NaN, infinite, negative or 65535"
             " (or a like code): they count as none",
             value=images.num_invalid,
-        )
-    for value, times in images.constants.most_common(1):
-        if times >= limits.CONSTANT_IMAGES * images.num_decoded:
-            of = f"the largest depth of {times} of {images.num_decoded} images"
-            yield warning(
-                "depth-constant",
-                where,
-                f"many pixels are exactly {value:.6g} m, {of}: a code for no return?",
-                value=value,
-                unit="m",
-            )
-    if images.num_repeats:
-        yield warning(
+        ),
+        *judge(
+            WARNING if is_code else None,
+            "depth-constant",
+            where,
+            f"many pixels are exactly {constant:.6g} m, the largest depth of {times} of {num} images: a code for no"
+            " return?",
+            value=constant,
+            unit="m",
+        ),
+        *judge(
+            WARNING if images.num_repeats else None,
             "depth-repeats",
             where,
-            f"{images.num_repeats} of {images.num_decoded} depth images equal the one before to the bit",
+            f"{images.num_repeats} of {num} depth images equal the one before to the bit",
             value=images.num_repeats,
-        )
-    yield from _scale(images)
+        ),
+        *_scale(images),
+    ]
 
 
 def _scale(images: ImageWatch) -> list[Finding]:
     medians = [median for median in images.medians if median > 0]
-    if not medians:
+    median, used = float(np.median(medians)) if medians else 0.0, images.unit or 1.0
+    (low, high), (near, far), counts = PLAUSIBLE_DEPTH, limits.TABLE_DEPTH, median / used
+    if not medians or near <= median <= far:
         return []
-    median = float(np.median(medians))
-    used = images.unit or 1.0
-    low, high = PLAUSIBLE_DEPTH
     if low <= median <= high:
-        near, far = limits.TABLE_DEPTH
-        if near <= median <= far:
-            return []
         text = f"median depth {median:.3g} m, read as {used:g} m per count: unusual for a robot's table"
         return [note("depth-scale", images.where, text, "if it is wrong, give --depth-scale", value=median, unit="m")]
-    counts = median / used
-    fits = [s for s in SCALES if limits.TABLE_DEPTH[0] <= counts * s <= limits.TABLE_DEPTH[1]]
-    guess = "millimetres stored as floats" if images.is_float and counts > high else ""
-    guess = "metres stored as integers" if not images.is_float and counts < 20 else guess
-    text = f"median depth {median:.4g} m, read as {used:g} m per count: expected {low:g} to {high:g} m"
-    text += f"; {guess}?" if guess else ""
-    return [
-        error(
-            "depth-scale",
-            images.where,
-            text,
-            f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]",
-            value=median,
-            unit="m",
-        )
-    ]
+    fits = [s for s in SCALES if near <= counts * s <= far]
+    is_large, is_small = images.is_float and counts > high, not images.is_float and counts < 20
+    guess = "; millimetres stored as floats?" if is_large else "; metres stored as integers?" if is_small else ""
+    text = f"median depth {median:.4g} m, read as {used:g} m per count: expected {low:g} to {high:g} m{guess}"
+    remedy = f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]"
+    return [error("depth-scale", images.where, text, remedy, value=median, unit="m")]
 
 
 def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
-    """Findings on colour-depth registration, by camera."""
     edges = {
         camera: [_spectra(f) for f in its[:: max(1, len(its) // limits.EDGE_FRAMES)][: limits.EDGE_FRAMES]]
         for camera in sorted({frame.camera for frame in frames})
@@ -295,35 +283,36 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
     found: list[Finding] = []
     others: dict[str, tuple[str, float, float]] = {}
     for camera, spectra in edges.items():
-        surface = np.mean([_correlation(color, depth) for color, depth in spectra], axis=0)
+        surface = _correlate(spectra)
         dv, du, peak, runner_up = _peak(surface)
         width = surface.shape[1]
         if max(peak, 0.0) >= limits.EDGE_CLEAR and peak >= limits.EDGE_AHEAD * runner_up:
             if max(abs(du), abs(dv)) > max(limits.EDGE_SHIFT * width, limits.EDGE_AROUND):
-                found.append(_shifted(f"camera {camera}", du, dv, width, peak))
+                share = 100 * max(abs(du), abs(dv)) / width
+                found.append(
+                    error(
+                        "alignment",
+                        f"camera {camera}",
+                        f"depth edges lie {-du:+d} px across and {-dv:+d} px down from colour edges in images {width}"
+                        f" px wide ({share:.1f} % of the width, correlation {peak:.2f} there): depth is not"
+                        " registered to colour",
+                        "record depth aligned to colour, or with its own frame and CameraInfo, that ingest may"
+                        " register it",
+                        value=max(abs(du), abs(dv)),
+                        unit="px",
+                    )
+                )
         elif (other := _other(camera, edges, _at_zero(surface))) is not None:
             others[camera] = other
-    return found + [_exchanged(camera, other, is_mutual=other[0] in others) for camera, other in others.items()]
+    exchanged = (_judge_exchange(camera, other, is_mutual=other[0] in others) for camera, other in others.items())
+    return [*found, *chain.from_iterable(exchanged)]
 
 
-def _shifted(where: str, du: int, dv: int, width: int, peak: float) -> Finding:
-    share = 100 * max(abs(du), abs(dv)) / width
-    return error(
-        "alignment",
-        where,
-        f"depth edges lie {-du:+d} px across and {-dv:+d} px down from colour edges in images {width} px wide"
-        f" ({share:.1f} % of the width, correlation {peak:.2f} there): depth is not registered to colour",
-        "record depth aligned to colour, or with its own frame and CameraInfo, that ingest may register it",
-        value=max(abs(du), abs(dv)),
-        unit="px",
-    )
-
-
-def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> Finding:
+def _judge_exchange(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> list[Finding]:
     """An error only if mutual: an exchange has two sides."""
     name, own, peak = other
-    severity = error if is_mutual else warning
-    return severity(
+    return judge(
+        ERROR if is_mutual else WARNING,
         "alignment",
         f"camera {camera}",
         f"its colour edges meet the depth edges of camera {name} (correlation {peak:.2f}), not its own ({own:.2f})",
@@ -335,10 +324,9 @@ def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool)
 def _other(
     camera: str, edges: dict[str, list[tuple[Float64, Float64]]], own: float
 ) -> tuple[str, float, float] | None:
-    """The camera whose depth clearly fits this one's colour, and both scores (own first)."""
     pairs = {name: list(zip(edges[camera], its, strict=False)) for name, its in edges.items() if name != camera}
     scores = {
-        name: _at_zero(np.mean([_correlation(a[0], b[1]) for a, b in its], axis=0))
+        name: _at_zero(_correlate([(a[0], b[1]) for a, b in its]))
         for name, its in pairs.items()
         if all(a[0].shape == b[1].shape for a, b in its)
     }
@@ -358,19 +346,21 @@ def _spectra(frame: RgbdFrame) -> tuple[Float64, Float64]:
     is_edge = (far - near > limits.EDGE_STEP * near) & (near < 1e8)
     is_edge[: limits.EDGE_BORDER] = is_edge[-limits.EDGE_BORDER :] = False
     is_edge[:, : limits.EDGE_BORDER] = is_edge[:, -limits.EDGE_BORDER :] = False
-    return _transformed(slope), _transformed(is_edge.astype(np.float32))
+    return _transform(slope), _transform(is_edge.astype(np.float32))
 
 
-def _transformed(image: Float32) -> Float64:
-    window = np.outer(np.hanning(image.shape[0]) ** 0.25, np.hanning(image.shape[1]) ** 0.25)
-    centred = (image - image.mean()) * window
+def _transform(image: Float32) -> Float64:
+    centred = (image - image.mean()) * np.outer(
+        np.hanning(image.shape[0]) ** 0.25, np.hanning(image.shape[1]) ** 0.25
+    )
     length = float(np.linalg.norm(centred))
     return np.asarray(np.fft.rfft2(centred / length if length > 0 else centred))
 
 
-def _correlation(color: Float64, depth: Float64) -> Float64:
-    """(h, w) by shift of colour against depth edges, zero in the middle."""
-    return np.fft.fftshift(np.fft.irfft2(color * np.conj(depth)))
+def _correlate(edges: Sequence[tuple[Float64, Float64]]) -> Float64:
+    """(h, w) mean by shift of colour against depth edges, zero in the middle."""
+    surfaces = [np.fft.fftshift(np.fft.irfft2(color * np.conj(depth))) for color, depth in edges]
+    return np.asarray(np.mean(surfaces, axis=0))
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:

@@ -2,15 +2,17 @@
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.checks.check_cameras import calibration_findings, camera_findings, tf_findings
-from splatctrl_cli.checks.check_folder import Evidence, judged
+from splatctrl_cli.checks.check_folder import judge_frames
 from splatctrl_cli.checks.check_images import (
     ImageWatch,
     Kept,
@@ -25,16 +27,26 @@ from splatctrl_cli.checks.check_times import (
     clock_findings,
     ending_findings,
     file_findings,
-    joined_gaps,
+    join_gaps,
     part_findings,
     peer_findings,
     time_findings,
 )
 from splatctrl_cli.checks.clock_offset import ImageMotion
-from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, needs, note, warning
+from splatctrl_cli.checks.finding import (
+    NOTE,
+    WARNING,
+    CheckReport,
+    Finding,
+    damage_findings,
+    error,
+    find_lacks,
+    judge,
+    note,
+)
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
-from splatctrl_cli.recording.calibrated import correction_of
+from splatctrl_cli.recording.calibrated import read_correction
 from splatctrl_cli.recording.container.raw_log import Damage, JoinedLog, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.cameras import image_topics
 from splatctrl_cli.recording.log.decoder import (
@@ -56,7 +68,7 @@ from splatctrl_cli.recording.log.messages import (
     num_invalid,
     read_image,
 )
-from splatctrl_cli.recording.log.registration import DepthToColor, TfTree
+from splatctrl_cli.recording.log.registration import TfTree, warp_depth
 from splatctrl_cli.recording.log.rig import Camera, build_cameras, camera_topics, check_mask_topics, missing
 from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.survey import Survey, survey
@@ -124,7 +136,6 @@ class LogWatch(JoinedLog):
             return  # the survey counts it
 
     def _is_headed(self, topic: Topic) -> bool:
-        """True if messages begin with a std_msgs/Header."""
         if topic not in self._headed:
             fields = [line.split("#")[0].strip() for line in topic.definition.splitlines()]
             first = next((line for line in fields if line), "")
@@ -167,10 +178,9 @@ class LogWatch(JoinedLog):
 
 def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
     """The camera as `ingest` builds it, or None (rig.missing says why)."""
-    try:
+    with suppress(InputError):
         return build_cameras(log, found, replace(options, cameras=(topics.name,)))[0]
-    except InputError:
-        return None
+    return None
 
 
 def reduced_frames(
@@ -200,23 +210,18 @@ def reduced_frames(
 
 
 def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
-    """Depth in the undistorted colour view, reduced."""
     depth, stride = kept.pixels, kept.stride
-    if camera.depth_to_color is not None:
+    if camera.depth_lens is not None and camera.T_color_depth is not None:
         stride = max(1, round(camera.intrinsics.height / kept.pixels.shape[0]))
-        warp = camera.depth_to_color
-        depth = DepthToColor(
-            depth_intrinsics=strided_lens(warp.depth_intrinsics, kept.stride),
-            color_intrinsics=strided_lens(camera.intrinsics, stride),
-            T_color_depth=warp.T_color_depth,
-        ).warp(depth)
-    elif camera.undistortion is not None:
-        depth = camera.undistortion.nearest(_enlarged(depth, kept))[::stride, ::stride]
+        own, target = strided_lens(camera.depth_lens.intrinsics, kept.stride), strided_lens(camera.intrinsics, stride)
+        depth = warp_depth(depth, own, target, camera.T_color_depth)
+    elif camera.maps is not None:
+        depth = camera.remap(_enlarge(depth, kept))[::stride, ::stride]
     pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
     if color is not None and color.pixels.ndim == 3:
         pixels = color.pixels
-        if camera.undistortion is not None:
-            pixels = camera.undistortion.color(_enlarged(pixels, color))[:: color.stride, :: color.stride]
+        if camera.maps is not None:
+            pixels = camera.remap(_enlarge(pixels, color), cv2.INTER_LINEAR)[:: color.stride, :: color.stride]
     if pixels.shape[:2] != depth.shape:
         pixels = np.zeros((*depth.shape, 3), np.uint8)
     return RgbdFrame(
@@ -229,7 +234,7 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
     )
 
 
-def _enlarged(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
+def _enlarge(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
     return np.repeat(np.repeat(image, kept.stride, axis=0)[: kept.height], kept.stride, axis=1)[:, : kept.width]
 
 
@@ -246,8 +251,7 @@ def image_motion(
 
 
 def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Depth with colour, where both share a view."""
-    gray = dict(watch.images[topics.color].thumbnails if camera.depth_to_color is None else ())
+    gray = dict(watch.images[topics.color].thumbnails if camera.depth_lens is None else ())
     at, frames = sorted(gray), []
     poses = {frame.stamp_ns: frame.T_world_camera for frame in sorted(posed, key=lambda frame: frame.stamp_ns)}
     for stamp, depth in watch.images[topics.depth].thumbnails:
@@ -295,16 +299,18 @@ def check_log(
     for topics, camera in rig:
         if camera is not None and camera.depth_scale is not None and topics.depth in watch.images:
             watch.images[topics.depth].rescale(camera.depth_scale)
-    findings += _time_findings(watch, found, cameras)
-    findings += _image_findings(watch, cameras, {t.topic.name for t in image_topics(found, "unlike")})
+    used = {name for camera in cameras for name in (camera.color, camera.depth)}
+    unused = watch.images.keys() - used if cameras else set()
+    findings += _time_findings(watch, found, cameras, unused)
+    findings += _image_findings(watch, unused, {t.topic.name for t in image_topics(found, "unlike")})
     findings += calibration_findings(found, cameras, watch.changed_infos)
     findings += tf_findings(found, cameras, options)
     for topics, camera in rig:
         findings += camera_findings(found, topics, camera, options)
     if any(finding.code == "pose-missing" for finding in findings):
         findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
-    findings += [error("missing", log.path.name, *_parted(lack)) for lack in _lacks(log, found, options)]
-    correction = correction_of(options, log.path.name)
+    findings += [error("missing", log.path.name, *_split_remedy(lack)) for lack in _lacks(log, found, options)]
+    correction = read_correction(options, log.path.name)
     late_ns = {c.name: correction.late_ns(c.name) for _, c in rig if correction is not None and c is not None}
     whole = [(topics, camera) for topics, camera in rig if camera is not None]
     frames = {c.name: reduced_frames(t, c, watch.images, found.tf, options, late_ns) for t, c in whole}
@@ -325,28 +331,25 @@ def check_log(
             t.rate(is_read=found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS))
             for name, t in sorted(watch.times.items())
         ],
-        needs=needs(
+        lacks=find_lacks(
             num_cameras=len(cameras),
             num_frames=max((images.count for images in watch.images.values()), default=0),
             states_lack=of_states.lack,
         ),
     )
-    return judged(
+    return judge_frames(
         report,
-        Evidence(
-            frames=list(chain.from_iterable(frames.values())),
-            depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
-            motion=image_motion(watch, whole, frames),
-            states=of_states.states,
-            cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
-        ),
         of_states.model,
+        frames=list(chain.from_iterable(frames.values())),
+        depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
+        motion=image_motion(watch, whole, frames),
+        states=of_states.states,
+        cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
         only_errors=only_errors,
     )
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The selected cameras. Raises InputError for unknown ones."""
     cameras = camera_topics(log, found, options)
     names = tuple(camera.name for camera in cameras)
     if not names:
@@ -357,14 +360,13 @@ def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraT
 
 
 def _lacks(log: RawLog, found: Survey, options: SourceOptions) -> list[str]:
-    """Obstacles to `ingest` that no other finding names."""
     if not found.num_messages:
         damage = "nothing usable before the damage" if found.damage.count else "the log holds no messages"
         return [f"{damage}; record it again, or give another file"]
     return [lack for lack in missing(log, found, options) if not any(words in lack for words in SAID)]
 
 
-def _parted(lack: str) -> tuple[str, str]:
+def _split_remedy(lack: str) -> tuple[str, str]:
     what, _, remedy = lack.rpartition("; ")
     return (what, remedy) if what else (remedy, "")
 
@@ -374,9 +376,11 @@ def _span(found: Survey) -> tuple[int, int]:
     return min((t.first_log_ns for t in entries), default=0), max((t.last_log_ns for t in entries), default=0)
 
 
-def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopics]) -> list[Finding]:
+def _time_findings(
+    watch: LogWatch, found: Survey, cameras: Sequence[CameraTopics], unused: Collection[str]
+) -> list[Finding]:
     names = [n for n, e in sorted(found.topics.items()) if e.topic.type_name in (*IMAGES, *STATE_TYPES)]
-    times = [watch.times[n] for n in names if n in watch.times and not _is_beside(watch, n, cameras)]
+    times = [watch.times[n] for n in names if n in watch.times and n not in unused]
     each = [f for t in times for f in time_findings(t, "images" if t.topic in watch.images else "states")]
     each += [
         replace(f, code="tf-gap") if f.code == "gap" else f
@@ -389,37 +393,24 @@ def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopic
     said = {finding.where for finding in clocks if finding.code == "clock-offset"}
     clocks += [f for topics in peers for f in peer_findings(topics) if f.where not in said]
     return [
-        *joined_gaps(each),
+        *join_gaps(each),
         *(part_findings(times) if not any(f.code in {"clock", "clock-offset"} for f in clocks) else ()),
         *clocks,
         *ending_findings(list(watch.transforms.values()), last_ns),
     ]
 
 
-def _is_beside(watch: LogWatch, name: str, cameras: Sequence[CameraTopics]) -> bool:
-    """True if no camera uses a topic's images."""
-    return bool(cameras) and name in watch.images and not any(name in (c.color, c.depth) for c in cameras)
-
-
-def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Collection[str]) -> list[Finding]:
-    """Findings on image topics; notes if no camera uses them. unlike: topics with only depth's encoding."""
-    findings = []
+def _image_findings(watch: LogWatch, unused: Collection[str], unlike: Collection[str]) -> list[Finding]:
+    findings, known = [], ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
     for name, images in sorted(watch.images.items()):
         its = list(image_findings(images))
         kinds = set(images.encodings)
         unread = sorted(kinds - set(DEPTH_ENCODINGS) - set(COLOR_CONVERSIONS))
-        if unread:
-            known = ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
-            its.append(
-                warning(
-                    "encoding",
-                    name,
-                    f"encoding {unread[0]!r} is not read",
-                    f"record another topic of this camera, or convert it; read: {known}",
-                )
-            )
-        if _is_beside(watch, name, cameras):
-            its = [replace(f, severity=Severity.NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
+        remedy = f"record another topic of this camera, or convert it; read: {known}"
+        text = f"encoding {', '.join(map(repr, unread[:1]))} is not read"
+        its += judge(WARNING if unread else None, "encoding", name, text, remedy)
+        if name in unused:
+            its = [replace(f, severity=NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
         elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded and name not in unlike:
             its += depth_findings(images)
         findings += its

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from splatctrl_cli.checks import limits
-from splatctrl_cli.checks.finding import Finding, error, note, warning
+from splatctrl_cli.checks.finding import ERROR, NOTE, WARNING, Finding, error, judge, note, warning
 from splatctrl_cli.config.fixed import STATES_STILL
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_if
 from splatctrl_cli.files.spilled_rows import blocks_of, ranges
 from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.recording.log.state_columns import StateColumns
@@ -47,7 +47,7 @@ class Spread:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PoseAgreement:
     """Logged end-effector poses against forward kinematics.
 
@@ -64,43 +64,40 @@ class PoseAgreement:
 
     @property
     def sentence(self) -> str:
-        start = f"{self.num_poses} logged end-effector poses"
         x, y, z = self.offset[:3, 3]
         by = f"({x:.4f}, {y:.4f}, {z:.4f}) m and {np.degrees(_angle(self.offset[:3, :3])):.1f} deg"
-        if self.verdict == "agree":
-            return f"{start} agree with {self.link}: {self.difference.words}"
-        if self.verdict == "tool":
-            return f"{start} stand at {by} in {self.link}: a flange or tool transform; beside it {self.rest.words}"
-        if self.verdict == "base":
-            return f"{start} are moved by {by} in the world: is --base right? beside it {self.rest.words}"
-        if self.verdict == "still":
-            return f"{start} cannot be judged: the robot hardly moves"
-        return (
-            f"{start} do not fit this robot, with any tool: {self.rest.words} from {self.link}; "
-            "wrong URDF, joint order, or units?"
-        )
+        words: dict[PoseVerdict, str] = {
+            "agree": f"agree with {self.link}: {self.difference.words}",
+            "tool": f"stand at {by} in {self.link}: a flange or tool transform; beside it {self.rest.words}",
+            "base": f"are moved by {by} in the world: is --base right? beside it {self.rest.words}",
+            "still": "cannot be judged: the robot hardly moves",
+            "disagree": f"do not fit this robot, with any tool: {self.rest.words} from {self.link}; "
+            "wrong URDF, joint order, or units?",
+        }
+        return f"{self.num_poses} logged end-effector poses {words[self.verdict]}"
 
 
 def check_states(states: StateColumns, joints: Sequence[str]) -> None:
     """Raise InputError for no states, decreasing stamps, too long a pause, or non-finite positions."""
     stamps = states.stamp_ns
-    if not len(stamps):
-        raise InputError("joint states: expected at least one, got none", remedy="check the log's /joint_states")
-    back = np.flatnonzero(np.diff(stamps) < 0)
+    refuse_if(
+        not len(stamps), "joint states: expected at least one, got none", remedy="check the log's /joint_states"
+    )
+    steps = np.diff(stamps)
+    back = np.flatnonzero(steps < 0)
     if len(back):
-        index = int(back[0]) + 1
+        before, after = stamps[back[0] : back[0] + 2]
         raise InputError(
-            f"joint state {index}: expected a stamp not before {stamps[index - 1]} ns, got {stamps[index]} ns",
+            f"joint state {back[0] + 1}: expected a stamp not before {before} ns, got {after} ns",
             remedy="sort the states by stamp",
         )
-    pauses = np.diff(stamps)
-    if len(pauses) and pauses.max() > limits.STATES_PAUSE * 1e9:
-        index = int(np.argmax(pauses)) + 1
-        raise InputError(
-            f"joint states: mixed clocks: stamps jump by {pauses[index - 1] * 1e-9:.0f} s at state {index} of "
-            f"{len(stamps)}",
-            remedy="cut the log there, or give all states the times of one clock",
-        )
+    pause = steps.max(initial=0)
+    refuse_if(
+        pause > limits.STATES_PAUSE * 1e9,
+        f"joint states: mixed clocks: stamps jump by {pause * 1e-9:.0f} s at state"
+        f" {int(np.argmax(np.append(0, steps)))} of {len(stamps)}",
+        remedy="cut the log there, or give all states the times of one clock",
+    )
     for first, last in ranges(len(stamps)):
         q = states.position[first:last]
         if not np.isfinite(q).all():
@@ -164,20 +161,20 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
     near = min(links, key=lambda link: _cost(_spread(links[link], logged)))
     difference = _spread(links[near], logged)
     if difference.is_small:
-        return _agreement("agree", near, len(chosen), difference, np.eye(4), difference)
-    tools = {link: _explained(poses, logged) for link, poses in links.items()}
-    bases = {link: _explained(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
+        return PoseAgreement("agree", near, len(chosen), difference, np.eye(4), difference)
+    tools = {link: _explain(poses, logged) for link, poses in links.items()}
+    bases = {link: _explain(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
     tool = min(tools, key=lambda link: (round(_cost(tools[link][1]), 6), _cost(_spread(links[link], logged))))
     base = min(bases, key=lambda link: _cost(bases[link][1]))
     travel = _spread(np.broadcast_to(logged[0], logged.shape), logged)
     if max(travel.max_position, travel.max_rotation) < limits.LINK_TRAVEL:
-        return _agreement("still", near, len(chosen), difference, np.eye(4), difference)
+        return PoseAgreement("still", near, len(chosen), difference, np.eye(4), difference)
     if tools[tool][1].is_small:
-        return _agreement("tool", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+        return PoseAgreement("tool", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
     if bases[base][1].is_small:
         offset, rest = bases[base]
-        return _agreement("base", base, len(chosen), _spread(links[base], logged), invert_transform(offset), rest)
-    return _agreement("disagree", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+        return PoseAgreement("base", base, len(chosen), _spread(links[base], logged), invert_transform(offset), rest)
+    return PoseAgreement("disagree", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
 
 
 def _posed(states: Sequence[JointState]) -> Index:
@@ -187,12 +184,6 @@ def _posed(states: Sequence[JointState]) -> Index:
     return np.flatnonzero(np.fromiter(has_pose, dtype=np.bool_, count=len(states)))
 
 
-def _agreement(
-    verdict: PoseVerdict, link: str, num: int, difference: Spread, offset: Float64, rest: Spread
-) -> PoseAgreement:
-    return PoseAgreement(verdict=verdict, link=link, num_poses=num, difference=difference, offset=offset, rest=rest)
-
-
 def _world(model: RobotModel, state: JointState) -> Float64:
     if state.T_world_ee is not None:
         return state.T_world_ee
@@ -200,7 +191,7 @@ def _world(model: RobotModel, state: JointState) -> Float64:
     return np.asarray(model.T_world_base @ state.T_base_ee)
 
 
-def _explained(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
+def _explain(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
     """X (4, 4) of logged = poses X, by mean rotation and median position; rest."""
     relative = _inverse(poses) @ logged
     U, _, Vt = np.linalg.svd(relative[:, :3, :3].sum(axis=0))
@@ -292,59 +283,48 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
 
 
 def stream_findings(where: str, stream: JointStream) -> Iterator[Finding]:
-    """Findings on a topic's states of the same joints, as recorded."""
     position = stream.columns().get("position")
     if position is None:
         return
-    num_bad, first_bad, joint = 0, 0, 0
+    num_bad = at = 0
+    first_bad, joint = None, 0
     lowest, highest = np.full(len(stream.names), np.inf), np.full(len(stream.names), -np.inf)
-    at = 0
     for block in blocks_of(position):
         is_bad = ~np.isfinite(block)
         rows = np.flatnonzero(is_bad.any(axis=1))
         if len(rows) and not num_bad:
-            first_bad, joint = at + int(rows[0]), int(np.argmax(is_bad[rows[0]]))
+            first_bad, joint = int(stream.stamp_ns[at + rows[0]]), int(np.argmax(is_bad[rows[0]]))
         num_bad += len(rows)
         lowest = np.fmin(lowest, np.where(is_bad, np.inf, block).min(axis=0, initial=np.inf))
         highest = np.fmax(highest, np.where(is_bad, -np.inf, block).max(axis=0, initial=-np.inf))
         at += len(block)
-    if num_bad:
-        yield warning(
-            "joints-nan",
-            where,
-            f"{num_bad} of {at} states hold a position that is NaN or infinite; the first: {stream.names[joint]}",
-            value=num_bad,
-            stamp_ns=int(stream.stamp_ns[first_bad]),
-        )
     widest = np.maximum(np.abs(lowest), np.abs(highest))
-    if np.isfinite(widest).any() and float(widest[np.isfinite(widest)].max()) > DEGREES:
-        worst = int(np.argmax(np.where(np.isfinite(widest), widest, 0)))
-        yield error(
-            "joints-degrees",
-            where,
-            f"{stream.names[worst]} reaches {widest[worst]:.4g}: degrees, not radians?",
-            _unit_remedy(stream.names),
-            value=widest[worst],
-        )
-    yield from _velocities(where, stream, bool((highest - lowest > STATES_STILL).any()))
-
-
-def _velocities(where: str, stream: JointStream, is_moving: bool) -> list[Finding]:
-    if not is_moving:
-        return [note("joints-still", where, "no joint moves")]
+    widest = np.where(np.isfinite(widest), widest, 0.0)
+    worst = int(np.argmax(widest))
+    yield from judge(
+        WARNING if num_bad else None,
+        "joints-nan",
+        where,
+        f"{num_bad} of {at} states hold a position that is NaN or infinite; the first: {stream.names[joint]}",
+        value=num_bad,
+        stamp_ns=first_bad,
+    )
+    yield from judge(
+        ERROR if widest[worst] > DEGREES else None,
+        "joints-degrees",
+        where,
+        f"{stream.names[worst]} reaches {widest[worst]:.4g}: degrees, not radians?",
+        _unit_remedy(stream.names),
+        value=widest[worst],
+    )
     velocity = stream.columns().get("velocity")
-    if velocity is None:
-        return [note("joints-velocity", where, "no velocities were recorded: the change of the positions is taken")]
-    if all(not np.any(np.nan_to_num(block)) for block in blocks_of(velocity)):
-        return [
-            warning(
-                "joints-velocity",
-                where,
-                "all velocities are zero while joints move: the change of the positions is taken",
-                "let the driver fill them in",
-            )
-        ]
-    return []
+    if not (highest - lowest > STATES_STILL).any():
+        yield note("joints-still", where, "no joint moves")
+    elif velocity is None:
+        yield note("joints-velocity", where, "no velocities were recorded: the change of the positions is taken")
+    elif all(not np.any(np.nan_to_num(block)) for block in blocks_of(velocity)):
+        text = "all velocities are zero while joints move: the change of the positions is taken"
+        yield warning("joints-velocity", where, text, "let the driver fill them in")
 
 
 def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) -> list[Finding]:
@@ -353,22 +333,14 @@ def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) 
         check_angles(model, states, where)
     except InputError as wrong:
         return [error("joints-degrees", where, wrong.message, wrong.remedy)]
-    found = _limits(model, states, where)
     agreement = pose_agreement(model, states)
-    if agreement is not None and agreement.verdict != "still":
-        is_good = agreement.verdict in {"agree", "tool"}
-        make = note if is_good else error
-        found.append(
-            make(
-                "end-effector",
-                where,
-                agreement.sentence,
-                "" if is_good else "give the URDF of this very robot, and its --base",
-                value=1e3 * agreement.difference.median_position,
-                unit="mm",
-            )
-        )
-    return found
+    if agreement is None or agreement.verdict == "still":
+        return _limits(model, states, where)
+    severity = NOTE if agreement.verdict in {"agree", "tool"} else ERROR
+    remedy = "" if severity is NOTE else "give the URDF of this very robot, and its --base"
+    value = 1e3 * agreement.difference.median_position
+    found = judge(severity, "end-effector", where, agreement.sentence, remedy, value=value, unit="mm")
+    return [*_limits(model, states, where), *found]
 
 
 def _limits(model: RobotModel, states: Sequence[JointState], where: str) -> list[Finding]:
@@ -380,9 +352,8 @@ def _limits(model: RobotModel, states: Sequence[JointState], where: str) -> list
         if beyond.max() > limits.LIMIT_SLACK:
             num += 1
             first = state.stamp_ns if first is None else first
-    if first is None:
-        return []
     joint = int(np.argmax(worst))
     text = f"{num} of {len(states)} states are beyond the URDF's limits"
-    text += f", {model.joint_names[joint]} by {worst[joint]:.3g}"
-    return [warning("joints-limits", where, text, value=worst[joint], unit="rad", stamp_ns=first)]
+    text = f"{text}, {model.joint_names[joint]} by {worst[joint]:.3g}"
+    severity = None if first is None else WARNING
+    return judge(severity, "joints-limits", where, text, value=worst[joint], unit="rad", stamp_ns=first)

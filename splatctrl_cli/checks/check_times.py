@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from splatctrl_cli.checks import limits
-from splatctrl_cli.checks.finding import Finding, Rate, error, note, warning
+from splatctrl_cli.checks.finding import ERROR, NOTE, WARNING, Finding, Rate, judge, warning
 from splatctrl_cli.records import Float64
 
 _NS = 1e-9
@@ -111,42 +111,55 @@ class TimesWatch:
         )
 
 
-def time_findings(times: TimesWatch, what: str = "messages") -> Iterator[Finding]:
-    where = times.topic
+def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
+    where, count = times.topic, times.count
     if times.num_zero:
-        text = f"{times.num_zero} of {times.count} header stamps are 0"
-        make = error if times.num_zero == times.count and what != "states" else warning
-        if what == "states":
-            text = f"{text}; the times of logging are taken where all are"
-        yield make("stamp-zero", where, text, value=times.num_zero)
-        return
-    gaps = times.gaps()
-    if gaps and times.median_interval is not None:
-        longest, at = max(gaps)
-        lost = sum(round(interval / times.median_interval) - 1 for interval, _ in gaps)
-        gaps_of = f"a gap of {longest:.3g} s" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest {longest:.3g} s"
-        text = f"{gaps_of}; about {lost} {what} are missing"
-        yield warning("gap", where, text, value=longest, unit="s", stamp_ns=at)
-    if times.num_duplicates:
-        text = f"{times.num_duplicates} of {times.count} stamps repeat the one before"
-        first = times.first_duplicate_ns
-        yield warning("stamp-repeats", where, text, value=times.num_duplicates, stamp_ns=first)
-    if times.num_back:
-        text = f"stamps go back {times.num_back} times, by up to {times.furthest_back:.3g} s"
-        first = times.first_back_ns
-        yield warning("stamp-back", where, text, value=times.furthest_back, unit="s", stamp_ns=first)
+        text = f"{times.num_zero} of {count} header stamps are 0"
+        text = f"{text}; the times of logging are taken where all are" if what == "states" else text
+        severity = ERROR if times.num_zero == count and what != "states" else WARNING
+        return judge(severity, "stamp-zero", where, text, value=times.num_zero)
+    gaps, median = times.gaps(), times.median_interval or 1.0
+    longest, at = max(gaps, default=(0.0, 0))
+    lost = sum(round(interval / median) - 1 for interval, _ in gaps)
+    gaps_of = f"a gap of {longest:.3g} s" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest {longest:.3g} s"
+    return [
+        *judge(
+            WARNING if gaps else None,
+            "gap",
+            where,
+            f"{gaps_of}; about {lost} {what} are missing",
+            value=longest,
+            unit="s",
+            stamp_ns=at,
+        ),
+        *judge(
+            WARNING if times.num_duplicates else None,
+            "stamp-repeats",
+            where,
+            f"{times.num_duplicates} of {count} stamps repeat the one before",
+            value=times.num_duplicates,
+            stamp_ns=times.first_duplicate_ns,
+        ),
+        *judge(
+            WARNING if times.num_back else None,
+            "stamp-back",
+            where,
+            f"stamps go back {times.num_back} times, by up to {times.furthest_back:.3g} s",
+            value=times.furthest_back,
+            unit="s",
+            stamp_ns=times.first_back_ns,
+        ),
+    ]
 
 
-def joined_gaps(findings: list[Finding]) -> list[Finding]:
+def join_gaps(findings: list[Finding]) -> list[Finding]:
     """Findings, with common pauses of topics and transforms joined."""
     kept = [f for f in findings if f.code not in {"gap", "tf-gap"}]
     groups: list[list[Finding]] = []
     for finding in (f for f in findings if f.code in {"gap", "tf-gap"}):
-        group = next((g for g in groups if _overlap(g[0], finding)), None)
-        if group is None:
-            groups.append([finding])
-        else:
-            group.append(finding)
+        group = next((g for g in groups if _overlap(g[0], finding)), [])
+        groups += [] if group else [group]
+        group.append(finding)
     return [*(group[0] if len(group) == 1 else _joined(group) for group in groups), *kept]
 
 
@@ -167,22 +180,20 @@ def _joined(group: list[Finding]) -> Finding:
 
 def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
     """Files logged far apart; spans: first and last log time [ns]."""
-    found = []
     ordered = sorted((span, name) for name, span in spans.items() if name)
-    for (before, name), (after, other) in pairwise(ordered):
-        pause = (after[0] - before[1]) * _NS
-        if pause > limits.FILES_APART:
-            found.append(
-                warning(
-                    "files-apart",
-                    "files",
-                    f"between {name} and {other} nothing was logged for {pause:.4g} s",
-                    value=pause,
-                    unit="s",
-                    stamp_ns=before[1],
-                )
-            )
-    return found
+    pauses = [((after[0] - before[1]) * _NS, before[1], a, b) for (before, a), (after, b) in pairwise(ordered)]
+    return [
+        warning(
+            "files-apart",
+            "files",
+            f"between {name} and {other} nothing was logged for {pause:.4g} s",
+            value=pause,
+            unit="s",
+            stamp_ns=at,
+        )
+        for pause, at, name, other in pauses
+        if pause > limits.FILES_APART
+    ]
 
 
 def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
@@ -194,18 +205,9 @@ def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
     if not ended:
         return []
     first = min(ended, key=lambda edge: edge.last_ns)
-    early = (last_ns - first.last_ns) * _NS
-    more = f" and {len(ended) - 1} more" if len(ended) > 1 else ""
-    return [
-        warning(
-            "tf-ends",
-            f"{first.topic}{more}",
-            f"ends {early:.3g} s before the last image: frames below it have no pose from then on",
-            value=early,
-            unit="s",
-            stamp_ns=first.last_ns,
-        )
-    ]
+    early, more = (last_ns - first.last_ns) * _NS, f" and {len(ended) - 1} more" if len(ended) > 1 else ""
+    text = f"ends {early:.3g} s before the last image: frames below it have no pose from then on"
+    return [warning("tf-ends", f"{first.topic}{more}", text, value=early, unit="s", stamp_ns=first.last_ns)]
 
 
 def part_findings(topics: list[TimesWatch]) -> Iterator[Finding]:
@@ -213,81 +215,72 @@ def part_findings(topics: list[TimesWatch]) -> Iterator[Finding]:
     several = [t for t in topics if t.count > 2 and t.median_interval is not None]
     first, last = (min((t.first_ns for t in several), default=0), max((t.last_ns for t in several), default=0))
     for times in several:
-        least = max(limits.ENDS_EARLY, 3 * (times.median_interval or 0.0))
+        least, much = (
+            max(limits.ENDS_EARLY, 3 * (times.median_interval or 0.0)),
+            limits.ENDS_MUCH * (last - first) * _NS,
+        )
         begins, ends = (times.first_ns - first) * _NS, (last - times.last_ns) * _NS
-        for seconds, words, at in ((begins, "begins", times.first_ns), (ends, "ends", times.last_ns)):
-            if seconds > least:
-                side = "after the first" if words == "begins" else "before the last"
-                make = warning if seconds > limits.ENDS_MUCH * (last - first) * _NS else note
-                yield make(
-                    "part",
-                    times.topic,
-                    f"{words} {seconds:.3g} s {side} of the other topics",
-                    value=seconds,
-                    unit="s",
-                    stamp_ns=at,
-                )
+        for seconds, words, side, at in (
+            (begins, "begins", "after the first", times.first_ns),
+            (ends, "ends", "before the last", times.last_ns),
+        ):
+            severity = None if seconds <= least else WARNING if seconds > much else NOTE
+            text = f"{words} {seconds:.3g} s {side} of the other topics"
+            yield from judge(severity, "part", times.topic, text, value=seconds, unit="s", stamp_ns=at)
 
 
 def peer_findings(topics: list[TimesWatch]) -> Iterator[Finding]:
     """Topics whose log delay differs from the other cameras'."""
     stamped = [t for t in topics if t.delay is not None and t.count > 1]
-    if len(stamped) < 3:
-        return
-    for times in stamped:
+    for times in stamped if len(stamped) > 2 else ():
         own = times.delays[:, 1]
         others = np.array([t.delay for t in stamped if t is not times], dtype=np.float64)
         apart = float(np.median(own) - np.median(others))
-        spread = float(np.median(np.abs(own - np.median(own))))
-        if max(limits.PEERS_APART, 5 * spread, 3 * float(np.ptp(others))) < abs(apart) <= limits.DELAYS_APART:
-            value, at = round(1e3 * apart, 1), times.first_ns
-            yield warning(
-                "clock-offset",
-                times.topic,
-                f"stamps are {1e3 * abs(apart):.0f} ms {'before' if apart > 0 else 'after'} those of the other"
-                " cameras' images, as logged",
-                "is its clock synchronised (PTP, chrony), or is its stream only slower? compare what moves",
-                value=value,
-                unit="ms",
-                stamp_ns=at,
-            )
+        least = max(limits.PEERS_APART, 5 * float(np.median(np.abs(own - np.median(own)))), 3 * float(np.ptp(others)))
+        yield from judge(
+            WARNING if least < abs(apart) <= limits.DELAYS_APART else None,
+            "clock-offset",
+            times.topic,
+            f"stamps are {1e3 * abs(apart):.0f} ms {'before' if apart > 0 else 'after'} those of the other"
+            " cameras' images, as logged",
+            "is its clock synchronised (PTP, chrony), or is its stream only slower? compare what moves",
+            value=round(1e3 * apart, 1),
+            unit="ms",
+            stamp_ns=times.first_ns,
+        )
 
 
 def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
     """Header stamps against log times: another clock, offset, drift."""
-    stamped = [t for t in topics if t.delay is not None and t.count > 1]
+    stamped = [(t, t.delay) for t in topics if t.delay is not None and t.count > 1]
     if not stamped:
         return []
-    delays = [t.delay for t in stamped if t.delay is not None]
-    common = float(np.median(delays))
-    if abs(common) > limits.STAMP_DELAYED and max(abs(delay - common) for delay in delays) <= limits.DELAYS_APART:
-        found = [
-            note(
-                "clock",
-                "all topics",
-                f"header stamps are of another clock than the log's, {common:+.4g} s apart, the same for all topics"
-                " (a played log, or simulated time)",
-                value=common,
-                unit="s",
-            )
-        ]
-    else:
-        found = [*filter(None, (_offset(t, common) for t in stamped))]
-    return [*found, *filter(None, (_drift(t) for t in stamped))]
+    common = float(np.median([delay for _, delay in stamped]))
+    is_shifted = abs(common) > limits.STAMP_DELAYED and all(
+        abs(delay - common) <= limits.DELAYS_APART for _, delay in stamped
+    )
+    shifted = judge(
+        NOTE if is_shifted else None,
+        "clock",
+        "all topics",
+        f"header stamps are of another clock than the log's, {common:+.4g} s apart, the same for all topics"
+        " (a played log, or simulated time)",
+        value=common,
+        unit="s",
+    )
+    offsets = [] if is_shifted else [f for times, delay in stamped for f in _offset(times, delay, common)]
+    return [*shifted, *offsets, *(f for times, _ in stamped for f in _drift(times))]
 
 
-def _offset(times: TimesWatch, common: float) -> Finding | None:
-    delay = times.delay
-    assert delay is not None
+def _offset(times: TimesWatch, delay: float, common: float) -> list[Finding]:
+    text = f"header stamps are {delay:.4g} s before the log's times"
     if -delay > limits.STAMP_AHEAD:
         text = f"header stamps are {-delay:.3g} s later than the log's times: the sender's clock is ahead"
-    elif delay > limits.STAMP_DELAYED:
-        text = f"header stamps are {delay:.4g} s before the log's times"
-    elif abs(delay - common) > limits.DELAYS_APART:
+    elif delay <= limits.STAMP_DELAYED:
         text = f"header stamps are {delay:.3g} s before the log's times, those of most topics {common:.3g} s"
-    else:
-        return None
-    return warning(
+    is_off = not -limits.STAMP_AHEAD <= delay <= limits.STAMP_DELAYED or abs(delay - common) > limits.DELAYS_APART
+    return judge(
+        WARNING if is_off else None,
         "clock-offset",
         times.topic,
         text,
@@ -298,19 +291,16 @@ def _offset(times: TimesWatch, common: float) -> Finding | None:
     )
 
 
-def _drift(times: TimesWatch) -> Finding | None:
+def _drift(times: TimesWatch) -> list[Finding]:
     rows = times.delays
-    if len(rows) < 20:
-        return None
-    at, delay = rows[:, 0] - rows[0, 0], rows[:, 1]
-    if at[-1] <= 0:
-        return None
+    at, delay = rows[:, 0] - rows[:1, 0], rows[:, 1]
+    if len(rows) < 20 or at[-1] <= 0:
+        return []
     slope = _slope(at, delay)
     spread = float(np.median(np.abs(delay - np.median(delay) - slope * (at - np.median(at)))))
     change = slope * float(at[-1])
-    if abs(change) < max(limits.DELAYS_DRIFT, 6.0 * spread):
-        return None
-    return warning(
+    return judge(
+        WARNING if abs(change) >= max(limits.DELAYS_DRIFT, 6.0 * spread) else None,
         "clock-drift",
         times.topic,
         f"header stamps drift against the log's times by {1e3 * change:+.0f} ms ({1e6 * slope:+.0f} ppm)",

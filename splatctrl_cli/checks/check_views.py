@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -9,13 +10,14 @@ import numpy as np
 from splatctrl_cli.calibration.evidence import transform_of
 from splatctrl_cli.calibration.views import DepthView, landed, overlap_rows, surface_normals
 from splatctrl_cli.checks import limits
-from splatctrl_cli.checks.finding import Finding, error, warning
+from splatctrl_cli.checks.finding import ERROR, WARNING, Finding, error, judge, warning
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
 from splatctrl_cli.geometry import back_project, invert_transform, strided_lens, transform_points
 from splatctrl_cli.records import Bool, Float64, RgbdFrame, spread
 
 SCALES = (0.001, 0.01, 0.1, 0.2, 0.25, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0)
 SCALES = (*SCALES, *(1 / s for s in reversed(SCALES[:-1])))
+_Posed = TypeVar("_Posed", RgbdFrame, DepthView)
 FINE = np.linspace(0.92, 1.08, 17)
 
 
@@ -53,15 +55,13 @@ def check_views(
     scaled = [replace(f, depth=f.depth * np.float32(scales.get(f.camera, 1.0))) for f in frames]
     if scales:
         fitted = [_view(frame) for frame in _chosen(scaled)]
-        if _cost(fitted, pairs)[1] > _cost(_all_moved(views, moves), pairs)[1]:
+        if _cost(fitted, pairs)[1] > _cost(_move_all(views, moves), pairs)[1]:
             moves = wrong_poses(fitted, pairs)
         else:  # moves explain more
             scales, scaled = {}, list(frames)
     findings = _scale_findings(scales, used) if scales else _overlap_findings(views, pairs, used, is_sure=is_sure)
     findings += [_pose_finding(move, sorted(used)) for move in moves]
-    by_camera = {move.camera: move.T_camera_corrected for move in moves}
-    corrected = [replace(f, T_world_camera=f.T_world_camera @ by_camera.get(f.camera, np.eye(4))) for f in scaled]
-    return findings, scaled, corrected
+    return findings, scaled, _move_all(scaled, moves)
 
 
 def are_far(frames: Sequence[RgbdFrame]) -> bool:
@@ -144,20 +144,12 @@ def _overlap_findings(
     (fits, most), scale = max((_fitting(views, pairs, cameras, s), s) for s in tried)
     if most < limits.VIEWS_LANDED or plain > limits.VIEWS_TRUSTED * most or fits < limits.VIEWS_LEAST_FIT * most:
         return []
-    said = warning if is_sure else error
-    return [
-        said(
-            "views-scale",
-            "cameras",
-            f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times"
-            " it",
-            f"if so, {rescaled(used.values(), scale)}",
-            value=scale,
-        )
-    ]
+    text = f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times it"
+    remedy = f"if so, {rescale_remedy(used.values(), scale)}"
+    return judge(WARNING if is_sure else ERROR, "views-scale", "cameras", text, remedy, value=scale)
 
 
-def rescaled(units: Iterable[float | None], factor: float) -> str:
+def rescale_remedy(units: Iterable[float | None], factor: float) -> str:
     """Remedy: the --depth-scale for depths `factor` times as large.
 
     units: [m] per count, None for floats in metres.
@@ -179,7 +171,7 @@ def _scale_findings(scales: Mapping[str, float], used: Mapping[str, float | None
                 "views-scale",
                 "cameras",
                 f"views of one scene fit together only where all depths are multiplied by {factor:.3g}",
-                f"{rescaled(units, factor)}, or correct the poses' unit",
+                f"{rescale_remedy(units, factor)}, or correct the poses' unit",
                 value=factor,
             )
         ]
@@ -263,13 +255,9 @@ def _landed(
     a: DepthView, b: DepthView, scale_a: float = 1.0, scale_b: float = 1.0
 ) -> tuple[Float64, Bool, Float64, Float64]:
     """View a's points (K, 3) in b's frame, hits (K,), b's surface and normals."""
-    points = transform_points(_transform(a, b), a.points * scale_a)
+    points = transform_points(invert_transform(b.T_world_camera) @ a.T_world_camera, a.points * scale_a)
     lands, surface, normals = landed(points, b)
     return points, lands, surface * scale_b, normals
-
-
-def _transform(a: DepthView, b: DepthView) -> Float64:
-    return invert_transform(b.T_world_camera) @ a.T_world_camera
 
 
 def _distances(a: DepthView, b: DepthView, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
@@ -280,7 +268,6 @@ def _distances(a: DepthView, b: DepthView, scale_a: float = 1.0, scale_b: float 
 
 
 def _best_scale(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], cameras: Sequence[str]) -> float | None:
-    """Factor on these cameras' depths that fits far more points, or None."""
     medians = [float(np.median(v.points[:, 2])) for v in views if v.camera in cameras and len(v.points)]
     if not medians:
         return None
@@ -328,11 +315,11 @@ def _fitting(
 def _fitted(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
     is_far = _cost(views, _with(views, pairs, camera))[1] < limits.MOVE_GOOD_SHARE
     starts = [limits.MOVE_WIDTHS, (*limits.MOVE_WIDE, *limits.MOVE_WIDTHS)] if is_far else [limits.MOVE_WIDTHS]
-    found = [T for widths in starts if (T := _descended(views, pairs, camera, widths)) is not None]
+    found = [T for widths in starts if (T := _descend(views, pairs, camera, widths)) is not None]
     return min(found, key=lambda T: _cost(_moved(views, camera, T), pairs)[0], default=None)
 
 
-def _descended(
+def _descend(
     views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera: str, widths: Sequence[float]
 ) -> Float64 | None:
     """T_camera_corrected by Gauss-Newton on point-to-plane residuals, with Tukey's biweight."""
@@ -359,7 +346,9 @@ def _rows(a: DepthView, b: DepthView, camera: str) -> tuple[Float64, Float64]:
     """Derivatives (K, 6) by the camera's motion in its frame, and residuals (K,) [m]."""
     points, lands, surface, normals = _landed(a, b)
     lands &= np.any(normals != 0, axis=1) & (np.abs(points[:, 2] - surface[:, 2]) < 3 * limits.MOVE_WIDE[0])
-    residual, derivatives = overlap_rows(a.points, _transform(a, b), lands, surface, normals)
+    residual, derivatives = overlap_rows(
+        a.points, invert_transform(b.T_world_camera) @ a.T_world_camera, lands, surface, normals
+    )
     of_a, of_b = np.hsplit(derivatives, 2)
     return (a.camera == camera) * of_a + (b.camera == camera) * of_b, residual
 
@@ -381,8 +370,6 @@ def _moved(views: Sequence[DepthView], camera: str, T: Float64) -> list[DepthVie
     ]
 
 
-def _all_moved(views: Sequence[DepthView], moves: Sequence[Move]) -> list[DepthView]:
-    moved = list(views)
-    for move in moves:
-        moved = _moved(moved, move.camera, move.T_camera_corrected)
-    return moved
+def _move_all(frames: Sequence[_Posed], moves: Sequence[Move]) -> list[_Posed]:
+    by_camera = {move.camera: move.T_camera_corrected for move in moves}
+    return [replace(f, T_world_camera=f.T_world_camera @ by_camera.get(f.camera, np.eye(4))) for f in frames]

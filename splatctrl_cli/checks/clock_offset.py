@@ -31,8 +31,6 @@ class CameraMotion:
 
 @dataclass(kw_only=True)
 class ImageMotion:
-    """Collected image changes by camera."""
-
     cameras: dict[str, CameraMotion] = field(default_factory=dict)
     _last: dict[str, tuple[Float32, UInt8]] = field(default_factory=dict)
 
@@ -79,8 +77,9 @@ def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) ->
         dx = (u[None] - intrinsics.cx) * (z / intrinsics.fx)[:, None] - x[:, None]
         dy = (v[None] - intrinsics.cy) * (z / intrinsics.fy)[:, None] - y[:, None]
         above = np.square(radii[is_ahead].astype(np.float32))[:, None] - dx * dx - dy * dy
-        front = np.where(above > 0, z[:, None] - np.sqrt(np.maximum(above, 0)), np.float32(np.inf))
-        nearest = front.min(axis=0, initial=np.inf)
+        nearest = np.where(above > 0, z[:, None] - np.sqrt(np.maximum(above, 0)), np.float32(np.inf)).min(
+            axis=0, initial=np.inf
+        )
         row[:] = np.where(np.isfinite(nearest), nearest, 0)
     return depth.reshape(len(centers), intrinsics.height, intrinsics.width)
 
@@ -100,12 +99,8 @@ def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
     return float(np.sum(x * y)) / length if length > 0 else 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotPoints:
-    """A robot's spheres by joint state: centers (T, S, 3) and radii (S,) [m], world."""
-
-    centers: Float64
-    radii: Float64
+RobotPoints = tuple[Float64, Float64]
+"""A robot's spheres by joint state: centers (T, S, 3) and radii (S,) [m], world."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +143,7 @@ def estimate_clock_offset(
     first, last = _span(cameras)
     near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
     states = [states[index] for index in near]
-    robot = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
+    robot = None if robot is None else (robot[0][near], robot[1])
     if len(states) < 3:
         return _unknown(num, f"no joint states within {limits.OFFSET_REACH:g} s of the frames")
     position = np.array([state.position for state in states])
@@ -170,7 +165,7 @@ def estimate_clock_offset(
     return _peak(offsets, np.array(scores), num, limits.OFFSET_CORRELATION, limits.OFFSET_SUM_ERROR * interval)
 
 
-def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
+def select_states(stamp_ns: Stamps, motion: ImageMotion) -> Index:
     """Indices (K,) of states, with ascending stamps (T,), that suffice for `estimate_clock_offset`.
 
     A long or dense log needs few.
@@ -191,7 +186,7 @@ def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
         at = _since(camera, int(near[0]))
         for offset in offsets:
             for times in (at - offset, step * np.round((at - offset) / step)):
-                after = _after(seconds, times)
+                after = np.clip(np.searchsorted(seconds, times), 1, len(seconds) - 1)
                 is_asked[after] = is_asked[after - 1] = True
     return first + np.flatnonzero(is_asked)
 
@@ -218,12 +213,12 @@ def _since(camera: CameraMotion, start: int) -> Float64:
 def _pixel_scores(
     seconds: Float64, robot: RobotPoints, step: float, camera: CameraMotion, start: int, offsets: Float64
 ) -> Float64:
-    """Scores with the robot interpolated at every `step` from the first state."""
     number = np.round((_since(camera, start) - offsets[:, None]) / step).astype(np.int64)  # (O, K + 1)
     is_inside = (number >= 0) & (number * step < seconds[-1] + step / 2)
     wanted = np.unique(number[is_inside])
-    centers = _at(seconds, robot.centers.reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3)
-    depth = silhouettes(centers, robot.radii, camera)
+    depth = silhouettes(
+        _at(seconds, robot[0].reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3), robot[1], camera
+    )
     changes = np.array(camera.changes)
     scores = np.zeros(len(offsets))
     for i, inside in enumerate(is_inside):
@@ -248,22 +243,16 @@ def _sum_scores(seconds: Float64, position: Float64, camera: CameraMotion, start
 
 
 def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
-    """Intervals (K,) within the joint log; none if too few."""
     keep = is_inside[1:] & is_inside[:-1]
     return keep if keep.sum() >= max(limits.MOTION_INTERVALS // 2, len(keep) // 2) else np.zeros_like(keep)
 
 
 def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
     """Rows (K, D) of a curve (T, D) at times (K,), linear."""
-    after = _after(seconds, at)
+    after = np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
     before = after - 1
     share = np.clip((at - seconds[before]) / (seconds[after] - seconds[before]), 0.0, 1.0)[:, None]
     return np.asarray((1 - share) * curve[before] + share * curve[after])
-
-
-def _after(seconds: Float64, at: Float64) -> Index:
-    """State (K,) that ends each time's interval, or the nearest."""
-    return np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
 
 
 def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: float) -> ClockOffset:
@@ -300,8 +289,7 @@ def _vertex(offsets: Float64, score: Float64, best: int) -> float:
     near = slice(best - reach, best + reach + 1)
     width = float(offsets[best + reach] - offsets[best])
     a, b, _ = np.polyfit((offsets[near] - offsets[best]) / width, score[near], 2)
-    shift = float(np.clip(-b / (2 * a), -1.0, 1.0)) if a < 0 else 0.0
-    return float(offsets[best]) + shift * width
+    return float(offsets[best]) + (float(np.clip(-b / (2 * a), -1.0, 1.0)) if a < 0 else 0.0) * width
 
 
 def _unknown(num: int, reason: str, top: float = 0.0) -> ClockOffset:

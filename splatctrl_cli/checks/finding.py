@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
+from typing import Any
 
 from splatctrl_cli.records import RgbdFrame
 
@@ -131,7 +132,6 @@ _BLOCKED = {"": (), "all": ALL, "later": LATER, "replay": ("replay",)}
 
 
 def _checks() -> Iterator[Check]:
-    """The entries of `_TABLE`, whose rows continue in indented lines."""
     for row in re.findall(r"^[a-z].*(?:\n +.*)*", _TABLE, flags=re.MULTILINE):
         code, severities, blocked, meaning, *remedy = (cell.strip() for cell in " ".join(row.split()).split("|"))
         yield Check(
@@ -187,6 +187,12 @@ def _finding(
 
 
 error, warning, note = (partial(_finding, severity) for severity in ORDER)
+ERROR, WARNING, NOTE = ORDER
+
+
+def judge(severity: Severity | None, code: str, where: str, what: str, *remedy: str, **figure: Any) -> list[Finding]:
+    """One finding, or none without a severity; `remedy` and `figure` (value, unit, stamp_ns) as of `Finding`."""
+    return [] if severity is None else [_finding(severity, code, where, what, *remedy, **figure)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,16 +211,8 @@ class Rate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Need:
-    """A later command, and its obstacles; empty if it can start."""
-
-    command: str
-    lacks: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """A checked recording: findings, rates by topic, needs by command.
+    """A checked recording: findings, rates by topic; lacks: by later command what it misses, "" for nothing.
 
     frames: reduced views, without colour, of cameras with poses.
     """
@@ -226,7 +224,7 @@ class CheckReport:
     start_ns: int | None
     findings: Sequence[Finding]
     rates: Sequence[Rate] = ()
-    needs: Sequence[Need] = ()
+    lacks: Mapping[str, str] = field(default_factory=dict)
     frames: Sequence[RgbdFrame] = field(default=(), repr=False)
 
     @property
@@ -236,17 +234,15 @@ class CheckReport:
 
     @property
     def sorted_findings(self) -> list[Finding]:
-        """The findings, worst first, then as found."""
         return sorted(self.findings, key=lambda finding: ORDER.index(finding.severity))
 
-    def lacks(self, need: Need) -> tuple[str, ...]:
-        """Obstacles to a command, with errors among findings."""
-        return (*need.lacks, *(f"{f.where}: {f.what} [{f.code}]" for f in self.refusing(need)))
+    def blockers(self, command: str) -> list[Finding]:
+        return [f for f in self.sorted_findings if f.severity is ERROR and command in CHECKS[f.code].blocked]
 
-    def refusing(self, need: Need) -> list[Finding]:
-        """The errors that block a command."""
-        errors = [f for f in self.sorted_findings if f.severity is Severity.ERROR]
-        return [f for f in errors if need.command in CHECKS[f.code].blocked]
+    def obstacles(self, command: str) -> list[str]:
+        """Needs a command lacks, and errors that block it; empty if it can start."""
+        blocking = (f"{f.where}: {f.what} [{f.code}]" for f in self.blockers(command))
+        return [*filter(None, [self.lacks[command]]), *blocking]
 
     @property
     def counts(self) -> dict[str, int]:
@@ -280,23 +276,18 @@ class CheckReport:
                 for f in self.sorted_findings
             ],
             "rates": [vars(rate) for rate in self.rates],
-            "commands": {need.command: list(self.lacks(need)) for need in self.needs},
+            "commands": {command: self.obstacles(command) for command in self.lacks},
         }
 
 
-def needs(*, num_cameras: int, num_frames: int, states_lack: str) -> list[Need]:
-    """One per later command, without errors among findings. states_lack: why states are missing."""
-    lacks = {
-        "score": "one camera and less than three frames: nothing can be held out; record more views"
-        if num_cameras == 1 and 0 < num_frames < 3
-        else "",
-        "replay": states_lack,
-    }
-    return [Need(command=name, lacks=tuple(filter(None, [lacks.get(name)]))) for name in ALL]
+def find_lacks(*, num_cameras: int, num_frames: int, states_lack: str) -> dict[str, str]:
+    """Needs each later command lacks, errors aside. states_lack: why states are missing."""
+    is_too_short = num_cameras == 1 and 0 < num_frames < 3
+    few = "one camera and less than three frames: nothing can be held out; record more views" if is_too_short else ""
+    return dict.fromkeys(ALL, "") | {"score": few, "replay": states_lack}
 
 
 def damage_findings(where: str, notes: Sequence[str]) -> list[Finding]:
-    """One per kind of damage, with its count."""
     return [
         warning("damaged", where, text if num == 1 else f"{text} ({num} times)", value=num)
         for text, num in Counter(notes).items()

@@ -68,16 +68,15 @@ def _lines(report: CheckReport) -> Iterator[str]:
 
 
 def _needs(report: CheckReport) -> Iterator[str]:
-    if ready := [need.command for need in report.needs if not report.lacks(need)]:
+    if ready := [command for command in report.lacks if not report.obstacles(command)]:
         yield f"can start: {', '.join(ready)}"
     kept: dict[str, list[str]] = {}
-    for need in report.needs:
-        if codes := dict.fromkeys(finding.code for finding in report.refusing(need)):
-            kept.setdefault(", ".join(f"[{code}]" for code in codes), []).append(need.command)
+    for command in report.lacks:
+        if codes := dict.fromkeys(finding.code for finding in report.blockers(command)):
+            kept.setdefault(", ".join(f"[{code}]" for code in codes), []).append(command)
     yield from (f"cannot start, or would be wrong: {', '.join(names)}; see {why}" for why, names in kept.items())
-    for need in report.needs:
-        for lack in need.lacks:
-            yield from textwrap.wrap(f"missing for {need.command}: {lack}", WIDTH, subsequent_indent="  ")
+    for command, lack in report.lacks.items():
+        yield from textwrap.wrap(f"missing for {command}: {lack}", WIDTH, subsequent_indent="  ") if lack else ()
 
 
 def run_info(args: argparse.Namespace) -> int:

@@ -17,7 +17,7 @@ from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, shown
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Verdict, gate
 from splatctrl_cli.files.output import plain
-from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, PoseTopic, SourceOptions
+from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
 
 T = TypeVar("T")
 
@@ -134,12 +134,12 @@ def _is_topic(text: str) -> bool:
     return text.partition("=")[2].startswith("/")
 
 
-def _pose_topic(text: str) -> tuple[str, PoseTopic]:
+def _pose_topic(text: str) -> tuple[str, tuple[str, str]]:
     name, _, rest = text.partition("=")
     topic, at, frame = rest.partition("@")
     if not name or not topic or bool(at) != bool(frame):
         raise UsageError(f"--camera-pose {text}: expected NAME=TOPIC or NAME=TOPIC@FRAME")
-    return name, PoseTopic(topic=topic, frame=frame.strip("/"))
+    return name, (topic, frame.strip("/"))
 
 
 def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import DeviceFault, InputError, UsageError, WriteError, refuse_faults
+from splatctrl_cli.errors import DeviceFault, InputError, UsageError, WriteError, refuse_faults, refuse_if, require
 
 REMEDY = "make it again with the command in run.json"
 
@@ -63,13 +63,12 @@ class Parts:
         """Return the path. Raises InputError if the file is not as written."""
         if self.digests is None:
             return path
-        wanted = self.digests.get(self._name(path))
-        if wanted is None:
-            raise InputError(f"{path}: not among the parts that were listed", remedy=self.remedy)
-        if not path.is_file():
-            raise InputError(f"{path}: missing; it was listed", remedy=self.remedy)
-        if sha256(path) != wanted:
-            raise InputError(f"{path}: was changed after it was written (another sha256)", remedy=self.remedy)
+        found, said = self.digests.get(self._name(path)), f"{path}: not among the parts that were listed"
+        wanted = require(found, said, remedy=self.remedy)
+        refuse_if(not path.is_file(), f"{path}: missing; it was listed", remedy=self.remedy)
+        refuse_if(
+            sha256(path) != wanted, f"{path}: was changed after it was written (another sha256)", remedy=self.remedy
+        )
         return path
 
     def _name(self, path: Path) -> str:
@@ -95,7 +94,6 @@ def held(partial: Path, *, is_folder: bool) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, link or folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -189,20 +187,28 @@ def output_path(
     It also does so for a folder that no command wrote, another writer, or an unwritable parent. Raises WriteError if
     `is_write_failure`; other errors pass.
     """
-    try:
-        path = followed(path)
+    with refuse_faults(
+        lambda error: f"{path}: cannot be written: {error.strerror}",
+        OSError,
+        remedy="give another --out",
+        error=UsageError,
+    ):
+        path = follow_link(path)
         _check_replaceable(path, is_folder=is_folder)
         _check_not_there(path, force=force)
         partial = partial_path(path)
         partial.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
 
     def can_go_on() -> bool:
         return checkpoint is not None and (partial / checkpoint).is_file()
 
     with ExitStack() as stack:
-        try:
+        with refuse_faults(
+            lambda error: f"{path}: cannot be written: {error.strerror}",
+            OSError,
+            remedy="give another --out",
+            error=UsageError,
+        ):
             stack.enter_context(held(partial, is_folder=is_folder))
             is_resumed = resume and can_go_on()
             if is_folder and not is_resumed:
@@ -210,8 +216,6 @@ def output_path(
                     remove(entry)
             elif not is_resumed:
                 os.truncate(partial, 0)
-        except OSError as error:
-            raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
         try:
             _check_not_there(path, force=force)  # another run may have ended since
             yield partial
@@ -230,32 +234,30 @@ def output_path(
             raise
 
 
-def followed(path: Path) -> Path:
+def follow_link(path: Path) -> Path:
     """Target of a link, else the path itself. Raises UsageError for a loop."""
     if not path.is_symlink():
         return path
     target = Path(os.path.realpath(path))
-    if target.is_symlink():
-        raise UsageError(f"{path}: is a link to itself", remedy="give another --out")
+    refuse_if(target.is_symlink(), f"{path}: is a link to itself", remedy="give another --out", error=UsageError)
     return target
 
 
 def partial_path(path: Path) -> Path:
     """``NAME.partial`` next to the path, or to a link's target."""
-    target = followed(path)
+    target = follow_link(path)
     return target.with_name(target.name + PARTIAL)
 
 
 def check_can_be_written(path: Path) -> None:
     """Raise UsageError early if the nearest folder is not writable."""
     try:
-        above = next(folder for folder in followed(path).absolute().parents if folder.exists())
+        above = next(folder for folder in follow_link(path).absolute().parents if folder.exists())
         is_good = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
         reason = "" if is_good else f"{above} is {'read-only' if above.is_dir() else 'no folder'}"
     except OSError as error:
         reason = str(error.strerror)
-    if reason:
-        raise UsageError(f"{path}: cannot be written: {reason}", remedy="give another --out")
+    refuse_if(reason, f"{path}: cannot be written: {reason}", remedy="give another --out", error=UsageError)
 
 
 def write_durably(path: Path, write: Callable[[Path], object]) -> None:
@@ -281,25 +283,26 @@ def flush(path: Path) -> None:
 
 
 def _check_replaceable(path: Path, *, is_folder: bool) -> None:
-    """Raise UsageError if --force could remove foreign files."""
-    if path.name in ("", ".."):
-        raise UsageError(f"{path}: has no name of its own to write under", remedy="give another --out")
-    if is_folder and path.is_file():
-        raise UsageError(f"{path}: is a file, expected a folder to write", remedy="give another --out")
-    if not is_folder and path.is_dir():
-        raise UsageError(f"{path}: is a folder, expected a file to write", remedy="give another --out")
-    if path.is_dir() and any(path.iterdir()) and not any((path / name).is_file() for name in MARKERS):
-        raise UsageError(f"{path}: was not written by splatctrl (no run.json)", remedy="give another --out")
-
-    if path.is_dir() and os.path.ismount(path):
-        raise UsageError(f"{path}: is a mount point", remedy="give a folder in it")
-    if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
-        raise UsageError(f"{path}: cannot be replaced: it is read-only", remedy="give another --out")
+    is_there, other, rights = path.is_dir(), "give another --out", os.W_OK | os.X_OK
+    is_foreign = is_there and any(path.iterdir()) and not any((path / name).is_file() for name in MARKERS)
+    for is_bad, what, remedy in (
+        (path.name in ("", ".."), "has no name of its own to write under", other),
+        (is_folder and path.is_file(), "is a file, expected a folder to write", other),
+        (not is_folder and is_there, "is a folder, expected a file to write", other),
+        (is_foreign, "was not written by splatctrl (no run.json)", other),
+        (is_there and os.path.ismount(path), "is a mount point", "give a folder in it"),
+        (is_there and not os.access(path, rights), "cannot be replaced: it is read-only", other),
+    ):
+        refuse_if(is_bad, f"{path}: {what}", remedy=remedy, error=UsageError)
 
 
 def _check_not_there(path: Path, *, force: bool) -> None:
-    if not force and path.exists():
-        raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
+    refuse_if(
+        not force and path.exists(),
+        f"{path}: already exists",
+        remedy="give --force to replace it, or another --out",
+        error=UsageError,
+    )
 
 
 def _replace(partial: Path, path: Path) -> None:
@@ -321,7 +324,6 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the block's time to stage `name`."""
         start = time.perf_counter()
         try:
             yield
@@ -372,7 +374,6 @@ def write_run(
 
 
 def write_table(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows as CSV under a header of names."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, fieldnames=names, lineterminator="\n")
         table.writeheader()
@@ -390,12 +391,10 @@ def sha256(path: Path) -> str:
 
 
 def plain(value: object) -> object:
-    """Convert a foreign value for JSON."""
     if hasattr(value, "tolist"):
         return value.tolist()
     return str(value)
 
 
 def finite(value: float) -> float | None:
-    """The value, None if not finite."""
     return value if math.isfinite(value) else None

@@ -46,7 +46,6 @@ class RowFile:
         return self._num
 
     def append(self, rows: Float64) -> None:
-        """Add rows (T, ...)."""
         block = np.ascontiguousarray(rows, dtype=np.float64)
         if block.shape[1:] != self.row_shape:
             raise ValueError(f"rows: expected {self.row_shape}, got {block.shape[1:]}")
@@ -60,8 +59,9 @@ class RowFile:
         self._flush()
         num = max(min(last, self._num) - first, 0)
         self._file.seek(first * self._row_bytes)
-        content = bytearray(self._file.read(num * self._row_bytes))
-        return np.frombuffer(content, dtype=np.float64).reshape(num, *self.row_shape)
+        return np.frombuffer(bytearray(self._file.read(num * self._row_bytes)), dtype=np.float64).reshape(
+            num, *self.row_shape
+        )
 
     def _flush(self) -> None:
         if self._waiting:
@@ -112,13 +112,10 @@ class Rows:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Float64:
         return np.asarray(self[: len(self)], dtype=dtype)
 
-    def select(self, index: Index) -> "Rows":
-        """Rows of an index (K,), in its order."""
-        return Rows(self._file, index if self._index is None else self._index[index], self._columns)
-
-    def of_columns(self, order: Index) -> "Rows":
-        """Rows with these columns, in that order."""
-        return Rows(self._file, self._index, order if self._columns is None else self._columns[order])
+    def select(self, index: Index | None = None, columns: Index | None = None) -> "Rows":
+        """Rows of an index (K,), and of columns, in their order."""
+        wanted = ((self._index, index), (self._columns, columns))
+        return Rows(self._file, *(old if new is None else new if old is None else old[new] for old, new in wanted))
 
     def _read(self, first: int, last: int) -> Float64:
         if self._index is None:
@@ -133,13 +130,12 @@ Table = Float64 | Rows
 """Rows (T, ...) by number, slice or index: in memory, or in a file."""
 
 
-def selected(table: Table, index: Index) -> Table:
-    """Rows of an index (K,), in its order; a file is not read."""
-    return table.select(index) if isinstance(table, Rows) else table[index]
-
-
-def of_columns(table: Table, order: Index) -> Table:
-    return table.of_columns(order) if isinstance(table, Rows) else table[:, order]
+def select(table: Table, index: Index | None = None, columns: Index | None = None) -> Table:
+    """Rows of an index (K,), and of columns, in their order; a file is not read."""
+    if isinstance(table, Rows):
+        return table.select(index, columns)
+    rows = table if index is None else table[index]
+    return rows if columns is None else rows[:, columns]
 
 
 def blocks_of(table: Table) -> Iterator[Float64]:

@@ -45,7 +45,6 @@ class Summary:
 
 
 def names_in(folder: Path) -> list[str]:
-    """Sorted names in `folder`."""
     return sorted(os.listdir(folder))  # noqa: PTH208  (paths cost ten times more)
 
 

@@ -9,8 +9,7 @@ import zipfile
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager, suppress
 from io import BytesIO
 from math import prod
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, ranges
 from splatctrl_cli.formats.unpacking import PIECE
 from splatctrl_cli.libraries import of_extra
@@ -30,13 +29,8 @@ DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a 
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pieces:
-    """An array made during writing: `make` yields its values in C order."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    make: Callable[[], Iterable[Values]]
+Pieces = tuple[str, tuple[int, ...], Callable[[], Iterable[Values]]]
+"""An array made during writing: dtype, shape, and a maker of its values in C order."""
 
 
 def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) -> None:
@@ -44,13 +38,13 @@ def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) 
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
         for name, array in arrays.items():
-            size = np.dtype(array.dtype).itemsize * int(np.prod(array.shape))
+            dtype, shape = array[:2] if isinstance(array, tuple) else (array.dtype, array.shape)
+            size = np.dtype(dtype).itemsize * int(np.prod(shape))
             with archive.open(f"{name}.npy", "w", force_zip64=size >= 2**30) as stream:
-                if isinstance(array, Pieces):
-                    np.lib.format.write_array_header_1_0(
-                        stream, {"descr": array.dtype, "fortran_order": False, "shape": array.shape}
-                    )
-                    for piece in array.make():
+                if isinstance(array, tuple):
+                    header = {"descr": dtype, "fortran_order": False, "shape": shape}
+                    np.lib.format.write_array_header_1_0(stream, header)
+                    for piece in array[2]():
                         stream.write(piece.tobytes())
                 else:
                     np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
@@ -78,11 +72,9 @@ def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
     """True for a ``.npz`` with these arrays; head: its first bytes."""
     if not head.startswith(b"PK\x03\x04"):
         return False
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {f"{name}.npy" for name in names} <= set(archive.namelist())
-    except (*DAMAGE, OSError):
-        return False
+    with suppress(*DAMAGE, OSError), zipfile.ZipFile(path) as archive:
+        return {f"{name}.npy" for name in names} <= set(archive.namelist())
+    return False
 
 
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
@@ -90,32 +82,39 @@ def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, is_fortran, dtype = read(stream)
-    if any(not isinstance(n, int) or n < 0 for n in shape):
-        raise ValueError(f"shape {shape}, expected whole numbers")
+    refuse_if(
+        any(not isinstance(n, int) or n < 0 for n in shape),
+        f"shape {shape}, expected whole numbers",
+        error=ValueError,
+    )
     return tuple(shape), is_fortran, dtype
 
 
 def check_numbers(dtype: np.dtype[Any]) -> None:
     """Raise ValueError for objects, which would be unpickled."""
-    if dtype.hasobject:
-        raise ValueError("objects, expected numbers")
+    refuse_if(dtype.hasobject, "objects, expected numbers", error=ValueError)
 
 
 def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> Values:
     shape, is_fortran, dtype = npy_head(member)
     check_numbers(dtype)
     size = prod(shape) * dtype.itemsize
-    if most is not None and size > most:
-        raise ValueError(f"{name}{size} bytes, expected at most {most}")
-    if size != file_size - member.tell():
-        raise ValueError(f"{name}announces {size} bytes, holds {file_size - member.tell()}")
+    refuse_if(most is not None and size > most, f"{name}{size} bytes, expected at most {most}", error=ValueError)
+    refuse_if(
+        size != file_size - member.tell(),
+        f"{name}announces {size} bytes, holds {file_size - member.tell()}",
+        error=ValueError,
+    )
     content = bytearray(size)
     view, at = memoryview(content), 0
     while at < size and (piece := member.read(min(size - at, PIECE))):
         view[at : at + len(piece)] = piece
         at += len(piece)
-    if at < size or member.read(1):  # reading to the end is what checks the sum
-        raise ValueError(f"{name}expected {size} bytes, got {'more' if at == size else at}")
+    refuse_if(
+        at < size or member.read(1),
+        f"{name}expected {size} bytes, got {'more' if at == size else at}",
+        error=ValueError,
+    )  # reading to the end is what checks the sum
     values: Values = np.frombuffer(content, dtype) if size else np.zeros(0, dtype)
     return values.reshape(shape, order="F" if is_fortran else "C")
 
@@ -152,9 +151,10 @@ class ArrayFile(ABC):
         """
         headers = [self._checked(name) for name in names]
         lengths = [shape[0] for shape, _ in headers]
-        if len(set(lengths)) > 1:
-            said = ", ".join(f"{name} {length}" for name, length in zip(names, lengths, strict=True))
-            raise InputError(f"{self.path}: expected arrays of one length, got {said}", remedy="check the file")
+        said = ", ".join(f"{name} {length}" for name, length in zip(names, lengths, strict=True))
+        refuse_if(
+            len(set(lengths)) > 1, f"{self.path}: expected arrays of one length, got {said}", remedy="check the file"
+        )
         widths = [prod(shape[1:]) for shape, _ in headers]
         parts = [  # how many rows its blocks have is its own
             RowFile((width,), (part.reshape(len(part), width).astype(np.float64) for part in self._blocks(name)))
@@ -179,45 +179,45 @@ class ArrayFile(ABC):
         """Stamps (T,) [ns] of times in `unit_ns`, or of a dtype with its own unit."""
         _, dtype = self._checked(name, least=least, kinds="iufM")
         times = np.concatenate([np.zeros(0, dtype), *(block.reshape(-1) for block in self._blocks(name))])
-        if not np.isfinite(times).all():
-            raise InputError(
-                f"{self.path}: {name}: expected times, got NaN, NaT or infinity", remedy="check the file"
-            )
+        refuse_if(
+            not np.isfinite(times).all(),
+            f"{self.path}: {name}: expected times, got NaN, NaT or infinity",
+            remedy="check the file",
+        )
         if times.dtype.kind == "M":
             times, unit_ns = times.astype("datetime64[ns]").astype(np.int64), 1
         if times.dtype.kind in "iu":
             return np.asarray(times.astype(np.int64) * unit_ns + epoch_ns)
         whole = np.floor(times)
-        parts = np.round((times - whole) * unit_ns).astype(np.int64)
-        return np.asarray(whole.astype(np.int64) * unit_ns + parts + epoch_ns)
+        return np.asarray(
+            whole.astype(np.int64) * unit_ns + np.round((times - whole) * unit_ns).astype(np.int64) + epoch_ns
+        )
 
     def _checked(self, name: str, *, least: int = 1, kinds: str = "iuf") -> tuple[tuple[int, ...], np.dtype[Any]]:
         header = self._header(name)
-        if header is not None and header[1].kind in kinds and header[0]:
-            shape, dtype = header
-            size = prod(shape) * dtype.itemsize
-            if size > FREE_BYTES + MOST_RATIO * self.path.stat().st_size:  # no recording packs so small
-                raise InputError(
-                    f"{self.path}: {name}: {size} bytes unpacked, over {MOST_RATIO} times the size of the file",
-                    remedy="check the file",
-                )
-            if shape[0] >= least:
-                return header
-            raise InputError(f"{self.path}: {name}: expected rows, got none", remedy="record it again")
-        found = "none" if header is None else f"{header[1]} of shape {header[0]}"
-        raise InputError(
-            f"{self.path}: {name!r}: expected an array of numbers, got {found}",
-            remedy=f"arrays there: {', '.join(self.names)}",
+        if header is None or header[1].kind not in kinds or not header[0]:
+            found = "none" if header is None else f"{header[1]} of shape {header[0]}"
+            raise InputError(
+                f"{self.path}: {name!r}: expected an array of numbers, got {found}",
+                remedy=f"arrays there: {', '.join(self.names)}",
+            )
+        size = prod(header[0]) * header[1].itemsize
+        refuse_if(
+            size > FREE_BYTES + MOST_RATIO * self.path.stat().st_size,  # no recording packs so small
+            f"{self.path}: {name}: {size} bytes unpacked, over {MOST_RATIO} times the size of the file",
+            remedy="check the file",
         )
+        refuse_if(header[0][0] < least, f"{self.path}: {name}: expected rows, got none", remedy="record it again")
+        return header
 
-    @contextmanager
-    def _read_as(self, kind: str, *faults: type[Exception]) -> Iterator[None]:
-        """Turn `faults` into InputError."""
-        try:
-            yield
-        except faults as error:
-            said = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{self.path}: cannot be read as {kind}: {said}", remedy="check the file") from None
+    def _read_as(self, kind: str, *faults: type[Exception]) -> AbstractContextManager[None]:
+        return refuse_faults(
+            lambda error: (
+                f"{self.path}: cannot be read as {kind}: {' '.join(str(error).split()) or type(error).__name__}"
+            ),
+            *faults,
+            remedy="check the file",
+        )
 
 
 _MOST_BY_COLUMNS = 1 << 28  # bytes, as they are in memory at once
@@ -238,18 +238,19 @@ class NpzFile(ArrayFile):
             return shape, dtype
 
     def _blocks(self, name: str) -> Iterator[Array]:
-        """Yield the rows; an array stored by columns is read at once."""
         with self._opened(name) as (shape, dtype, is_by_columns, stream):
-            if is_by_columns:
-                if prod(shape) * dtype.itemsize > _MOST_BY_COLUMNS:
-                    raise ValueError(f"{name}: over {_MOST_BY_COLUMNS} bytes by columns, expected rows")
-                whole = np.frombuffer(_read(stream, prod(shape) * dtype.itemsize), dtype).reshape(shape, order="F")
-                yield from (whole[first : first + BLOCK] for first in range(0, shape[0], BLOCK))
-                return
-            row = prod(shape[1:]) * dtype.itemsize
-            for first in range(0, shape[0], BLOCK):
-                num = min(BLOCK, shape[0] - first)
-                yield np.frombuffer(_read(stream, num * row), dtype).reshape(num, *shape[1:])
+            size, step = prod(shape) * dtype.itemsize, max(shape[0], 1) if is_by_columns else BLOCK
+            refuse_if(
+                is_by_columns and size > _MOST_BY_COLUMNS,
+                f"{name}: over {_MOST_BY_COLUMNS} bytes by columns, expected rows",
+                error=ValueError,
+            )
+            for first in range(0, shape[0], step):
+                num = min(step, shape[0] - first)
+                rows = np.frombuffer(_read(stream, num * prod(shape[1:]) * dtype.itemsize), dtype).reshape(
+                    num, *shape[1:], order="F" if is_by_columns else "C"
+                )
+                yield from (rows[start : start + BLOCK] for start in range(0, num, BLOCK))
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]]:
@@ -288,8 +289,11 @@ class Hdf5File(ArrayFile):
             return None
         with self._opened() as file:
             array = file[name]
-            if self._h5py.check_vlen_dtype(array.dtype) not in {None, str, bytes}:
-                raise InputError(f"{self.path}: {name}: ragged: its rows differ in length", remedy=_RAGGED)
+            refuse_if(
+                self._h5py.check_vlen_dtype(array.dtype) not in {None, str, bytes},
+                f"{self.path}: {name}: ragged: its rows differ in length",
+                remedy=_RAGGED,
+            )
             return array.shape, array.dtype
 
     def _blocks(self, name: str) -> Iterator[Array]:
@@ -319,8 +323,11 @@ class ParquetFile(ArrayFile):
             self.names = list(file.schema_arrow.names)
             self._num: int = file.metadata.num_rows
         if only is not None:
-            if only[0] not in self.names:
-                raise InputError(f"{path}: no column {only[0]}", remedy=f"columns there: {', '.join(self.names)}")
+            refuse_if(
+                only[0] not in self.names,
+                f"{path}: no column {only[0]}",
+                remedy=f"columns there: {', '.join(self.names)}",
+            )
             self._num = sum(len(block) for block in self._blocks(only[0]))
 
     def __len__(self) -> int:
@@ -340,8 +347,7 @@ class ParquetFile(ArrayFile):
                 values = self._values(batch.column(name), name)
                 if self._only is not None:
                     values = values[self._values(batch.column(self._only[0]), self._only[0]) == self._only[1]]
-                if shape not in (None, values.shape[1:]):
-                    raise self._ragged(name)
+                self._refuse_ragged(shape not in (None, values.shape[1:]), name)
                 shape = values.shape[1:]
                 if len(values):
                     yield values
@@ -349,13 +355,14 @@ class ParquetFile(ArrayFile):
     def _values(self, column: Any, name: str) -> Array:
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
-        if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:
-            raise self._ragged(name)
+        self._refuse_ragged(
+            column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1, name
+        )
         inner = self._values(column.flatten(), name)
         return inner.reshape(len(column), -1, *inner.shape[1:])
 
-    def _ragged(self, name: str) -> InputError:
-        return InputError(f"{self.path}: {name}: ragged: its rows differ in length, or have none", remedy=_RAGGED)
+    def _refuse_ragged(self, is_ragged: object, name: str) -> None:
+        refuse_if(is_ragged, f"{self.path}: {name}: ragged: its rows differ in length, or have none", remedy=_RAGGED)
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:

@@ -6,13 +6,14 @@ PFM: one float32 channel, as MVSNet's depth, rows from the bottom.
 import re
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if, require
 from splatctrl_cli.formats.unpacking import read_bytes
 from splatctrl_cli.records import Array, Float32
 
@@ -75,29 +76,31 @@ def _jpeg_head(data: bytes) -> ImageHead | None:
     return None
 
 
-def _png_head(data: bytes) -> ImageHead | None:
-    if not data.startswith(PNG):
-        return None
-    at, head, has_pixels = len(PNG), None, False
-    view = memoryview(data)
-    while at + 12 <= len(data):
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Yield kind, start and end of a PNG's chunks up to IEND; the end of a cut one is beyond the data."""
+    at, kind = len(PNG), b""
+    while at + 12 <= len(data) and kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 12 + length
-        if end > len(data) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            return None
-        if (kind == b"IHDR") != (head is None) or kind == b"tRNS":
+        yield kind, at, at + 12 + length
+        at += 12 + length
+
+
+def _png_head(data: bytes) -> ImageHead | None:
+    head, has_pixels, view = None, False, memoryview(data)
+    for kind, at, end in _png_chunks(data) if data.startswith(PNG) else ():
+        is_whole = end <= len(data) and zlib.crc32(view[at + 4 : end - 4]) == int.from_bytes(
+            data[end - 4 : end], "big"
+        )
+        if not is_whole or (kind == b"IHDR") != (head is None) or kind == b"tRNS":
             return None
         if kind == b"IHDR":
-            if length != 13:
-                return None
             width, height, bits, color, _, _, interlace = struct.unpack_from(">IIBBBBB", data, at + 8)
-            if interlace or bits not in {8, 16} or color not in _PNG_CHANNELS:
+            if end - at != 25 or interlace or bits not in {8, 16} or color not in _PNG_CHANNELS:
                 return None
             head = ImageHead(width=width, height=height, channels=_PNG_CHANNELS[color], bits=bits)
         has_pixels |= kind == b"IDAT"
         if kind == b"IEND":
             return head if has_pixels else None
-        at = end
     return None
 
 
@@ -131,13 +134,10 @@ def _says_more_than_it_holds(png: bytes) -> bool:
     if len(png) < _PNG_HEAD.size:
         return True
     width, height, bits = _PNG_HEAD.unpack_from(png)
-    at, end, has_pixels = len(PNG), len(png), False
-    while at < end and (kind := png[at + 4 : at + 8]) != b"IEND":
-        has_pixels |= kind == b"IDAT"
-        if kind[:1].isupper() and kind not in _PNG_CHUNKS:
-            return True
-        at += 12 + int.from_bytes(png[at : at + 4], "big")
-    return bool(not has_pixels or at + 12 > end or width * height * bits // 8 > 1100 * end)  # deflate's is 1032
+    kinds = [kind for kind, _, _ in _png_chunks(png)]
+    is_known = all(kind in _PNG_CHUNKS for kind in kinds if kind[:1].isupper())
+    is_whole = b"IDAT" in kinds and kinds[-1] == b"IEND"
+    return not (is_known and is_whole) or width * height * bits // 8 > 1100 * len(png)  # deflate's is 1032
 
 
 def write_pfm(path: Path, image: Float32) -> None:
@@ -152,22 +152,22 @@ def read_pfm(path: Path) -> Float32:
     Raises InputError if missing, of another format or length.
     """
     content = read_bytes(path)
-    header = re.match(rb"(PF|Pf)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", content[:128])
-    if header is None:
-        raise InputError(f"{path}: expected a PFM image, got another format")
-    width, height = int(header[2]), int(header[3])
-    is_little = header[4].startswith(b"-")
-    if header[1] != b"Pf" or header[4].lstrip(b"+-").rstrip(b"0").rstrip(b".") != b"1":
-        raise InputError(
-            f"{path}: expected one channel (Pf) of scale 1, got {header[1].decode()} of scale {header[4].decode()}"
-        )
-    if width == 0 or height == 0:
-        raise InputError(f"{path}: expected pixels, got {width}x{height}", remedy="copy the file anew")
-    start = header.end()
-    if len(content) - start != 4 * width * height:
-        raise InputError(
-            f"{path}: expected {4 * width * height} bytes for {width}x{height}, got {len(content) - start}",
-            remedy="copy the file anew",
-        )
-    values = np.frombuffer(content, dtype="<f4" if is_little else ">f4", offset=start)
+    header = require(
+        re.match(rb"(PF|Pf)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", content[:128]),
+        f"{path}: expected a PFM image, got another format",
+    )
+    width, height, start = int(header[2]), int(header[3]), header.end()
+    refuse_if(
+        header[1] != b"Pf" or header[4].lstrip(b"+-").rstrip(b"0").rstrip(b".") != b"1",
+        f"{path}: expected one channel (Pf) of scale 1, got {header[1].decode()} of scale {header[4].decode()}",
+    )
+    refuse_if(
+        width == 0 or height == 0, f"{path}: expected pixels, got {width}x{height}", remedy="copy the file anew"
+    )
+    refuse_if(
+        len(content) - start != 4 * width * height,
+        f"{path}: expected {4 * width * height} bytes for {width}x{height}, got {len(content) - start}",
+        remedy="copy the file anew",
+    )
+    values = np.frombuffer(content, dtype="<f4" if header[4].startswith(b"-") else ">f4", offset=start)
     return np.ascontiguousarray(values.reshape(height, width)[::-1], dtype=np.float32)

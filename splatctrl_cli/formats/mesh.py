@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Float64, Index
 
@@ -38,22 +38,23 @@ def load_mesh(path: Path) -> TriangleMesh:
     Vertices at one place are merged. COLLADA is scaled by its unit; its up axis is ignored, as in RViz. Bytes after a
     binary STL's faces are ignored, with a note. Raises InputError if unreadable, without triangles, or not finite.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: expected a mesh, got no such file")
+    refuse_if(not path.is_file(), f"{path}: expected a mesh, got no such file")
     kind = path.suffix.lower()
-    source, note = _opened(path) if kind in {".stl", ".obj", ".off"} else (path, "")
-    try:
+    source, note = _open_mesh(path) if kind in {".stl", ".obj", ".off"} else (path, "")
+    with refuse_faults(
+        lambda error: f"{path}: expected a mesh, got {type(error).__name__}: {error}",
+        Exception,
+        remedy="give an OBJ, STL, PLY, GLB or COLLADA file",
+    ):  # trimesh raises whatever the reader of the format raises
         loaded = trimesh.load(source, file_type=kind[1:], force="mesh", process=False)
-        scale = _collada_unit(path) if kind == ".dae" else 1.0
-    except Exception as error:  # trimesh raises whatever the reader of the format raises
-        raise InputError(
-            f"{path}: expected a mesh, got {type(error).__name__}: {error}",
-            remedy="give an OBJ, STL, PLY, GLB or COLLADA file",
-        ) from None
-    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise InputError(f"{path}: expected a mesh, got no triangle", remedy="give a mesh with faces, not a cloud")
-    if not np.isfinite(loaded.vertices).all():
-        raise InputError(f"{path}: expected finite vertices, got some that are not")
+        unit = ElementTree.parse(path).find("{*}asset/{*}unit") if kind == ".dae" else None
+        scale = 1.0 if unit is None else float(unit.get("meter", "1"))  # metres per unit
+    refuse_if(
+        not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces),
+        f"{path}: expected a mesh, got no triangle",
+        remedy="give a mesh with faces, not a cloud",
+    )
+    refuse_if(not np.isfinite(loaded.vertices).all(), f"{path}: expected finite vertices, got some that are not")
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
     loaded.update_faces(loaded.nondegenerate_faces())
     return TriangleMesh(
@@ -64,29 +65,23 @@ def load_mesh(path: Path) -> TriangleMesh:
     )
 
 
-def _opened(path: Path) -> tuple[BytesIO | Path, str]:
-    """A binary STL without trailing bytes, and a note; or a text."""
+def _open_mesh(path: Path) -> tuple[BytesIO | Path, str]:
     content = path.read_bytes()
     num = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
     end = STL_HEADER + STL_FACE * num  # of a text: gigabytes
     if path.suffix.lower() == ".stl" and len(content) >= STL_HEADER:
         if end <= len(content):
             rest = len(content) - end
-            words = f"{path.name}: {rest} bytes after its {num} faces are ignored" if rest else ""
-            return BytesIO(content[:end]), words
-        if b"facet" not in content.lower():
-            raise InputError(
-                f"{path}: expected {end} bytes for {num} faces, got {len(content)}",
-                remedy="copy or write the file again",
+            return BytesIO(content[:end]), (
+                f"{path.name}: {rest} bytes after its {num} faces are ignored" if rest else ""
             )
+        refuse_if(
+            b"facet" not in content.lower(),
+            f"{path}: expected {end} bytes for {num} faces, got {len(content)}",
+            remedy="copy or write the file again",
+        )
     try:
         content.decode()
     except UnicodeDecodeError:
         return BytesIO(content.decode("utf-8", "replace").encode()), ""
     return path, ""
-
-
-def _collada_unit(path: Path) -> float:
-    """Metres per unit."""
-    unit = ElementTree.parse(path).find("{*}asset/{*}unit")
-    return 1.0 if unit is None else float(unit.get("meter", "1"))

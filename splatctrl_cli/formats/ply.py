@@ -10,7 +10,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from splatctrl_cli.config.ranges import MAX_PLACE
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if, require
 from splatctrl_cli.formats.unpacking import read_bytes
 from splatctrl_cli.records import Array, Float64, PointCloud
 
@@ -65,8 +65,10 @@ class _Element:
 
     def dtype(self, path: Path, byte_order: str) -> "np.dtype[Any]":
         """The row's type; float text becomes float64 to keep its digits."""
-        if any(" " in kind for _, kind in self.properties):
-            raise InputError(f"{path}: element {self.name} has list properties: expected a table of numbers")
+        refuse_if(
+            any(" " in kind for _, kind in self.properties),
+            f"{path}: element {self.name} has list properties: expected a table of numbers",
+        )
         types = [(name, SCALARS[kind]) for name, kind in self.properties]
         return np.dtype(
             [(name, "f8" if (byte_order, kind) == ("=", "f4") else byte_order + kind) for name, kind in types]
@@ -93,15 +95,16 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
     """
     content = read_bytes(path)
     form, elements, comments, length = _parse_header(path, content)
-    wanted = next((found for found in elements if found.name == element), None)
-    if wanted is None:
-        raise InputError(f"{path}: expected an element {element}, got {[found.name for found in elements]}")
+    wanted = require(
+        next((found for found in elements if found.name == element), None),
+        f"{path}: expected an element {element}, got {[found.name for found in elements]}",
+    )
     names = [name for name, _ in wanted.properties]
-    if "packed_position" in names:
-        raise InputError(
-            f"{path}: a compressed PLY of SuperSplat (packed_position, ...), expected one value per property",
-            remedy="export it there as an uncompressed PLY",
-        )
+    refuse_if(
+        "packed_position" in names,
+        f"{path}: a compressed PLY of SuperSplat (packed_position, ...), expected one value per property",
+        remedy="export it there as an uncompressed PLY",
+    )
     check_properties(path, names, required)
     read = _read_ascii if form == "ascii" else _read_binary
     return PlyFile(path=path, rows=read(path, content, form, elements, length, wanted), comments=tuple(comments))
@@ -110,13 +113,13 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
 def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
     """Raise InputError naming missing `required` properties."""
     missing = [name for name in required if name not in names]
-    if missing:
-        raise InputError(
-            f"{path}: no 3D-GS splat file: missing properties {' '.join(missing)} (it has {' '.join(names)})",
-            remedy="write them by these names: scale_* is log(sigma [m]), rot_* a quaternion w x y z, opacity a logit"
-            if ({"opacity", "f_dc_0"} & {*names})
-            else "a point cloud or mesh has to be reconstructed first",
-        )
+    refuse_if(
+        missing,
+        f"{path}: no 3D-GS splat file: missing properties {' '.join(missing)} (it has {' '.join(names)})",
+        remedy="write them by these names: scale_* is log(sigma [m]), rot_* a quaternion w x y z, opacity a logit"
+        if ({"opacity", "f_dc_0"} & {*names})
+        else "a point cloud or mesh has to be reconstructed first",
+    )
 
 
 def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
@@ -129,8 +132,11 @@ def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     lines += [f"property {NAMES_OF_SCALARS[kind.str[1:]]} {name}" for name, (kind, *_) in fields.items()]
     for key, value in comments.items():
-        if not key or ":" in key or any(mark in key + value for mark in "\r\n"):
-            raise UsageError(f"PLY comment {key!r}: expected one line and a key without a colon, got {value!r}")
+        refuse_if(
+            not key or ":" in key or any(mark in key + value for mark in "\r\n"),
+            f"PLY comment {key!r}: expected one line and a key without a colon, got {value!r}",
+            error=UsageError,
+        )
         lines.append(f"comment {key}: {value}".rstrip() if value else f"comment {key}")
     path.write_bytes("\n".join([*lines, "end_header", ""]).encode("ascii", "backslashreplace") + rows.tobytes())
 
@@ -142,12 +148,12 @@ def _read_binary(
     dtype = wanted.dtype(path, byte_order)
     for found in elements:
         start, end = end if found is wanted else start, found.end(content, end, byte_order)
-    if len(content) != end:
-        what = "cut short" if len(content) < end else "longer than its header says"
-        raise InputError(
-            f"{path}: {what}: expected {end} bytes ({length} of header and the data it promises), got {len(content)}",
-            remedy="copy or write the file again",
-        )
+    what = "cut short" if len(content) < end else "longer than its header says"
+    refuse_if(
+        len(content) != end,
+        f"{path}: {what}: expected {end} bytes ({length} of header and the data it promises), got {len(content)}",
+        remedy="copy or write the file again",
+    )
     return np.frombuffer(content, dtype, count=wanted.count, offset=start)
 
 
@@ -156,8 +162,7 @@ def _read_ascii(
 ) -> Array:
     lines = [line.split() for line in content[length:].split(b"\n") if line.strip()]
     expected = sum(found.count for found in elements if found.properties)
-    if len(lines) != expected:
-        raise InputError(f"{path}: expected {expected} lines of data, got {len(lines)}")
+    refuse_if(len(lines) != expected, f"{path}: expected {expected} lines of data, got {len(lines)}")
     start = sum(found.count for found in elements[: elements.index(wanted)] if found.properties)
     rows = lines[start : start + wanted.count]
     table = np.zeros(wanted.count, dtype=wanted.dtype(path, BYTE_ORDERS[form]))
@@ -173,12 +178,16 @@ def _read_ascii(
 
 
 def _parse_header(path: Path, content: bytes) -> tuple[str, list[_Element], list[str], int]:
-    if not content.startswith((b"ply\n", b"ply\r\n")):
-        raise InputError(f"{path}: no PLY file: expected it to start with 'ply', got {content[:8]!r}")
+    refuse_if(
+        not content.startswith((b"ply\n", b"ply\r\n")),
+        f"{path}: no PLY file: expected it to start with 'ply', got {content[:8]!r}",
+    )
     end = content.find(b"\nend_header")
     newline = content.find(b"\n", end + 1)
-    if end < 0 or newline < 0 or content[end:newline].strip() != b"end_header":
-        raise InputError(f"{path}: cut short: its header has no end_header line")
+    refuse_if(
+        end < 0 or newline < 0 or content[end:newline].strip() != b"end_header",
+        f"{path}: cut short: its header has no end_header line",
+    )
     form, elements, comments = "", list[_Element](), list[str]()
     for line in content[:end].decode("utf-8", "backslashreplace").splitlines()[1:]:
         match line.split():
@@ -193,15 +202,16 @@ def _parse_header(path: Path, content: bytes) -> tuple[str, list[_Element], list
             ):
                 elements[-1].properties.append((name, f"{length} {kind}"))
             case ["property", kind, name] if elements and kind in SCALARS:
-                if name in (known for known, _ in elements[-1].properties):
-                    raise InputError(f"{path}: element {elements[-1].name} names property {name} twice")
+                refuse_if(
+                    name in (known for known, _ in elements[-1].properties),
+                    f"{path}: element {elements[-1].name} names property {name} twice",
+                )
                 elements[-1].properties.append((name, kind))
             case []:
                 continue
             case _:
                 raise InputError(f"{path}: header line not understood: {line.strip()!r}")
-    if not form:
-        raise InputError(f"{path}: its header has no format line; expected one of {', '.join(BYTE_ORDERS)}")
+    refuse_if(not form, f"{path}: its header has no format line; expected one of {', '.join(BYTE_ORDERS)}")
     return form, elements, comments, newline + 1
 
 
@@ -212,8 +222,10 @@ def read_points(path: Path) -> PointCloud:
     """
     table = _columns(path, ("x", "y", "z", "red", "green", "blue"), "coloured point cloud")
     points, colors = table[:, :3], table[:, 3:] / 255.0
-    if colors.min() < 0.0 or colors.max() > 1.0:
-        raise InputError(f"{path}: red, green, blue: expected 0 to 255, got up to {255.0 * colors.max():g}")
+    refuse_if(
+        colors.min() < 0.0 or colors.max() > 1.0,
+        f"{path}: red, green, blue: expected 0 to 255, got up to {255.0 * colors.max():g}",
+    )
     return PointCloud(points=points.astype(np.float32), colors=colors.astype(np.float32))
 
 
@@ -228,10 +240,8 @@ def read_positions(path: Path) -> Float64:
 def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
     ply = read_table(path, "vertex", ())
     missing = [name for name in names if name not in ply.names]
-    if missing:
-        raise InputError(f"{path}: no {what}: missing properties {' '.join(missing)}")
-    if not len(ply):
-        raise InputError(f"{path}: has no points", remedy="give a point cloud of the scene")
+    refuse_if(missing, f"{path}: no {what}: missing properties {' '.join(missing)}")
+    refuse_if(not len(ply), f"{path}: has no points", remedy="give a point cloud of the scene")
     return np.column_stack([ply.column(name) for name in names])
 
 
@@ -258,10 +268,17 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)
-    try:
-        first = next(lines, None)
-        if first is None:
-            raise InputError(f"{name}: has no points", remedy="give a CSV file with the columns x,y,z [m]")
+    with (
+        refuse_faults(
+            lambda error: f"{name}: line {reader.line_num}: no CSV text: {error}",
+            csv.Error,
+            remedy="correct the line",
+        ),
+        refuse_faults(f"{name}: no UTF-8 text", UnicodeDecodeError, remedy="give a CSV file"),
+    ):
+        first = require(
+            next(lines, None), f"{name}: has no points", remedy="give a CSV file with the columns x,y,z [m]"
+        )
         columns, rest = _axes(name, first[1]), lines
         if columns is None:
             columns, rest = [0, 1, 2], chain([first], lines)
@@ -269,27 +286,21 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
         while block := list(islice(rest, POINTS_PER_BLOCK)):
             yield _numbers(name, block, columns, len(first[1]))
             num_points += len(block)
-    except csv.Error as error:
-        raise InputError(f"{name}: line {reader.line_num}: no CSV text: {error}", remedy="correct the line") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{name}: no UTF-8 text: {error}", remedy="give a CSV file") from None
-    if not num_points:
-        raise InputError(f"{name}: has a header and no points", remedy="add a line for each point")
+    refuse_if(not num_points, f"{name}: has a header and no points", remedy="add a line for each point")
 
 
 def _axes(name: str, cells: Sequence[str]) -> list[int] | None:
-    """Columns of x, y, z; None if the line is a point."""
     if len(cells) == 3 and all(_number(cell) is not None for cell in cells):
         return None
     titles = [cell.strip().lstrip("\ufeff").lower() for cell in cells]
     for axis in AXES:
-        if titles.count(axis) != 1:
-            what = "no column" if axis not in titles else "several columns"
-            raise InputError(
-                f"{name}: {what} {axis}: expected a header with x, y and z, or three numbers a line, got"
-                f" {','.join(cells)[:60]!r}",
-                remedy="name the columns x,y,z; they are in metres",
-            )
+        what = "no column" if axis not in titles else "several columns"
+        refuse_if(
+            titles.count(axis) != 1,
+            f"{name}: {what} {axis}: expected a header with x, y and z, or three numbers a line, got"
+            f" {','.join(cells)[:60]!r}",
+            remedy="name the columns x,y,z; they are in metres",
+        )
     return [titles.index(axis) for axis in AXES]
 
 

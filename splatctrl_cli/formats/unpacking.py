@@ -6,7 +6,7 @@ from pathlib import Path
 import lz4.frame
 import zstandard
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_faults, refuse_if
 
 PIECE = 1 << 20  # bytes that are read at a time
 MAX_BLOCK = 128 << 20  # bytes; of one chunk or record, as stored and as unpacked
@@ -19,19 +19,17 @@ _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, M
 
 def read_bytes(path: Path, most: int = -1) -> bytes:
     """Read all or the first `most` bytes. Raises InputError if unreadable."""
-    try:
-        with path.open("rb") as stream:
-            return stream.read(most)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    with (
+        refuse_faults(lambda error: f"{path}: cannot be read: {error.strerror}", OSError),
+        path.open("rb") as stream,
+    ):
+        return stream.read(most)
 
 
 def read_text(path: Path, remedy: str) -> str:
     """Read UTF-8 text. Raises InputError with the remedy if unreadable, UnicodeDecodeError for other bytes."""
-    try:
+    with refuse_faults(lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy=remedy):
         return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy=remedy) from None
 
 
 class BadBlockError(ValueError):
@@ -48,8 +46,9 @@ class Budget:
         """Unpack within the budget. Raises BadBlockError."""
         if size <= MAX_BLOCK:
             self._left -= size
-            if self._left < 0:
-                raise BadBlockError(f"the file so far unpacks to over {MOST_RATIO} times its size")
+            refuse_if(
+                self._left < 0, f"the file so far unpacks to over {MOST_RATIO} times its size", error=BadBlockError
+            )
         return unpacked(data, compression, size)
 
 
@@ -58,13 +57,13 @@ def unpacked(data: bytes, compression: str, size: int, largest: int = MAX_BLOCK)
 
     Raises BadBlockError for unknown or broken compression, a size over `largest`, or another than announced.
     """
-    if size > largest:
-        raise BadBlockError(f"announces {size} bytes unpacked, at most {largest} are read")
+    refuse_if(size > largest, f"announces {size} bytes unpacked, at most {largest} are read", error=BadBlockError)
     content = _unpacked_up_to(data, compression, size + 1)
-    if len(content) != size:
-        raise BadBlockError(
-            f"announces {size} bytes unpacked, holds {'more' if len(content) > size else len(content)}"
-        )
+    refuse_if(
+        len(content) != size,
+        f"announces {size} bytes unpacked, holds {'more' if len(content) > size else len(content)}",
+        error=BadBlockError,
+    )
     return content
 
 
@@ -79,7 +78,7 @@ def unpacked_start(data: bytes, compression: str, size: int) -> bytes:
 def _unpacked_up_to(data: bytes, compression: str, most: int) -> bytes:
     if compression in _PLAIN:
         return data[:most]
-    try:
+    with refuse_faults(lambda _: "cannot be decompressed", *_FAILURES, error=BadBlockError):
         match compression:
             case "zstd":
                 decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
@@ -89,8 +88,6 @@ def _unpacked_up_to(data: bytes, compression: str, most: int) -> bytes:
                 return _of_lz4(data, most)
             case "bz2":
                 return bz2.BZ2Decompressor().decompress(data, max_length=most)
-    except _FAILURES:
-        raise BadBlockError("cannot be decompressed") from None
     raise BadBlockError(f"compression {compression!r} is unknown; expected zstd, lz4 or bz2")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from splatctrl_cli.checks.check_folder import check_folder
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Need, Severity, error, note, warning
+from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity, error, note, warning
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
@@ -72,7 +72,7 @@ def check(request: CheckRequest) -> CheckResult:
 def refuse_errors(path: Path, options: SourceOptions, allowed: Collection[str] = ()) -> None:
     """Raise InputError if `check` finds an error for reconstruct, except `allowed` codes."""
     report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
-    if errors := [f for f in report.refusing(Need(command="reconstruct", lacks=())) if f.code not in allowed]:
+    if errors := [f for f in report.blockers("reconstruct") if f.code not in allowed]:
         first, more = errors[0], f"; {len(errors) - 1} more: splatctrl check {path}" if len(errors) > 1 else ""
         remedy = first.remedy or CHECKS[first.code].remedy
         remedy += f"; if it is right, give {_ALLOWING[first.code]}" if first.code in _ALLOWING else ""

@@ -64,9 +64,9 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
     if set(source.cameras) == {HOLDOUT}:
         given = ",".join(options.cameras or ())
         raise UsageError(f"--cameras {given}: leaves no camera to train with", remedy="name another, or leave it out")
-    robots = [description for _, description in logged_descriptions(request.paths)]
+    robots = logged_descriptions(request.paths)
     if len(robots) > 1:
-        said = ", ".join(robot.where for robot in robots)
+        said = ", ".join(where for _, where, _ in robots)
         progress.log(
             f"warning: {len(robots)} robots are described, by {said}: none is kept; give --urdf to each command"
         )
@@ -84,7 +84,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
                 partial,
                 source,
                 topics=topics,
-                robot=robots[0].text if len(robots) == 1 else "",
+                robot=robots[0][2] if len(robots) == 1 else "",
                 progress=lambda num: progress.log(f"{num} frames") if num % 100 == 0 else None,
                 identity=identity,
             )

@@ -1,7 +1,7 @@
 """Recordings corrected by a calibration, or perturbed, as they are read."""
 
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 
 from splatctrl_cli.calibration.calibration_file import CalibratedCamera, Calibration, read_calibration
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import compare_poses, interpolate_transform, transform_from
 from splatctrl_cli.recording.capture.capture import CaptureSource
@@ -41,11 +41,11 @@ class Correction:
         cameras = self.calibration.cameras
         if name == HOLDOUT and len(cameras) == 1:  # views of the one camera, held out
             return next(iter(cameras.values()))
-        if name not in cameras:
-            raise InputError(
-                f"{self.where}: camera {name} is not in {self.file}, which has {', '.join(cameras)}",
-                remedy=f"calibrate it too, or leave it out with --cameras {','.join(cameras)}",
-            )
+        refuse_if(
+            name not in cameras,
+            f"{self.where}: camera {name} is not in {self.file}, which has {', '.join(cameras)}",
+            remedy=f"calibrate it too, or leave it out with --cameras {','.join(cameras)}",
+        )
         return cameras[name]
 
     def pose(self, name: str, T_recorded: Float64) -> Float64:
@@ -55,10 +55,11 @@ class Correction:
             return T_recorded @ camera.T
         if _same(T_recorded, camera.recorded):
             return camera.T
-        if _same(T_recorded, camera.T):
-            raise InputError(
-                f"{self.where}: camera {name} is already where {self.file} puts it", remedy="leave --calibration out"
-            )
+        refuse_if(
+            _same(T_recorded, camera.T),
+            f"{self.where}: camera {name} is already where {self.file} puts it",
+            remedy="leave --calibration out",
+        )
         off = 1e3 * float(np.linalg.norm(T_recorded[:3, 3] - camera.recorded[:3, 3]))
         raise InputError(
             f"{self.where}: camera {name} is not recorded where {self.calibration.recording}, which was calibrated,"
@@ -89,7 +90,24 @@ class Correction:
             depth=self.depth(frame.camera, frame.depth),
         )
 
-    def notes(self, digests: Sequence[str]) -> list[str]:
+    def changed(self, stored: StoredFrame, T: Float64) -> StoredFrame:
+        """The frame with its depth corrected, at pose T (4, 4); counts stay counts if only their scale changes."""
+        camera, unit = self.camera(stored.camera), stored.depth_unit
+        if (camera.scale, camera.bias) == (1.0, 0.0):
+            return replace(stored, T_world_camera=T)
+        if unit is None or camera.bias:
+            return _with_depth(stored, T, lambda: self.depth(stored.camera, stored.depth))
+        scaled = unit * camera.scale
+
+        def counted() -> Float32:
+            return metres(np.rint(stored.depth / np.float32(unit)).astype(np.uint16), scaled)
+
+        return replace(stored, T_world_camera=T, read_depth=counted, depth_unit=scaled)
+
+    def digests(self) -> dict[str, str]:
+        return {f"{CALIBRATION}{self.file.name}": sha256(self.file)}
+
+    def notes(self, digests: Collection[str]) -> list[str]:
         """A report's notes; digests: sha256 of the recording's files."""
         text = f"poses, depths and clock are those of {self.file.name}"
         if set(digests) == set(self.calibration.digests.values()):
@@ -97,7 +115,11 @@ class Correction:
         return [f"{text}, which was found of another recording ({self.calibration.recording})"]
 
 
-def correction_of(options: SourceOptions, where: str) -> Correction | None:
+def _with_depth(stored: StoredFrame, T: Float64, read_depth: Callable[[], Float32]) -> StoredFrame:
+    return replace(stored, T_world_camera=T, read_depth=read_depth, depth_unit=None, depth_file=None)
+
+
+def read_correction(options: SourceOptions, where: str) -> Correction | None:
     """The options' correction, or None. Raises InputError for an invalid file."""
     if options.calibration is None:
         return None
@@ -109,41 +131,43 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 
     Raises InputError for another recording's calibration, UsageError as `Perturbation.of`.
     """
-    correction, perturbation = correction_of(options, source.name), Perturbation.of(options.perturb)
+    correction, perturbation = read_correction(options, source.name), Perturbation.of(options.perturb)
     if correction is not None:
-        source = CalibratedSource(source, correction, round(options.pose_tolerance_s * SECOND_NS))
-    return source if perturbation is None else PerturbedSource(source, perturbation)
-
-
-class CalibratedSource(FrameSource):
-    """Another source's records, corrected by a calibration.
-
-    Joint states move to the frames' clock. A moving camera takes its pose at the frame's time on the robot's clock,
-    from a log's transforms or interpolated between frames. Frames without a pose within `tolerance_ns` are left out
-    and counted.
-    """
-
-    def __init__(self, source: FrameSource, correction: Correction, tolerance_ns: int = 0) -> None:
-        self.inner = source
-        self._correction = correction
-        self._tolerance_ns = tolerance_ns
-        if isinstance(source, CaptureSource) and sha256(correction.file) in source.made_of:
-            raise InputError(
-                f"{source.name}: was ingested with {correction.file}", remedy="leave --calibration out: it is applied"
-            )
+        refuse_if(
+            isinstance(source, CaptureSource) and sha256(correction.file) in source.made_of,
+            f"{source.name}: was ingested with {correction.file}",
+            remedy="leave --calibration out: it is applied",
+        )
         for camera in source.cameras:
             correction.camera(camera)
-        self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
-        self.has_clock, self.world_frame = source.has_clock, source.world_frame
-        self.states = correction.states(source.states)
-        self.joint_topics = None if correction.clock_ns else source.joint_topics
-        unseen = set(self.cameras)
+        unseen = set(source.cameras)
         for _, camera, T in source.poses():
             if camera in unseen:
                 correction.pose(camera, T)
-                unseen.remove(camera)
+            unseen.discard(camera)
             if not unseen:
                 break
+    changes: list[Correction | Perturbation | None] = [correction, perturbation]
+    for change in (change for change in changes if change is not None):
+        source = ChangedSource(source, change, round(options.pose_tolerance_s * SECOND_NS))
+    return source
+
+
+class ChangedSource(FrameSource):
+    """Another source's records, corrected by a calibration or perturbed, in memory.
+
+    A calibrated clock moves joint states to the frames'. A moving camera then takes its pose at the frame's time on
+    the robot's clock, from a log's transforms or interpolated between frames. Frames without a pose within
+    `tolerance_ns` are left out and counted.
+    """
+
+    def __init__(self, source: FrameSource, change: "Correction | Perturbation", tolerance_ns: int) -> None:
+        self.inner, self._change, self._tolerance_ns = source, change, tolerance_ns
+        self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
+        self.has_clock, self.world_frame = source.has_clock, source.world_frame
+        self.states, self.joint_topics = source.states, source.joint_topics
+        if isinstance(change, Correction) and change.clock_ns:
+            self.states, self.joint_topics = change.states(source.states), None
 
     @property
     def loss(self) -> LossReport:
@@ -152,7 +176,7 @@ class CalibratedSource(FrameSource):
         return replace(
             loss,
             without_pose=loss.without_pose + self._num_without_pose,
-            notes=[*loss.notes, *self._correction.notes(list(self.inner.digests().values()))],
+            notes=[*loss.notes, *self._change.notes(self.inner.digests().values())],
         )
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
@@ -162,45 +186,23 @@ class CalibratedSource(FrameSource):
                 yield stamp, camera, T
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the files and the calibration."""
-        return {**self.inner.digests(), f"{CALIBRATION}{self._correction.file.name}": sha256(self._correction.file)}
+        return self.inner.digests() | self._change.digests()
 
     def _frames(self) -> Iterator[StoredFrame]:
         for item in self.inner.stored():
             if isinstance(item, StoredFrame):
                 T = self._pose(item.stamp_ns, item.camera, item.T_world_camera)
                 if T is not None:
-                    yield self._corrected(item, T)
-
-    def _corrected(self, stored: StoredFrame, T: Float64) -> StoredFrame:
-        camera = self._correction.camera(stored.camera)
-        if (camera.scale, camera.bias) == (1.0, 0.0):
-            return replace(stored, T_world_camera=T)
-        unit = stored.depth_unit
-        if unit is None or camera.bias:
-            return replace(
-                stored,
-                T_world_camera=T,
-                read_depth=lambda: self._correction.depth(stored.camera, stored.depth),
-                depth_unit=None,
-                depth_file=None,
-            )
-        scaled = unit * camera.scale
-
-        def counted() -> Float32:
-            return metres(np.rint(stored.depth / np.float32(unit)).astype(np.uint16), scaled)
-
-        return replace(stored, T_world_camera=T, read_depth=counted, depth_unit=scaled)
+                    yield self._change.changed(item, T)
 
     def _pose(self, stamp_ns: int, camera: str, T_recorded: Float64) -> Float64 | None:
-        late_ns = self._correction.late_ns(camera)
-        T = self._recorded_at(camera, stamp_ns - late_ns) if late_ns else T_recorded
-        return None if T is None else self._correction.pose(camera, T)
-
-    def _recorded_at(self, camera: str, stamp_ns: int) -> Float64 | None:
-        if isinstance(self.inner, RosLogSource):
-            return self.inner.pose_at(camera, stamp_ns)
-        return _between(*self._paths[camera], stamp_ns, self._tolerance_ns)
+        late_ns = self._change.late_ns(camera) if isinstance(self._change, Correction) else 0
+        T: Float64 | None = T_recorded
+        if late_ns and isinstance(self.inner, RosLogSource):
+            T = self.inner.pose_at(camera, stamp_ns - late_ns)
+        elif late_ns:
+            T = _between(*self._paths[camera], stamp_ns - late_ns, self._tolerance_ns)
+        return None if T is None else self._change.pose(camera, T)
 
     @cached_property
     def _num_without_pose(self) -> int:
@@ -251,10 +253,17 @@ class Perturbation:
     def of(cls, given: Mapping[str, float]) -> "Perturbation | None":
         """Build from values by name; None if they do nothing. Raises UsageError for an unknown name or value."""
         for name, value in given.items():
-            if name not in LIMITS:
-                raise UsageError(f"--perturb {name}: expected one of {', '.join(LIMITS)}", remedy="leave it out")
-            if not 0 <= value <= LIMITS[name] or (name == "seed" and value != int(value)):
-                raise UsageError(f"--perturb {name}: expected 0 to {LIMITS[name]:g}, got {value:g}")
+            refuse_if(
+                name not in LIMITS,
+                f"--perturb {name}: expected one of {', '.join(LIMITS)}",
+                remedy="leave it out",
+                error=UsageError,
+            )
+            refuse_if(
+                not 0 <= value <= LIMITS[name] or (name == "seed" and value != int(value)),
+                f"--perturb {name}: expected 0 to {LIMITS[name]:g}, got {value:g}",
+                error=UsageError,
+            )
         made = cls(**{name.replace("-", "_"): int(v) if name == "seed" else v for name, v in given.items()})  # type: ignore[arg-type]
         return made if made.depth_noise or made.pose_error or made.pose_turn else None
 
@@ -271,55 +280,23 @@ class Perturbation:
         quat_xyzw = [*(np.sin(half) * axis / np.linalg.norm(axis)), np.cos(half)]
         return np.asarray(T_world_camera @ transform_from(self.pose_error * way / np.linalg.norm(way), quat_xyzw))
 
-    def words(self) -> str:
-        """Values as on the command line."""
+    def changed(self, stored: StoredFrame, T: Float64) -> StoredFrame:
+        """The frame at pose T (4, 4), with noise in its depth."""
+        if not self.depth_noise:
+            return replace(stored, T_world_camera=T)
+        return _with_depth(stored, T, lambda: self.depth(stored.camera, stored.stamp_ns, stored.depth))
+
+    def digests(self) -> dict[str, str]:
+        """Values as on the command line, in place of a file's digest."""
         values = {"depth-noise": self.depth_noise, "pose-error": self.pose_error, "pose-turn": self.pose_turn}
-        return ",".join(f"{name}={value!r}" for name, value in {**values, "seed": self.seed}.items() if value)
+        words = ",".join(f"{name}={value!r}" for name, value in {**values, "seed": self.seed}.items() if value)
+        return {f"{PERTURB}{words}": words}
+
+    def notes(self, _digests: Collection[str]) -> list[str]:
+        return [f"perturbed: {words}" for words in self.digests().values()]
 
     def _generator(self, camera: str, stamp_ns: int = 0) -> np.random.Generator:
         return np.random.default_rng([self.seed, zlib.crc32(camera.encode()), stamp_ns % 2**63])
 
 
-class PerturbedSource(FrameSource):
-    """Another source's records, perturbed in memory."""
-
-    def __init__(self, source: FrameSource, perturbation: Perturbation) -> None:
-        self.inner, self._perturbation = source, perturbation
-        self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
-        self.has_clock, self.world_frame = source.has_clock, source.world_frame
-        self.states, self.joint_topics = source.states, source.joint_topics
-
-    @property
-    def loss(self) -> LossReport:
-        """The source's, with a note."""
-        loss = self.inner.loss
-        return replace(loss, notes=[*loss.notes, f"perturbed: {self._perturbation.words()}"])
-
-    def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        for stamp_ns, camera, T in self.inner.poses():
-            yield stamp_ns, camera, self._perturbation.pose(camera, T)
-
-    def digests(self) -> dict[str, str]:
-        """sha256 of the files, and the perturbation."""
-        words = self._perturbation.words()
-        return {**self.inner.digests(), f"{PERTURB}{words}": words}
-
-    def _frames(self) -> Iterator[StoredFrame]:
-        for stored in self.inner.stored():
-            if isinstance(stored, StoredFrame):
-                yield self._perturbed(stored)
-
-    def _perturbed(self, stored: StoredFrame) -> StoredFrame:
-        asked, T = self._perturbation, self._perturbation.pose(stored.camera, stored.T_world_camera)
-        if not asked.depth_noise:
-            return replace(stored, T_world_camera=T)
-        return replace(
-            stored,
-            T_world_camera=T,
-            read_depth=lambda: asked.depth(stored.camera, stored.stamp_ns, stored.depth),
-            depth_unit=None,
-            depth_file=None,
-        )
-
-
-LOGGED = RosLogSource | CaptureSource | CalibratedSource | PerturbedSource  # a log's or a capture's records
+LOGGED = RosLogSource | CaptureSource | ChangedSource  # a log's or a capture's records

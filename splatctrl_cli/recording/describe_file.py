@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.formats.grid.grid_format import json_value
@@ -27,8 +27,7 @@ _LIST_LIMIT = 12  # longer lists are counted, not shown
 
 def describe_file(path: Path) -> Summary:
     """Describe a file by content. Raises InputError if unknown."""
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: the file is empty (0 bytes)", remedy="write or copy it again")
+    refuse_if(path.stat().st_size == 0, f"{path}: the file is empty (0 bytes)", remedy="write or copy it again")
     with path.open("rb") as stream:
         head = stream.read(1 << 16)  # bytes in which a text header must end
     for describe in _KINDS:
@@ -42,8 +41,7 @@ def describe_file(path: Path) -> Summary:
 
 def _ply(path: Path, head: bytes) -> Summary:
     text, end, _ = head.partition(b"end_header")
-    if not end:
-        raise InputError(f"{path}: a PLY whose header does not end", remedy="the file is damaged")
+    refuse_if(not end, f"{path}: a PLY whose header does not end", remedy="the file is damaged")
     lines = text.decode("latin-1").splitlines()
     comments = [line[8:] for line in lines if line.startswith("comment ")]
     elements = [line.split()[1:3] for line in lines if line.startswith("element ") and len(line.split()) == 3]
@@ -63,8 +61,7 @@ def _npz(path: Path, _head: bytes) -> Summary:
     with refuse_faults(f"{path}: not a readable .npz", *DAMAGE, OSError, remedy="the file is damaged"):
         with zipfile.ZipFile(path) as archive:
             arrays = {n: _npy_header(archive, n) for n in archive.namelist() if n.endswith(".npy")}
-        if not arrays:
-            raise InputError(f"{path}: a zip file without arrays", remedy="expected .npz")
+        refuse_if(not arrays, f"{path}: a zip file without arrays", remedy="expected .npz")
         short = [
             name.removesuffix(".npy")
             for name, (shape, dtype) in arrays.items()
@@ -108,8 +105,7 @@ def _npy(path: Path, _head: bytes) -> Summary:
 
 def _urdf(path: Path, _head: bytes) -> Summary:
     robot = _parsed(path, lambda: ElementTree.fromstring(path.read_bytes()), "readable XML")
-    if robot.tag != "robot":
-        raise InputError(f"{path}: expected <robot>, got <{robot.tag}>", remedy="expected a URDF")
+    refuse_if(robot.tag != "robot", f"{path}: expected <robot>, got <{robot.tag}>", remedy="expected a URDF")
     joints, links = robot.findall("joint"), robot.findall("link")
     rows = []
     for joint in joints:
@@ -171,9 +167,8 @@ def _yaml(path: Path, _head: bytes) -> Summary:
 
 
 def _image(path: Path, _head: bytes) -> Summary:
-    pixels = decode_file(path.read_bytes(), color=False)
-    if pixels is None:
-        raise InputError(f"{path}: not an image that can be read", remedy="the file is damaged")
+    said = f"{path}: not an image that can be read"
+    pixels = require(decode_file(path.read_bytes(), color=False), said, remedy="the file is damaged")
     return Summary(
         path=str(path),
         kind="image",
@@ -196,28 +191,26 @@ def _find(content: Any, key: str) -> Any:
 def _short(value: object) -> object:
     if isinstance(value, list) and (len(value) > _LIST_LIMIT or any(isinstance(v, list | dict) for v in value)):
         return f"{len(value)} entries"
-    if isinstance(value, dict):
-        return {key: _short(item) for key, item in value.items()}
-    return value
+    return {key: _short(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
-def _suffix(describe: Callable[[Path, bytes], Summary], *suffixes: str) -> Callable[[Path, bytes], Summary | None]:
-    return lambda path, head: describe(path, head) if path.suffix.lower() in suffixes else None
-
-
-def _start(describe: Callable[[Path, bytes], Summary], *magics: bytes) -> Callable[[Path, bytes], Summary | None]:
-    return lambda path, head: describe(path, head) if head.startswith(magics) else None
+def _kind(
+    describe: Callable[[Path, bytes], Summary], starts: tuple[bytes, ...] = (), suffixes: tuple[str, ...] = ()
+) -> Callable[[Path, bytes], Summary | None]:
+    return lambda path, head: (
+        describe(path, head) if head.startswith(starts) or path.suffix.lower() in suffixes else None
+    )
 
 
 _KINDS: tuple[Callable[[Path, bytes], Summary | None], ...] = (
-    _start(_ply, b"ply\n", b"ply\r\n"),
-    _start(_npy, b"\x93NUMPY"),
-    _start(_image, b"\x89PNG", b"\xff\xd8\xff"),
+    _kind(_ply, (b"ply\n", b"ply\r\n")),
+    _kind(_npy, (b"\x93NUMPY",)),
+    _kind(_image, (b"\x89PNG", b"\xff\xd8\xff")),
     *(kind.describe for kind in GRID_FORMATS.values()),
-    _start(_npz, b"PK\x03\x04"),
-    _suffix(describe_splats, *(suffix for suffix in SPLAT_FORMATS if suffix != ".ply")),
-    _suffix(_urdf, ".urdf", ".xacro"),
-    _suffix(_json, ".json"),
-    _suffix(_rows, ".jsonl", ".csv"),
-    _suffix(_yaml, ".yaml", ".yml"),
+    _kind(_npz, (b"PK\x03\x04",)),
+    _kind(describe_splats, suffixes=tuple(suffix for suffix in SPLAT_FORMATS if suffix != ".ply")),
+    _kind(_urdf, suffixes=(".urdf", ".xacro")),
+    _kind(_json, suffixes=(".json",)),
+    _kind(_rows, suffixes=(".jsonl", ".csv")),
+    _kind(_yaml, suffixes=(".yaml", ".yml")),
 )

@@ -8,7 +8,7 @@ from typing import Any
 
 from splatctrl_cli.calibration.calibration_file import describe_calibration, is_calibration
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.summary import Grid, Summary, files_below, names_in
 from splatctrl_cli.formats.grid.grid_format import FORMAT, covers, header_facts
 from splatctrl_cli.formats.scene.scene_folder import run_value
@@ -18,7 +18,7 @@ from splatctrl_cli.recording.capture.capture import (
     CaptureSource,
     is_capture,
     read_capture_header,
-    robot_description_of,
+    read_robot_description,
 )
 from splatctrl_cli.recording.capture.capture_writer import check_not_partial
 from splatctrl_cli.recording.container.log_formats import (
@@ -45,7 +45,7 @@ from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.log.survey import NAME as ROBOT
-from splatctrl_cli.recording.log.survey import RobotDescription, TopicSurvey, robot_descriptions, survey_to_describe
+from splatctrl_cli.recording.log.survey import TopicSurvey, robot_descriptions, survey_to_describe
 from splatctrl_cli.recording.log.video import SUFFIXES as VIDEOS
 from splatctrl_cli.recording.log.video import open_log
 from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
@@ -59,8 +59,7 @@ def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth
     Raises InputError if missing, unusable, or without required depth.
     """
     options = options or SourceOptions()
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
     return calibrated(_opened(path, options, needs_depth=needs_depth), options)
 
 
@@ -70,14 +69,12 @@ def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSo
         if needs_depth and (refusal := lacks_depth(source)) is not None:
             raise refusal
         return source
-    if is_capture(path):
-        return CaptureSource(path, options)
-    return RosLogSource(open_log(path), options)
+    return CaptureSource(path, options) if is_capture(path) else RosLogSource(open_log(path), options)
 
 
 def lacks_depth(source: FrameSource) -> InputError | None:
     """The error for missing depth, possible only in image folders."""
-    return source.no_depth() if isinstance(source, ImageFolderSource) and not source.has_depth else None
+    return source.depth_fault if isinstance(source, ImageFolderSource) and not source.has_depth else None
 
 
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
@@ -90,18 +87,18 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
     return open_source(paths[0], options) if log is None else calibrated(RosLogSource(log, options), options)
 
 
-def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:
-    """URDFs of logs and captures, each once with its path; skips other inputs."""
-    found: dict[str, tuple[Path, RobotDescription]] = {}
+def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, str, str]]:
+    """Path, topic or node, and text of logs' and captures' URDFs, each once; skips other inputs."""
+    found: dict[str, tuple[Path, str, str]] = {}
     for path in paths:
         said = []
         if is_capture(path):
-            said = robot_description_of(path)
+            said = read_robot_description(path)
         elif path.exists() and not has_views(path):
             with suppress(InputError):  # who reads it says why
                 said = robot_descriptions(open_raw_log(path))
-        for description in said:
-            found.setdefault(description.text, (path, description))
+        for where, text in said:
+            found.setdefault(text, (path, where, text))
     return list(found.values())
 
 
@@ -111,8 +108,7 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
     Raises InputError if missing, or if one of several is no log.
     """
     for path in paths:
-        if not path.exists():
-            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+        refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
         if path.suffix == ".toml" or is_capture(path) or has_views(path):
             if len(paths) == 1:
                 return None
@@ -124,13 +120,12 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
 def describe(path: Path, options: SourceOptions | None = None) -> Summary:
     """Describe any input. Raises InputError if missing or unknown."""
     options = options or SourceOptions()
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
     if path.is_dir():
         return _describe_folder(path, options)
     with path.open("rb") as stream:
         start = stream.read(16)
-    if start.startswith(tuple(kind.magic for kind in CONTAINERS)) or path.suffix in (*SUFFIXES, *VIDEOS):
+    if start.startswith(tuple(magic for magic, _ in CONTAINERS.values())) or path.suffix in (*SUFFIXES, *VIDEOS):
         return describe_log(open_log(path), options)
     if path.suffix == ".toml" and is_calibration(path):
         return describe_calibration(path)
@@ -148,22 +143,20 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     """Topics, times, frames, cameras, and what a reconstruction misses."""
     found, sampling = survey_to_describe(log)
-    with_messages = [t for t in found.topics.values() if t.count]
+    logged = [t for t in found.topics.values() if t.count]
+    first, last = min((t.first_log_ns for t in logged), default=0), max((t.last_log_ns for t in logged), default=0)
+    times = {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
+    frames = {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
+    joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
+    robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
     facts: dict[str, object] = {
         "bytes": sum(file.stat().st_size for file in log.files),
         "messages": found.num_messages,
+        **(times if logged else {}),
+        **(frames if found.tf.frames else {}),
+        **({"joints": list(joints)} if joints else {}),
+        **({ROBOT: robots} if robots else {}),
     }
-    if with_messages:
-        first, last = min(t.first_log_ns for t in with_messages), max(t.last_log_ns for t in with_messages)
-        facts |= {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
-    if found.tf.frames:
-        facts |= {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
-    joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
-    if joints:
-        facts["joints"] = list(joints)
-    robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
-    if robots:
-        facts[ROBOT] = robots
     rows = [_topic_row(found.topics[name]) for name in sorted(found.topics)]
     grids = [
         Grid(
@@ -178,14 +171,13 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
         grids.append(Grid(name="cameras", header=("camera", "color", "depth", "camera_info"), rows=rows))
     lacks = missing(log, found, options) if found.num_messages else ["the log holds no messages"]
-    notes = [*sampling, *found.damage.all_notes, *found.tf.notes]
     return Summary(
         path=str(log.path),
         kind=log.container,
         facts=facts,
         grids=tuple(grids),
         missing=tuple(lacks),
-        notes=tuple(notes),
+        notes=(*sampling, *found.damage.all_notes, *found.tf.notes),
         damaged=found.damage.count,
     )
 
@@ -216,9 +208,7 @@ def _first(entry: TopicSurvey) -> str:
     if calibration is not None:
         K = calibration.K
         return f"{calibration.width}x{calibration.height} fx {K[0, 0]:.1f} cx {K[0, 2]:.1f} cy {K[1, 2]:.1f}"
-    if entry.joints.first_names is not None:
-        return f"{len(entry.joints.first_names)} joints"
-    return "-"
+    return f"{len(entry.joints.first_names)} joints" if entry.joints.first_names is not None else "-"
 
 
 def _describe_folder(path: Path, options: SourceOptions) -> Summary:
@@ -245,15 +235,18 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     entries = [path / name for name in names_in(path)[:1000]]
     rows = [[file.name + "/" if file.is_dir() else file.name, *files_below(file)] for file in entries]
     count, size = files_below(path)
-    facts: dict[str, object] = {"files": count, "bytes": size}
-    if "splats.ply" in names:
-        facts["splats"] = describe_file(path / "splats.ply").facts
-    if "occupancy.npz" in names:
-        facts["space"] = _known_space(path, has_run="run.json" in names)
-    facts |= field
-    if "run.json" in names and not field:
-        run = describe_file(path / "run.json").facts
-        facts["run"] = {key: value for key, value in run.items() if key != "config"}  # `info run.json` shows it
+    has_run, is_run = "run.json" in names, "run.json" in names and not field
+    run = describe_file(path / "run.json").facts if is_run else {}
+    facts: dict[str, object] = {
+        "files": count,
+        "bytes": size,
+        **({"splats": describe_file(path / "splats.ply").facts} if "splats.ply" in names else {}),
+        **({"space": _known_space(path, has_run=has_run)} if "occupancy.npz" in names else {}),
+        **field,
+        **(
+            {"run": {key: value for key, value in run.items() if key != "config"}} if is_run else {}
+        ),  # `info run.json`
+    }
     grid = Grid(name="files", header=("name", "files", "bytes"), rows=rows)
     return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,))
 
@@ -273,8 +266,7 @@ def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
 
 def _probability(value: Any) -> float:
     number = float(value)
-    if not 0.0 < number < 1.0:
-        raise ValueError(f"{number}, expected a probability between 0 and 1")
+    refuse_if(not 0.0 < number < 1.0, f"{number}, expected a probability between 0 and 1", error=ValueError)
     return number
 
 
@@ -306,21 +298,13 @@ def _describe_capture(path: Path) -> Summary:
 
 def _describe_images(path: Path, source: ImageFolderSource, kind: str) -> Summary:
     first = next((item for item in source.stored() if isinstance(item, StoredFrame)), None)
-    counts = source.count_views()
-    facts: dict[str, object] = {"has_clock": source.has_clock}
-    if first is not None:
-        valid = first.frame.depth > 0
-        intrinsics = first.frame.intrinsics
-        facts |= {
-            "size": f"{intrinsics.width}x{intrinsics.height}",
-            "fx_fy_cx_cy": [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
-            "first_valid_depth_share": round(float(valid.mean()), 4),
-        }
-    loss = source.loss
-    facts["loss"] = {
-        "unpaired_color": loss.unpaired_color,
-        "unpaired_depth": loss.unpaired_depth,
-        "without_pose": loss.without_pose,
+    counts = {name: sum(camera == name for _, camera, _ in source.poses()) for name in source.cameras}
+    loss, k = source.loss, None if first is None else first.intrinsics
+    facts: dict[str, object] = {
+        "has_clock": source.has_clock,
+        **({} if k is None else {"size": f"{k.width}x{k.height}", "fx_fy_cx_cy": [k.fx, k.fy, k.cx, k.cy]}),
+        **({} if first is None else {"first_valid_depth_share": round(float((first.depth > 0).mean()), 4)}),
+        "loss": {name: getattr(loss, name) for name in ("unpaired_color", "unpaired_depth", "without_pose")},
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
     refusal = lacks_depth(source)

@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if
 
 CALIBRATION = "--calibration "  # begins the name of a calibration among the files that were read
 NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # of a distortion, that OpenCV takes
@@ -27,19 +27,12 @@ class CameraTopics:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseTopic:
-    """A topic of poses; frame: what it poses, "" for the messages' or the camera's."""
-
-    topic: str
-    frame: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
 class SourceOptions:
     """The user's settings for an input; the defaults fit a well-formed log.
 
     world_frame: of poses (default: tf's root). cameras: only these (default: all). By camera name: camera_topics;
-    camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf has none; human_topics:
+    camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf has
+    none, with the frame that they pose or ""; human_topics:
     images not 0 on a person; intrinsics: fx, fy, cx, cy [px] and distortion coefficients. depth_scale [m per count].
     root: of an image folder's files. holdout: its frames (index or name) for camera `holdout`. stamps: ``header`` or
     ``log``. calibration: a file of `calibrate`. perturb: changes to frames (`calibrated`).
@@ -49,7 +42,7 @@ class SourceOptions:
     cameras: tuple[str, ...] | None = None
     camera_topics: tuple[CameraTopics, ...] = ()
     camera_poses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    camera_pose_topics: Mapping[str, PoseTopic] = field(default_factory=dict)
+    camera_pose_topics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     human_topics: Mapping[str, str] = field(default_factory=dict)
     intrinsics: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     depth_scale: float | None = None
@@ -64,24 +57,28 @@ class SourceOptions:
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
         """Raise InputError for a set option that does not apply to this input."""
-        flags = {"camera_topics": "camera", "human_topics": "human-topic"}
-        flags |= dict.fromkeys(["camera_poses", "camera_pose_topics"], "camera-pose")
+        flags = {
+            "camera_topics": "camera",
+            "human_topics": "human-topic",
+            **dict.fromkeys(["camera_poses", "camera_pose_topics"], "camera-pose"),
+        }
         default = SourceOptions()
         for name in names:
-            if getattr(self, name) != getattr(default, name):
-                flag = flags.get(name, name.replace("_", "-"))
-                remedy = "leave it out"
-                if (name, kind) == ("holdout", "a capture"):
-                    remedy = "give it to `splatctrl ingest`, which makes a camera `holdout` of these views"
-                raise InputError(f"{path}: --{flag} does not apply to {kind}", remedy=remedy)
+            flag = flags.get(name, name.replace("_", "-"))
+            is_split = (name, kind) == ("holdout", "a capture")
+            refuse_if(
+                getattr(self, name) != getattr(default, name),
+                f"{path}: --{flag} does not apply to {kind}",
+                remedy="give it to `splatctrl ingest`, which makes a camera `holdout` of these views"
+                if is_split
+                else "leave it out",
+            )
 
 
-def still_note(camera: str) -> str:
-    return f"camera {camera}: stands still where --camera-pose puts it, not where the recording may say"
+still_note = "camera {}: stands still where --camera-pose puts it, not where the recording may say".format
 
 
 def refuse_unknown_cameras(where: Path, asked: Iterable[str], known: Collection[str]) -> None:
     """Raise InputError for a requested camera not in the recording."""
     for name in asked:
-        if name not in known:
-            raise InputError(f"{where}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")
+        refuse_if(name not in known, f"{where}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")

@@ -14,8 +14,8 @@ from splatctrl_cli.checks.clock_offset import (
     ImageMotion,
     RobotPoints,
     estimate_clock_offset,
+    select_states,
     silhouettes,
-    states_asked,
 )
 from splatctrl_cli.checks.finding import Severity
 from splatctrl_cli.errors import InputError
@@ -161,7 +161,7 @@ def sample(plain_arm: Path) -> tuple[list[JointState], ImageMotion, RobotPoints]
             motion.add(record)
     moving = model.moving_spheres
     q = np.array([state.position for state in states])
-    points = RobotPoints(centers=model.sphere_centers_batch(q)[:, moving], radii=model.sphere_set.radii[moving])
+    points = (model.sphere_centers_batch(q)[:, moving], model.sphere_set.radii[moving])
     return states, motion, points
 
 
@@ -211,16 +211,16 @@ def test_the_offset_is_found_from_few_states_of_a_dense_log(
     stamps = np.arange(known[0], known[-1] + 120 * 10**9, 5_000_000)
     q = np.array([state.position for state in states])
     position = np.column_stack([np.interp(stamps, known, q[:, j]) for j in range(q.shape[1])])
-    centers = np.array(points.centers[np.searchsorted(known, stamps, side="right") - 1][:, :8])
+    centers = np.array(points[0][np.searchsorted(known, stamps, side="right") - 1][:, :8])
 
     def found_from(index: np.ndarray) -> ClockOffset:
         some = [
             JointState(stamp_ns=int(stamps[i]), position=position[i], velocity=np.zeros(q.shape[1])) for i in index
         ]
-        robot = RobotPoints(centers=centers[index], radii=points.radii[:8]) if has_robot else None
+        robot = (centers[index], points[1][:8]) if has_robot else None
         return estimate_clock_offset(some, long, robot)
 
-    asked = states_asked(stamps, long)
+    asked = select_states(stamps, long)
     assert len(asked) < len(stamps) // 2
     assert found_from(asked) == found_from(np.arange(len(stamps)))
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.files import spilled_rows
-from splatctrl_cli.files.spilled_rows import RowFile, Rows, scratch_folder, selected
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, scratch_folder, select
 from splatctrl_cli.formats import arrays
 from splatctrl_cli.recording.log import state_columns
 from splatctrl_cli.recording.log.state_columns import StateCollector
 from splatctrl_cli.recording.log.state_topics import checked_stamps
-from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, differentiated, smoothed_seconds
+from splatctrl_cli.recording.log.state_track import RawTrack, clean_states, differentiate, smoothed_seconds
 from splatctrl_cli.recording.source import SourceOptions
 from splatctrl_cli.recording.state import state_table
 from splatctrl_cli.recording.state.state_source import open_states
@@ -45,10 +45,10 @@ def test_rows_are_read_as_those_of_an_array(monkeypatch: pytest.MonkeyPatch, in_
     assert (len(table), table.shape) == (40, (40, 3))
     assert np.array_equal(table[5:9], values[5:9]) and np.array_equal(table[-1], values[-1])
     assert np.array_equal(table[far], values[far]) and not len(table[40:50])
-    chosen = table.select(far).of_columns(np.array([2, 0]))
+    chosen = table.select(far).select(columns=np.array([2, 0]))
     assert np.array_equal(chosen[1:4], values[far][1:4][:, [2, 0]])
     assert np.array_equal(chosen.select(np.array([3, 0]))[:2], values[[17, 39]][:, [2, 0]])
-    assert np.array_equal(selected(values, far), values[far])
+    assert np.array_equal(select(values, far), values[far])
     table[0:1][0, 0] = 9.0  # a copy
     assert table[0][0] == 0.0
     with pytest.raises(ValueError, match="expected"):
@@ -98,9 +98,9 @@ def test_the_clock_is_smoothed_as_by_a_line_through_the_neighbours(block: int) -
 
 def test_velocities_are_the_same_to_the_bit_in_any_blocks(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
     stamps, q = uneven(300)
-    found = differentiated(stamps, q)
+    found = differentiate(stamps, q)
     monkeypatch.setattr(spilled_rows, "BLOCK", 10_000)
-    assert np.array_equal(found, differentiated(stamps, q))
+    assert np.array_equal(found, differentiate(stamps, q))
 
 
 def test_states_are_cleaned_the_same_in_any_blocks(block: int) -> None:
@@ -109,13 +109,13 @@ def test_states_are_cleaned_the_same_in_any_blocks(block: int) -> None:
     q[20], stamps[31] = np.nan, stamps[30]
     velocity = np.where(np.arange(60)[:, None] % 9 == 0, np.nan, 0.1) * np.ones((60, 7))
     columns = {"position": filled(q[order]), "velocity": filled(velocity[order])}
-    states = cleaned(RawTrack(where="x", names=JOINTS, stamp_ns=stamps[order], **columns), loss)
+    states = clean_states(RawTrack(where="x", names=JOINTS, stamp_ns=stamps[order], **columns), loss)
     kept = [i for i in range(60) if i != 20]
     first = {int(stamps[i]): i for i in sorted(kept, key=lambda i: -list(order).index(i))}
     chosen = [first[stamp] for stamp in sorted(first)]
     assert [s.stamp_ns for s in states] == sorted(first) and len(states) == 58
     assert np.array_equal(np.array([s.position for s in states]), q[chosen])
-    slopes = differentiated(stamps[chosen], q[chosen])
+    slopes = differentiate(stamps[chosen], q[chosen])
     wanted = np.where(np.isnan(velocity[chosen]), slopes, velocity[chosen])
     assert np.array_equal(np.array([s.velocity for s in states]), wanted)
     assert np.array_equal(states[-1].position, states[57].position) and len(states[3:9:2]) == 3

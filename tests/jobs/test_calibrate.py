@@ -210,9 +210,9 @@ def test_each_frame_of_the_wrist_is_where_the_hand_was(
 def test_check_has_the_frames_of_the_wrist_there_too(
     wrist: SetUp, wrist_log: Path, wrist_result: CalibrateResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(check_log, "judged", lambda _, evidence, *__, **___: evidence)
-    evidence: Any = check_log.check_log(open_raw_log(wrist_log), SourceOptions(calibration=wrist_result.out))
-    frames = [frame for frame in evidence.frames if frame.camera == WRIST]
+    monkeypatch.setattr(check_log, "judge_frames", lambda *_, frames, **__: frames)
+    found: Any = check_log.check_log(open_raw_log(wrist_log), SourceOptions(calibration=wrist_result.out))
+    frames = [frame for frame in found if frame.camera == WRIST]
     assert frames
     assert max(off_hand(wrist, frame.stamp_ns, frame.T_world_camera)[0] for frame in frames) < 0.003
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.recording.calibrated import Perturbation, PerturbedSource
+from splatctrl_cli.recording.calibrated import ChangedSource, Perturbation
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
@@ -65,7 +65,7 @@ def test_a_camera_is_moved_and_turned_by_as_much_as_asked_the_same_in_every_fram
 
 
 def test_no_error_is_the_recording_itself_and_an_error_is_among_what_was_read(log: Path) -> None:
-    assert not isinstance(open_source(log, SourceOptions(perturb={"depth-noise": 0.0, "seed": 3})), PerturbedSource)
+    assert not isinstance(open_source(log, SourceOptions(perturb={"depth-noise": 0.0, "seed": 3})), ChangedSource)
     plain, noisy = open_source(log), open_source(log, SourceOptions(perturb={"depth-noise": 0.01}))
     assert noisy.digests().items() - plain.digests().items() == {("--perturb depth-noise=0.01", "depth-noise=0.01")}
     assert "perturbed: depth-noise=0.01" in noisy.loss.notes

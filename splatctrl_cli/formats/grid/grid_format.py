@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.files.summary import Grid, Summary
-from splatctrl_cli.records import DistanceGrid, Float64, Values
+from splatctrl_cli.records import DistanceGrid, Values
 
 FORMAT = "splatctrl distance grid"
 VERSION = 2
@@ -59,19 +59,7 @@ CHANNELS: Mapping[str, Channel] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridHead:
-    """A grid file's head: origin (3,) float64 and voxel [m], cells along x, y, z."""
-
-    origin: Float64
-    voxel: float
-    shape: Shape
-    channels: tuple[str, ...]
-    header: dict[str, object]
-
-
 def file_header(grid: DistanceGrid) -> dict[str, object]:
-    """The header with format and version."""
     return {**grid.header, "format": FORMAT, "version": VERSION}
 
 
@@ -82,12 +70,13 @@ def header_text(grid: DistanceGrid) -> str:
 def parse_header(name: str, text: str) -> dict[str, object]:
     """Parse a header. Raises InputError naming `name` if invalid or of another version."""
     with refuse_faults(f"{name}: header: not JSON", json.JSONDecodeError, remedy="bake it again"):
-        parsed = json.loads(text)
-    if not isinstance(parsed, dict) or parsed.get("version") != VERSION:
-        version = parsed.get("version") if isinstance(parsed, dict) else None
-        raise InputError(
-            f"{name}: header: expected version {VERSION}, got {version!r}", remedy="bake it again with this splatctrl"
-        )
+        parsed: dict[str, object] = json.loads(text)
+    version = parsed.get("version") if isinstance(parsed, dict) else None
+    refuse_if(
+        version != VERSION,
+        f"{name}: header: expected version {VERSION}, got {version!r}",
+        remedy="bake it again with this splatctrl",
+    )
     return parsed
 
 
@@ -96,22 +85,26 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
 
     Raises InputError without sdf, or for an unknown name, dtype or shape.
     """
-    if not {"sdf"} <= arrays.keys() <= CHANNELS.keys():
-        raise InputError(
-            f"{name}: expected the channel sdf and any of {', '.join(list(CHANNELS)[1:])}, "
-            f"got {', '.join(arrays) or 'none'}",
-            remedy="give a grid that sdf-bake wrote",
-        )
+    refuse_if(
+        not {"sdf"} <= arrays.keys() <= CHANNELS.keys(),
+        f"{name}: expected the channel sdf and any of {', '.join(list(CHANNELS)[1:])}, "
+        f"got {', '.join(arrays) or 'none'}",
+        remedy="give a grid that sdf-bake wrote",
+    )
     cells = arrays["sdf"][1]
-    if len(cells) != 3 or min(cells) < 1:
-        raise InputError(f"{name}: sdf: expected (X, Y, Z) cells, got {cells}", remedy="bake it again")
+    refuse_if(
+        len(cells) != 3 or min(cells) < 1,
+        f"{name}: sdf: expected (X, Y, Z) cells, got {cells}",
+        remedy="bake it again",
+    )
     shape = (cells[0], cells[1], cells[2])
     for channel, got in arrays.items():
         wanted = (CHANNELS[channel].dtype, CHANNELS[channel].shape(shape))
-        if got != wanted:
-            raise InputError(
-                f"{name}: {channel}: expected {wanted[0]} {wanted[1]}, got {got[0]} {got[1]}", remedy="bake it again"
-            )
+        refuse_if(
+            got != wanted,
+            f"{name}: {channel}: expected {wanted[0]} {wanted[1]}, got {got[0]} {got[1]}",
+            remedy="bake it again",
+        )
     return shape
 
 
@@ -148,8 +141,9 @@ def x_fastest(values: Values) -> Iterator[Values]:
     for start in range(0, z, step):
         planes = np.empty((min(step, z - start), y, x, *values.shape[3:]), values.dtype)
         for at in range(0, x, TILE):
-            tile = values[at : at + TILE, :, start : start + step]
-            planes[:, :, at : at + TILE] = tile.transpose(2, 1, 0, *range(3, values.ndim))
+            planes[:, :, at : at + TILE] = values[at : at + TILE, :, start : start + step].transpose(
+                2, 1, 0, *range(3, values.ndim)
+            )
         yield planes
 
 
@@ -194,22 +188,17 @@ def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
 
 
 def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
-    """The header's `FIELD_FACTS`."""
     return {key: header[key] for key in FIELD_FACTS if header.get(key) is not None}
 
 
-def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
+def summary_of(path: Path, kind: str, grid: DistanceGrid) -> Summary:
     table = Grid(
         name="channels",
         header=("channel", "dtype", "unit"),
-        rows=[[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels],
+        rows=[[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in grid.channels],
     )
-    return Summary(
-        path=str(path),
-        kind=kind,
-        facts={**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)},
-        grids=(table,),
-    )
+    facts = {**covers(grid.origin, grid.voxel, grid.channels["sdf"].shape), **header_facts(grid.header)}
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(table,))
 
 
 def json_value(text: object) -> object:
@@ -252,17 +241,19 @@ class GridSlabs:
 
         counts: the baker's so far. Raises InputError if channels or shapes differ from the plan.
         """
-        if slab.keys() != set(self.plan.channels):
-            raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")
+        refuse_if(
+            slab.keys() != set(self.plan.channels),
+            f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}",
+        )
         num = len(slab[self.plan.channels[0]])
         for name in self.plan.channels:
-            wanted = (CHANNELS[name].dtype, self._shape(name, num))
+            wanted = (CHANNELS[name].dtype, CHANNELS[name].shape((num, *self.plan.shape[1:])))
             values = slab[name]
-            if (values.dtype.str, values.shape) != wanted or num + self.num_layers > self.plan.shape[0]:
-                raise InputError(
-                    f"slab: {name} at layer {self.num_layers} of {self.plan.shape[0]}: expected {wanted}, "
-                    f"got {(values.dtype.str, values.shape)}"
-                )
+            refuse_if(
+                (values.dtype.str, values.shape) != wanted or num + self.num_layers > self.plan.shape[0],
+                f"slab: {name} at layer {self.num_layers} of {self.plan.shape[0]}: expected {wanted}, "
+                f"got {(values.dtype.str, values.shape)}",
+            )
             self._write_channel(name, values)
         self.num_layers += num
         self.counts = counts or {}
@@ -273,11 +264,11 @@ class GridSlabs:
 
     def grid(self, header: Mapping[str, object]) -> DistanceGrid:
         """Open as read-only memory maps. Raises InputError before it is whole."""
-        if not self.is_whole():
-            raise InputError(
-                f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
-                remedy="continue the bake",
-            )
+        refuse_if(
+            not self.is_whole(),
+            f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
+            remedy="continue the bake",
+        )
         channels: dict[str, Values] = {
             name: np.lib.format.open_memmap(self.folder / f"{name}.npy", mode="r") for name in self.plan.channels
         }
@@ -288,12 +279,11 @@ class GridSlabs:
             header=dict(header),
         )
 
-    def _shape(self, name: str, num_layers: int) -> tuple[int, ...]:
-        return CHANNELS[name].shape((num_layers, *self.plan.shape[1:]))
-
     def _write_channel(self, name: str, values: Values) -> None:
         path = self.folder / f"{name}.npy"
-        layer = np.dtype(CHANNELS[name].dtype).itemsize * int(np.prod(self._shape(name, 1)))
+        layer = np.dtype(CHANNELS[name].dtype).itemsize * int(
+            np.prod(CHANNELS[name].shape((1, *self.plan.shape[1:])))
+        )
         with path.open("r+b") as stream:
             stream.seek(path.stat().st_size - layer * (self.plan.shape[0] - self.num_layers))
             stream.write(np.ascontiguousarray(values).data)
@@ -329,9 +319,8 @@ def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
         raise InputError(f"{folder / PROGRESS}: not readable: {error!r}", remedy="bake without --resume") from None
     wanted = plan.as_dict()
     differs = [key for key in wanted if left.get(key) != wanted[key]]
-    if differs:
-        told = ", ".join(_difference(key, left.get(key), wanted[key]) for key in differs)
-        raise UsageError(f"{folder}: cannot be continued: {told}", remedy="bake without --resume")
+    changes = ", ".join(_difference(key, left.get(key), wanted[key]) for key in differs)
+    refuse_if(differs, f"{folder}: cannot be continued: {changes}", remedy="bake without --resume", error=UsageError)
     for name in plan.channels:
         path = folder / f"{name}.npy"
         size = CHANNELS[name].shape(plan.shape)
@@ -339,8 +328,7 @@ def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
             found = np.lib.format.open_memmap(path, mode="r").shape
         except (OSError, ValueError):  # not there, or cut
             found = ()
-        if found != size:
-            raise InputError(f"{path}: expected {size}, got no such array", remedy="bake without --resume")
+        refuse_if(found != size, f"{path}: expected {size}, got no such array", remedy="bake without --resume")
     return GridSlabs(folder, plan, num_layers, counts)
 
 

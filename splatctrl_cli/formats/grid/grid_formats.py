@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.formats.grid.grid_format import STEM, GridFormat
 from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.records import DistanceGrid
@@ -17,21 +17,25 @@ def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: s
     unknown: the policy; ``nan`` blanks cells.
     """
     strange = [name for name in names if name not in FORMATS]
-    if strange or not names:
-        raise UsageError(f"formats: expected some of {', '.join(FORMATS)}, got {', '.join(strange) or 'none'}")
+    refuse_if(
+        strange or not names,
+        f"formats: expected some of {', '.join(FORMATS)}, got {', '.join(strange) or 'none'}",
+        error=UsageError,
+    )
     for name in names:
         kind = FORMATS[name]
-        if not kind.needs & set(channels):
-            raise UsageError(
-                f"format {name}: expected one of the channels {', '.join(sorted(kind.needs))}, "
-                f"got {', '.join(channels)}",
-                remedy="bake it too, or leave the format out",
-            )
-        if unknown == "nan" and not kind.holds_unknown:
-            raise UsageError(
-                f"format {name}: cannot hold cells without a distance",
-                remedy="bake with field.unknown=obstacle or free, or leave the format out",
-            )
+        refuse_if(
+            not kind.needs & set(channels),
+            f"format {name}: expected one of the channels {', '.join(sorted(kind.needs))}, got {', '.join(channels)}",
+            remedy="bake it too, or leave the format out",
+            error=UsageError,
+        )
+        refuse_if(
+            unknown == "nan" and not kind.holds_unknown,
+            f"format {name}: cannot hold cells without a distance",
+            remedy="bake with field.unknown=obstacle or free, or leave the format out",
+            error=UsageError,
+        )
         kind.check()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_faults, refuse_if
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.grid.grid_format import CHUNK, GridFormat, check_grid
 from splatctrl_cli.libraries import trimesh
@@ -29,10 +29,12 @@ def iso_surface(grid: DistanceGrid) -> Any:
     Raises NotEvaluableError if no cube crosses 0.
     """
     shape, values = check_grid(grid), grid.channels["sdf"]
-    if min(shape) < 2:
-        raise NotEvaluableError(
-            f"surface: expected at least 2 cells along each axis, got {shape}", remedy="bake a larger --box"
-        )
+    refuse_if(
+        min(shape) < 2,
+        f"surface: expected at least 2 cells along each axis, got {shape}",
+        remedy="bake a larger --box",
+        error=NotEvaluableError,
+    )
     step = max(1, CHUNK // max(1, values.nbytes // shape[0]))
     vertices, faces, count = [], [], 0
     lowest, highest = np.inf, -np.inf
@@ -47,14 +49,14 @@ def iso_surface(grid: DistanceGrid) -> Any:
             vertices.append(found[0] + (start, 0.0, 0.0))
             faces.append(found[1].astype(np.int64) + count)
             count += len(found[0])
-    if not vertices:
-        is_any = lowest <= highest
-        got = f"values from {lowest:.4g} to {highest:.4g} m" if is_any else "no cell that has a distance"
-        raise NotEvaluableError(
-            f"surface: expected sdf to cross 0 m, got {got}",
-            remedy="bake with a smaller voxel",
-        )
-    return _joined(grid, np.concatenate(vertices), np.concatenate(faces))
+    got = f"values from {lowest:.4g} to {highest:.4g} m" if lowest <= highest else "no cell that has a distance"
+    refuse_if(
+        not vertices,
+        f"surface: expected sdf to cross 0 m, got {got}",
+        remedy="bake with a smaller voxel",
+        error=NotEvaluableError,
+    )
+    return _join(grid, np.concatenate(vertices), np.concatenate(faces))
 
 
 def write_surface(path: Path, surface: Any) -> None:
@@ -91,8 +93,7 @@ def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64
     return vertices.astype(np.float64), faces
 
 
-def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Any:
-    """Merge equal vertices, in world; drop collapsed triangles."""
+def _join(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Any:
     unique, index = np.unique(np.round(vertices / STEP), axis=0, return_inverse=True)
     joined = index.reshape(-1)[faces]
     first, second, third = joined.T
@@ -101,16 +102,15 @@ def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> 
 
 
 def describe_mesh(path: Path, _head: bytes) -> Summary | None:
-    """Summarise a ``.obj`` or ``.stl``, read whole."""
     if path.suffix.lower() not in {".obj", ".stl"}:
         return None
-    try:
+    with refuse_faults(
+        f"{path}: not a readable mesh", Exception, remedy="the file is damaged"
+    ):  # whatever its parsers meet
         mesh = trimesh.load_mesh(path, process=False)
         mesh.merge_vertices()  # .stl has three a triangle
         facts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "is_watertight": bool(mesh.is_watertight)}
         lower, upper = np.round(mesh.bounds, 6).tolist()
-    except Exception as error:  # whatever its parsers meet
-        raise InputError(f"{path}: not a readable mesh: {error}", remedy="the file is damaged") from None
     return Summary(path=str(path), kind="mesh", facts={**facts, "lower": lower, "upper": upper})
 
 

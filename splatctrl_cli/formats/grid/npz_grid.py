@@ -13,12 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.arrays import DAMAGE, check_numbers, has_arrays, npy_head, savez
 from splatctrl_cli.formats.grid.grid_format import (
     GridFormat,
-    GridHead,
     check_finite,
     check_grid,
     check_layout,
@@ -26,7 +25,7 @@ from splatctrl_cli.formats.grid.grid_format import (
     parse_header,
     summary_of,
 )
-from splatctrl_cli.records import DistanceGrid, Values
+from splatctrl_cli.records import DistanceGrid, Float64, Values
 
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}
 
@@ -47,30 +46,31 @@ def write_npz(path: Path, grid: DistanceGrid) -> None:
     savez(path, {**members, **grid.channels}, level=0)
 
 
-def read_npz(path: Path) -> DistanceGrid:
-    """Read the grid of `write_npz`; never unpickles.
+def read_npz(path: Path, *, with_values: bool = True) -> DistanceGrid:
+    """Read the grid of `write_npz`; never unpickles. Without values, channels are zeros.
 
     Raises InputError if missing, damaged (checksums included), not finite, of another version or not ours. NaN is
     allowed in sdf and gradient if the header's ``unknown`` is ``nan``.
     """
     with _opened(path) as archive:
-        head = _head(path, archive, _members(archive))
-        channels = {name: _array(archive, name) for name in head.channels}
-    grid = DistanceGrid(origin=head.origin, voxel=head.voxel, channels=channels, header=head.header)
-    check_finite(str(path), grid)
+        members = _members(archive)
+        origin, voxel, header = _head(path, archive, members)
+        layout = {name: (kind.str, size) for name, (kind, size) in members.items() if name not in {*PLACE, "header"}}
+        check_layout(str(path), layout)
+        channels = {
+            name: _array(archive, name) if with_values else np.broadcast_to(np.zeros((), kind), size)
+            for name, (kind, size) in layout.items()
+        }
+    grid = DistanceGrid(origin=origin, voxel=voxel, channels=channels, header=header)
+    if with_values:
+        check_finite(str(path), grid)
     return grid
-
-
-def read_npz_head(path: Path) -> GridHead:
-    """Read all but the channels' values, which are not checked. Raises as `read_npz`."""
-    with _opened(path) as archive:
-        return _head(path, archive, _members(archive))
 
 
 def describe_npz(path: Path, head: bytes) -> Summary | None:
     """Summarise a ``field.npz``. Raises InputError if damaged or of another version."""
     is_ours = has_arrays(path, head, {*PLACE, "header", "sdf"})
-    return summary_of(path, "distance grid", read_npz_head(path)) if is_ours else None
+    return summary_of(path, "distance grid", read_npz(path, with_values=False)) if is_ours else None
 
 
 @contextmanager
@@ -92,53 +92,65 @@ def _members(archive: zipfile.ZipFile) -> _Members:
     members: _Members = {}
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")
-        if name in members or name == entry.filename:
-            raise ValueError(f"{entry.filename}: expected one .npy of each name")
+        refuse_if(
+            name in members or name == entry.filename,
+            f"{entry.filename}: expected one .npy of each name",
+            error=ValueError,
+        )
         with archive.open(entry) as stream:
             shape, _, dtype = npy_head(stream)
             check_numbers(dtype)
             size = stream.tell() + dtype.itemsize * prod(shape)
-        if entry.file_size != size:
-            raise ValueError(f"{entry.filename}: expected {size} bytes, got {entry.file_size}")
+        refuse_if(
+            entry.file_size != size,
+            f"{entry.filename}: expected {size} bytes, got {entry.file_size}",
+            error=ValueError,
+        )
         members[name] = (dtype, shape)
     size = sum(entry.file_size for entry in archive.infolist() if entry.compress_type != zipfile.ZIP_STORED)
-    if size > MOST_PACKED:
-        raise ValueError(
-            f"{size} bytes in compressed arrays, expected at most {MOST_PACKED}, or arrays not compressed"
-        )
+    refuse_if(
+        size > MOST_PACKED,
+        f"{size} bytes in compressed arrays, expected at most {MOST_PACKED}, or arrays not compressed",
+        error=ValueError,
+    )
     return members
 
 
-def _head(path: Path, archive: zipfile.ZipFile, members: _Members) -> GridHead:
-    if {*PLACE, "header", "sdf"} - members.keys():
-        raise InputError(
-            f"{path}: expected the arrays origin, voxel, header and sdf, got {', '.join(members) or 'none'}",
-            remedy="give a field.npz that sdf-bake wrote",
-        )
+def _head(path: Path, archive: zipfile.ZipFile, members: _Members) -> tuple[Float64, float, dict[str, object]]:
+    """Origin (3,) [m], voxel [m] and header."""
+    refuse_if(
+        {*PLACE, "header", "sdf"} - members.keys(),
+        f"{path}: expected the arrays origin, voxel, header and sdf, got {', '.join(members) or 'none'}",
+        remedy="give a field.npz that sdf-bake wrote",
+    )
     dtype, text_shape = members["header"]
-    if dtype.kind != "U" or text_shape != ():
-        raise InputError(f"{path}: header: expected one string, got {dtype} {text_shape}", remedy="bake it again")
+    refuse_if(
+        dtype.kind != "U" or text_shape != (),
+        f"{path}: header: expected one string, got {dtype} {text_shape}",
+        remedy="bake it again",
+    )
     header = parse_header(str(path), str(_array(archive, "header")))
     for name, expected in PLACE.items():
         got = (members[name][0].str, members[name][1])
-        if got != expected:
-            raise InputError(f"{path}: {name}: expected {expected}, got {got}", remedy="bake it again")
+        refuse_if(got != expected, f"{path}: {name}: expected {expected}, got {got}", remedy="bake it again")
     origin, voxel = _array(archive, "origin").astype(np.float64), float(_array(archive, "voxel").astype(np.float64))
-    if not np.isfinite(origin).all():
-        raise InputError(f"{path}: origin: expected 3 finite float64, got {origin.tolist()}", remedy="bake it again")
-    if not 0.0 < voxel < np.inf:
-        raise InputError(f"{path}: voxel: expected a size above 0 m, got {voxel}", remedy="bake it again")
-    layout = {name: (kind.str, size) for name, (kind, size) in members.items() if name not in {*PLACE, "header"}}
-    return GridHead(
-        origin=origin, voxel=voxel, shape=check_layout(str(path), layout), channels=tuple(layout), header=header
+    refuse_if(
+        not np.isfinite(origin).all(),
+        f"{path}: origin: expected 3 finite float64, got {origin.tolist()}",
+        remedy="bake it again",
     )
+    refuse_if(
+        not 0.0 < voxel < np.inf, f"{path}: voxel: expected a size above 0 m, got {voxel}", remedy="bake it again"
+    )
+    return origin, voxel, header
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Values:
     with archive.open(f"{name}.npy") as stream:
         array = np.lib.format.read_array(stream, allow_pickle=False)
-        if stream.read(1):  # reading to the end is what checks the sum
-            raise ValueError(f"{name}.npy goes on after its array")
+        refuse_if(
+            stream.read(1), f"{name}.npy goes on after its array", error=ValueError
+        )  # reading to the end is what checks the sum
     return np.asarray(array, order="C")
 
 

@@ -8,7 +8,7 @@ pairs ``splatctrl.KEY`` of JSON text.
 import json
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
@@ -65,8 +65,11 @@ def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
     text = read_bytes(path, 1 << 20)  # in which the header must end
     head, end, _ = text.partition(b"\n\n")
     lines = head.decode("utf-8", errors="replace").replace("\r\n", "\n").split("\n")
-    if not lines[0].startswith("NRRD000") or not end:
-        raise InputError(f"{path}: expected NRRD and a header that ends, got neither", remedy="the file is damaged")
+    refuse_if(
+        not lines[0].startswith("NRRD000") or not end,
+        f"{path}: expected NRRD and a header that ends, got neither",
+        remedy="the file is damaged",
+    )
     fields: dict[str, str] = {}
     pairs: dict[str, str] = {}
     for line in lines[1:]:
@@ -82,7 +85,6 @@ def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def describe_nrrd(path: Path, head: bytes) -> Summary | None:
-    """Summarise an NRRD file and our bake's header."""
     if not head.startswith(b"NRRD000"):
         return None
     fields, pairs = read_nrrd_head(path)

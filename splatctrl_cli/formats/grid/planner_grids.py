@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.arrays import DAMAGE, Pieces, has_arrays, read_arrays, savez
 from splatctrl_cli.formats.grid.grid_format import (
@@ -42,17 +42,17 @@ CUROBO = "0.7"  # the version that a file is for, as it says
 def write_curobo(path: Path, grid: DistanceGrid) -> None:
     """Write ``sdf`` for cuRobo. Raises InputError for NaN."""
     shape, distances = check_grid(grid), grid.channels["sdf"]
-    if any(np.isnan(layers).any() for layers in slabs(distances)):
-        raise InputError(
-            "grid to write for cuRobo: sdf: expected distances, got NaN",
-            remedy="bake with field.unknown=obstacle or free",
-        )
+    refuse_if(
+        any(np.isnan(layers).any() for layers in slabs(distances)),
+        "grid to write for cuRobo: sdf: expected distances, got NaN",
+        remedy="bake with field.unknown=obstacle or free",
+    )
     sides = np.array(shape, np.float64) - 1.0
     center = grid.origin + 0.5 * grid.voxel * sides - 0.5 * grid.voxel
-    features = Pieces(
-        dtype="<f4",
-        shape=(shape[0] * shape[1] * shape[2],),
-        make=lambda: (-layers.astype(np.float32, copy=False) for layers in slabs(distances)),
+    features: Pieces = (
+        "<f4",
+        (shape[0] * shape[1] * shape[2],),
+        lambda: (-layers.astype(np.float32, copy=False) for layers in slabs(distances)),
     )
     arrays: dict[str, Values | Pieces] = {
         "features": features,
@@ -100,11 +100,11 @@ def write_moveit(path: Path, grid: DistanceGrid) -> None:
     obstacles. Raises InputError with neither bound nor hard.
     """
     shape = check_grid(grid)
-    if not {"bound", "hard"} & grid.channels.keys():
-        raise InputError(
-            f"grid to write for MoveIt: expected the channel bound or hard, got {', '.join(grid.channels)}",
-            remedy="bake it with one of them",
-        )
+    refuse_if(
+        not {"bound", "hard"} & grid.channels.keys(),
+        f"grid to write for MoveIt: expected the channel bound or hard, got {', '.join(grid.channels)}",
+        remedy="bake it with one of them",
+    )
     numbers = (grid.voxel, *((n + MOVEIT_MARGIN) * grid.voxel for n in shape), *grid.origin)
     text = "".join(f"{name}: {float(value)!r}\n" for name, value in zip(FIELDS, numbers, strict=True))
     step = max(1, CHUNK // (4 * shape[1] * shape[2]))
@@ -137,8 +137,11 @@ def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
             numbers[name] = float(value)
         except ValueError:
             numbers[name] = np.nan
-        if key != name or not np.isfinite(numbers[name]):
-            raise InputError(f"{path}: expected '{name}: NUMBER', got {line!r}", remedy="the file is damaged")
+        refuse_if(
+            key != name or not np.isfinite(numbers[name]),
+            f"{path}: expected '{name}: NUMBER', got {line!r}",
+            remedy="the file is damaged",
+        )
     return numbers, start
 
 

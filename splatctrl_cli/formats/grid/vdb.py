@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
@@ -73,10 +73,10 @@ def openvdb() -> Any:
     try:
         import openvdb as module
     except ImportError:
-        try:
+        with refuse_faults(
+            "OpenVDB: its Python module cannot be imported", ImportError, remedy=_REMEDY, error=UsageError
+        ):
             import pyopenvdb as module
-        except ImportError as error:
-            raise UsageError(f"OpenVDB: its Python module cannot be imported: {error}", remedy=_REMEDY) from None
     return module
 
 
@@ -87,7 +87,6 @@ def _above(values: Any) -> float:
 
 
 def _plain(value: object) -> object:
-    """Text or a number for OpenVDB; JSON of all else."""
     is_number = isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**31)
     return value if isinstance(value, str | bool) or is_number else json.dumps(value, allow_nan=False)
 
@@ -99,14 +98,14 @@ def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
     another or a damaged file.
     """
     with path.open("rb") as stream:
-        if stream.read(8) != MAGIC:
-            raise InputError(f"{path}: expected an OpenVDB file, got another", remedy="the file is damaged")
+        refuse_if(
+            stream.read(8) != MAGIC, f"{path}: expected an OpenVDB file, got another", remedy="the file is damaged"
+        )
         with refuse_faults(
             f"{path}: not a readable OpenVDB file", ValueError, struct.error, remedy="the file is damaged"
         ):
             version, _, _, has_offsets = _unpack(stream, "<3I?")
-            if version < 222 or not has_offsets:
-                raise ValueError(f"file version {version}")
+            refuse_if(version < 222 or not has_offsets, f"file version {version}", error=ValueError)
             stream.read(_UUID_LENGTH)
             _metadata(stream)
             grids = []
@@ -126,8 +125,7 @@ def _unpack(stream: BinaryIO, layout: str) -> tuple[Any, ...]:
 def _text(stream: BinaryIO) -> str:
     (length,) = _unpack(stream, "<I")
     text = stream.read(length)
-    if len(text) != length:
-        raise ValueError("it is cut")
+    refuse_if(len(text) != length, "it is cut", error=ValueError)
     return text.decode("utf-8", errors="replace")
 
 
@@ -145,7 +143,6 @@ def _metadata(stream: BinaryIO) -> dict[str, object]:
 
 
 def describe_vdb(path: Path, head: bytes) -> Summary | None:
-    """Summarise an OpenVDB file and our bake's header."""
     if not head.startswith(MAGIC):
         return None
     grids = read_vdb_head(path)

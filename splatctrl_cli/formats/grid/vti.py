@@ -5,6 +5,7 @@ on XML file formats).
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 from xml.etree.ElementTree import Element, ParseError
@@ -14,13 +15,12 @@ import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import refuse_faults, refuse_if, require
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
     FORMAT,
     GridFormat,
-    GridHead,
     check_finite,
     check_grid,
     check_layout,
@@ -42,6 +42,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
     """Write the grid; NaN is kept. Raises InputError for invalid channels."""
     x, y, z = check_grid(grid)
     extent = f"0 {x - 1} 0 {y - 1} 0 {z - 1}"
+    origin, spacing = (" ".join(repr(float(v)) for v in values) for values in (grid.origin, [grid.voxel] * 3))
     arrays, offset = [], 0
     for name, values in grid.channels.items():
         arrays.append(
@@ -55,7 +56,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
         '<?xml version="1.0"?>',
         f"<VTKFile {' '.join(f'{key}={quoteattr(value)}' for key, value in _FILE.items())}>",
         *(f"  <!-- {line} -->" for line in _comments(grid)),
-        f'  <ImageData WholeExtent="{extent}" Origin="{_triple(grid.origin)}" Spacing="{_triple([grid.voxel] * 3)}">',
+        f'  <ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}">',
         "    <FieldData>",
         '      <Array type="String" Name="header" NumberOfTuples="1" format="ascii">',
         f"        {codes}",
@@ -79,57 +80,60 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
         stream.write(b"\n  </AppendedData>\n</VTKFile>\n")
 
 
-def read_vti(path: Path) -> DistanceGrid:
-    """Read a `write_vti` grid. Raises InputError if missing, damaged or not ours."""
+def read_vti(path: Path, *, with_values: bool = True) -> DistanceGrid:
+    """Read a `write_vti` grid; without values, channels are zeros.
+
+    Raises InputError if missing, damaged or not ours.
+    """
     with _opened(path) as stream:
-        head, starts = _head(path, stream)
-        channels = {name: _values(path, stream, head, name, start) for name, start in starts.items()}
-    grid = DistanceGrid(origin=head.origin, voxel=head.voxel, channels=channels, header=head.header)
-    check_finite(str(path), grid)
+        grid, starts = _head(path, stream)
+        if with_values:
+            grid = replace(
+                grid, channels={name: _values(path, stream, grid, name, start) for name, start in starts.items()}
+            )
+            check_finite(str(path), grid)
     return grid
 
 
-def read_vti_head(path: Path) -> GridHead:
-    """Read all but the channels' values. Raises as `read_vti`."""
-    with _opened(path) as stream:
-        return _head(path, stream)[0]
-
-
 def _opened(path: Path) -> BinaryIO:
-    try:
+    missing, folder = "bake one with sdf-bake --formats vti", "give the field.vti in it"
+    with (
+        refuse_faults(lambda _: f"{path}: no such file", FileNotFoundError, remedy=missing),
+        refuse_faults(lambda _: f"{path}: expected a file, got a folder", IsADirectoryError, remedy=folder),
+    ):
         return path.open("rb")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file", remedy="bake one with sdf-bake --formats vti") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: expected a file, got a folder", remedy="give the field.vti in it") from None
 
 
-def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, dict[str, int]]:
-    """The head, and by channel the offset [bytes] of its length, before its values."""
+def _head(path: Path, stream: BinaryIO) -> tuple[DistanceGrid, dict[str, int]]:
+    """The grid of zeros, and by channel the offset [bytes] of its length, before its values."""
     text = stream.read(1 << 22)  # bytes in which the XML must end
     mark = text.find(_APPENDED)
     begin = text.find(b"_", mark) + 1
-    if mark < 0 or begin == 0:
-        raise InputError(f"{path}: expected raw appended data, got none", remedy=_REMEDY)
+    refuse_if(mark < 0 or begin == 0, f"{path}: expected raw appended data, got none", remedy=_REMEDY)
     with refuse_faults(f"{path}: not readable XML", ParseError, DefusedXmlException, remedy=_REMEDY):
         root: Any = ElementTree.fromstring(text[:begin] + b"</AppendedData></VTKFile>")
     image, piece = root.find("ImageData"), root.find("ImageData/Piece")
-    if {key: root.get(key) for key in _FILE} != _FILE or image is None or piece is None:
-        raise InputError(f"{path}: expected a VTKFile of {_FILE}, got {dict(root.attrib)}", remedy=_REMEDY)
-    try:
+    refuse_if(
+        {key: root.get(key) for key in _FILE} != _FILE or image is None or piece is None,
+        f"{path}: expected a VTKFile of {_FILE}, got {dict(root.attrib)}",
+        remedy=_REMEDY,
+    )
+    with refuse_faults(
+        lambda error: f"{path}: not a distance grid of ours: {error!r}", KeyError, ValueError, remedy=_REMEDY
+    ):
         return _parsed(path, image, piece, begin)
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: not a distance grid of ours: {error!r}", remedy=_REMEDY) from None
 
 
-def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[GridHead, dict[str, int]]:
+def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[DistanceGrid, dict[str, int]]:
     bounds = [int(number) for number in piece.attrib["Extent"].split()]
-    if bounds[::2] != [0, 0, 0] or piece.attrib["Extent"] != image.attrib["WholeExtent"]:
-        raise ValueError(f"expected one piece from 0 0 0, got {piece.attrib['Extent']}")
+    refuse_if(
+        bounds[::2] != [0, 0, 0] or piece.attrib["Extent"] != image.attrib["WholeExtent"],
+        f"expected one piece from 0 0 0, got {piece.attrib['Extent']}",
+        error=ValueError,
+    )
     shape = (bounds[1] + 1, bounds[3] + 1, bounds[5] + 1)
     spacing = {float(number) for number in image.attrib["Spacing"].split()}
-    if len(spacing) != 1:
-        raise ValueError(f"expected cubic cells, got {image.attrib['Spacing']}")
+    refuse_if(len(spacing) != 1, f"expected cubic cells, got {image.attrib['Spacing']}", error=ValueError)
     codes = [int(code) for code in (image.findtext("FieldData/Array") or "").split()]
     header = parse_header(str(path), bytes(codes[:-1]).decode("utf-8"))
     arrays = {array.attrib["Name"]: array.attrib for array in piece.iterfind("PointData/DataArray")}
@@ -142,24 +146,26 @@ def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[Gri
     check_layout(str(path), layout)
     origin = np.array([float(number) for number in image.attrib["Origin"].split()])
     voxel = spacing.pop()
-    if origin.shape != (3,) or not np.isfinite(origin).all() or not 0.0 < voxel < np.inf:
-        raise ValueError(f"expected a place and a size above 0, got {image.attrib['Origin']}, {voxel}")
-    return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header), starts
+    refuse_if(
+        origin.shape != (3,) or not np.isfinite(origin).all() or not 0.0 < voxel < np.inf,
+        f"expected a place and a size above 0, got {image.attrib['Origin']}, {voxel}",
+        error=ValueError,
+    )
+    zeros = {name: np.broadcast_to(np.zeros((), kind), size) for name, (kind, size) in layout.items()}
+    return DistanceGrid(origin=origin, voxel=voxel, channels=zeros, header=header), starts
 
 
-def _values(path: Path, stream: BinaryIO, head: GridHead, name: str, start: int) -> Values:
+def _values(path: Path, stream: BinaryIO, grid: DistanceGrid, name: str, start: int) -> Values:
     stream.seek(start)
-    (x, y, z), channel = head.shape, CHANNELS[name]
-    count = x * y * z * channel.components
-    size = count * np.dtype(channel.dtype).itemsize
+    zeros = grid.channels[name]
+    (x, y, z), size = zeros.shape[:3], zeros.size * zeros.itemsize
     there = min(int.from_bytes(stream.read(8), "little"), path.stat().st_size - start - 8)
-    if there != size:
-        raise InputError(
-            f"{path}: {name}: expected {size} bytes, got {max(there, 0)}",
-            remedy="the file is cut; bake it again",
-        )
-    flat: Values = np.fromfile(stream, channel.dtype, count)
-    planes = flat.reshape((z, y, x) if channel.components == 1 else (z, y, x, channel.components))
+    refuse_if(
+        there != size,
+        f"{path}: {name}: expected {size} bytes, got {max(there, 0)}",
+        remedy="the file is cut; bake it again",
+    )
+    planes: Values = np.fromfile(stream, zeros.dtype, zeros.size).reshape(z, y, x, *zeros.shape[3:])
     return np.ascontiguousarray(planes.transpose(2, 1, 0, *range(3, planes.ndim)))
 
 
@@ -168,21 +174,15 @@ def _comments(grid: DistanceGrid) -> list[str]:
     return [f"{name}: {grid.header[name]}".replace("--", "- -") for name in names if name in grid.header]
 
 
-def _triple(values: object) -> str:
-    return " ".join(repr(float(value)) for value in np.asarray(values, dtype=np.float64))
-
-
 def describe_vti(path: Path, head: bytes) -> Summary | None:
-    """Summarise a ``.vti``: a distance grid if ours, else its XML."""
     if path.suffix != ".vti" and b'type="ImageData"' not in head[:512]:
         return None
     text = head.decode("latin-1")
-    image = re.search(r"<ImageData\b([^>]*)>", text)
-    if image is None:
-        raise InputError(f"{path}: a .vti without ImageData", remedy="the file is damaged")
+    found, said = re.search(r"<ImageData\b([^>]*)>", text), f"{path}: a .vti without ImageData"
+    image = require(found, said, remedy="the file is damaged")
     codes = re.search(r'<Array type="String"[^>]*>([\d\s]+)</Array>', text)  # the string, written as numbers
     if codes and FORMAT in bytes(int(code) % 256 for code in codes[1].split()).decode("utf-8", "replace"):
-        return summary_of(path, "ParaView image data", read_vti_head(path))
+        return summary_of(path, "ParaView image data", read_vti(path, with_values=False))
     facts: dict[str, object] = dict(_ATTRIBUTE.findall(image[1]))
     arrays = [dict(_ATTRIBUTE.findall(attributes)) for attributes in re.findall(r"<DataArray\b([^>]*)>", text)]
     grid = Grid(

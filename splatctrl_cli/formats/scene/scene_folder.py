@@ -16,7 +16,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_faults
+from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_faults, refuse_if
 from splatctrl_cli.files.output import PARTIAL, Parts
 from splatctrl_cli.formats.scene.voxel_file import (
     read_known_occupancy,
@@ -132,14 +132,18 @@ def _corrections(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], Vie
 
 def _bends(bends: Mapping[str, Mapping[str, Any]]) -> dict[str, Float64]:
     grids = {str(camera): np.array(bend["offsets"], np.float64) for camera, bend in bends.items()}
-    if any(grid.shape != fixed.BEND_GRID or not np.isfinite(grid).all() for grid in grids.values()):
-        raise ValueError(f"not {fixed.BEND_GRID} finite offsets")
+    refuse_if(
+        any(grid.shape != fixed.BEND_GRID or not np.isfinite(grid).all() for grid in grids.values()),
+        f"not {fixed.BEND_GRID} finite offsets",
+        error=ValueError,
+    )
     return grids
 
 
 def _inside(name: str) -> str:
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise ValueError(f"{name} lies outside the scene")
+    refuse_if(
+        Path(name).is_absolute() or ".." in Path(name).parts, f"{name} lies outside the scene", error=ValueError
+    )
     return name
 
 
@@ -158,19 +162,13 @@ class SceneFolder:
         with refuse_faults(f"{file}: cannot be read", OSError, ValueError):
             run = json.loads(file.read_text(encoding="utf-8"))
         for name in ("metrics", "inputs", "config"):
-            if not isinstance(run, dict) or not isinstance(run.get(name, {}), dict):
-                raise InputError(f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
+            is_object = isinstance(run, dict) and isinstance(run.get(name, {}), dict)
+            refuse_if(not is_object, f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
         return dict(run)
 
     @cached_property
     def parts(self) -> Parts:
-        """Digests that check every opened file."""
         return Parts.of_run(self.path, self.run)
-
-    @property
-    def has_digests(self) -> bool:
-        """False for an older scene, whose files cannot be checked."""
-        return self.parts.digests is not None
 
     @property
     def made_from(self) -> dict[str, Any]:
@@ -201,7 +199,6 @@ class SceneFolder:
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of the last frame."""
         return self._metric("stamp_ns", int)
 
     @property
@@ -226,23 +223,22 @@ class SceneFolder:
     def gaussians(self) -> GaussianSet:
         """The Gaussians. Raises InputError if there are none."""
         gaussians = read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
-        if not len(gaussians):
-            raise InputError(
-                f"{self.path}: expected Gaussians, got none: there is nothing to render",
-                remedy="reconstruct again with views that have depth; splats.ply is empty",
-            )
+        refuse_if(
+            not len(gaussians),
+            f"{self.path}: expected Gaussians, got none: there is nothing to render",
+            remedy="reconstruct again with views that have depth; splats.ply is empty",
+        )
         return gaussians
 
     def splats(self) -> SplatSet:
         return read_world_splats(self._isotropic("splats.ply"))
 
     def _isotropic(self, name: str) -> Path:
-        """The checked file. Raises InputError if splats are not isotropic."""
-        if self.is_anisotropic:
-            raise InputError(
-                f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",
-                remedy="reconstruct the recording, or 'splatctrl score' this scene",
-            )
+        refuse_if(
+            self.is_anisotropic,
+            f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",
+            remedy="reconstruct the recording, or 'splatctrl score' this scene",
+        )
         return self.parts.checked(self.path / name)
 
     def occupancy(self) -> OccupancyGrid:
@@ -274,21 +270,22 @@ class SceneFolder:
                 for row in csv.DictReader(stream)
             )
         for before, after in pairwise(taken):
-            if after.stamp_ns <= before.stamp_ns:
-                raise InputError(
-                    f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
-                    remedy="reconstruct the scene again",
-                )
+            refuse_if(
+                after.stamp_ns <= before.stamp_ns,
+                f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
+                remedy="reconstruct the scene again",
+            )
         return taken
 
     def snapshot_at(self, stamp_ns: int) -> Snapshot:
         """The newest snapshot up to `stamp_ns`. Raises NotEvaluableError before the first."""
         known = [s for s in self.snapshots if s.stamp_ns <= stamp_ns]
-        if not known:
-            raise NotEvaluableError(
-                f"{self.path}: no snapshot at or before stamp {stamp_ns}",
-                remedy="the scene was not known yet; ask for a later time",
-            )
+        refuse_if(
+            not known,
+            f"{self.path}: no snapshot at or before stamp {stamp_ns}",
+            remedy="the scene was not known yet; ask for a later time",
+            error=NotEvaluableError,
+        )
         return known[-1]
 
     def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
@@ -309,15 +306,17 @@ class SceneFolder:
 
 def open_scene(path: Path) -> SceneFolder:
     """Open a scene folder. Raises InputError if it is none."""
-    if not path.exists():
-        raise InputError(f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
-    if path.name.endswith(PARTIAL):
-        raise InputError(f"{path}: an interrupted run", remedy="continue it: the same command and --resume")
-    if not (path / "splats.ply").is_file() or not (path / "run.json").is_file():
-        raise InputError(
-            f"{path}: expected a scene folder with splats.ply and run.json",
-            remedy="give what 'splatctrl reconstruct' wrote",
-        )
+    refuse_if(not path.exists(), f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
+    refuse_if(
+        path.name.endswith(PARTIAL),
+        f"{path}: an interrupted run",
+        remedy="continue it: the same command and --resume",
+    )
+    refuse_if(
+        not (path / "splats.ply").is_file() or not (path / "run.json").is_file(),
+        f"{path}: expected a scene folder with splats.ply and run.json",
+        remedy="give what 'splatctrl reconstruct' wrote",
+    )
     return SceneFolder(path)
 
 
@@ -345,8 +344,9 @@ class SplatFile(SceneFolder):
     def _found(self) -> SplatSet | GaussianSet:
         found, comments = read_splats(self.path)
         check_world(self.path, comments)
-        if not len(found):
-            raise InputError(f"{self.path}: has no splats: there is nothing to render", remedy="give another file")
+        refuse_if(
+            not len(found), f"{self.path}: has no splats: there is nothing to render", remedy="give another file"
+        )
         return found
 
     def gaussians(self) -> GaussianSet:

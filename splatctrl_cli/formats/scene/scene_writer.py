@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import Parts, flush, sha256, write_durably, write_table
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL, SHELL_FILE, Snapshot
@@ -88,10 +88,11 @@ class SceneWriter:
         kept |= {path for s in self.snapshots for path in (s.path, s.occupancy_path)}
         kept |= {self.folder / name for name in checkpoint.parts or {}}
         missing = sorted(path.name for path in kept if not path.is_file())
-        if missing or self._audit.stat().st_size < checkpoint.audit_bytes:
-            raise InputError(
-                f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it", remedy=START_OVER
-            )
+        refuse_if(
+            missing or self._audit.stat().st_size < checkpoint.audit_bytes,
+            f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it",
+            remedy=START_OVER,
+        )
         written = Parts(folder=self.folder, digests=checkpoint.parts, remedy=START_OVER)
         for path in sorted(kept - {self._audit, self.folder / CHECKPOINT}):
             written.checked(path)
@@ -106,7 +107,6 @@ class SceneWriter:
         return self.folder / "snapshots" / f"{index:06d}.ply"
 
     def audit(self, row: object) -> None:
-        """Append to ``audit.jsonl``."""
         assert is_dataclass(row) and not isinstance(row, type)
         with self._audit.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(asdict(row)) + "\n")
@@ -142,7 +142,6 @@ class SceneWriter:
         self._thread.shutdown()
 
     def _write_shell(self, path: Path, stamp_ns: int, shell: SplatSet | None) -> None:
-        """Write a separate file, which readers of splats skip."""
         if shell is not None and len(shell):
             write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
 
@@ -165,7 +164,6 @@ class SceneWriter:
         write_durably(self.folder / CHECKPOINT, lambda path: savez(path, arrays, level=1 if is_last else 0))
 
     def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, shell: SplatSet | None = None) -> None:
-        """Write final splats, shell, occupancy and the index of snapshots."""
         self.settle()
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
         self._write_shell(self.folder / SHELL_FILE, stamp_ns, shell)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.records import Array, Label, UInt8, Values
 from splatctrl_cli.voxels import (
@@ -78,7 +78,7 @@ def _evidence(known: KnownVoxels) -> dict[str, Values]:
 
 
 @contextmanager
-def _refused(path: Path, what: str) -> Iterator[None]:
+def _refuse(path: Path, what: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
@@ -89,7 +89,7 @@ def _refused(path: Path, what: str) -> Iterator[None]:
 
 def read_states(path: Path) -> OccupancyGrid:
     """Read a `write_states` grid. Raises InputError otherwise; never unpickles."""
-    with _refused(path, _STATES):
+    with _refuse(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         header = json.loads(str(arrays["header"]))
         states = _voxels(arrays["states"], "states", np.uint8, header)
@@ -101,7 +101,7 @@ def read_seen(path: Path) -> SeenVoxels | None:
 
     None for an older file. Raises InputError for another one.
     """
-    with _refused(path, _OURS):
+    with _refuse(path, _OURS):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
@@ -127,14 +127,14 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 def read_occupancy(path: Path) -> OccupancyGrid:
     """Read the ``occupancy.npz`` grid. Raises InputError otherwise; never unpickles."""
-    with _refused(path, _OCCUPANCY):
+    with _refuse(path, _OCCUPANCY):
         arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
         return _grid_of(arrays, json.loads(str(arrays["header"])))
 
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
     """Read all of ``occupancy.npz``; None if older. Raises as `read_occupancy`."""
-    with _refused(path, _OCCUPANCY):
+    with _refuse(path, _OCCUPANCY):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
@@ -158,7 +158,7 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
 
 def read_unrepresented(path: Path) -> Balls | None:
     """Read only unrepresented voxels; None if older. Raises InputError for another file."""
-    with _refused(path, _OURS):
+    with _refuse(path, _OURS):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
@@ -193,12 +193,12 @@ def _last_seen(stored: Array, header: Mapping[str, Any], num_steps: int) -> Arra
 
 def _balls(arrays: Arrays, voxel: float) -> Balls:
     centers, labels = arrays["unrepresented"], arrays["unrepresented_labels"]
-    if centers.dtype != np.float32 or labels.dtype != np.uint8 or centers.shape != (labels.size, 3):
-        raise ValueError(
-            f"unrepresented: expected float32 (K, 3) and uint8 (K,), got {centers.shape}, {labels.shape}"
-        )
-    if not np.isfinite(centers).all():
-        raise ValueError("unrepresented: expected finite centres")
+    refuse_if(
+        centers.dtype != np.float32 or labels.dtype != np.uint8 or centers.shape != (labels.size, 3),
+        f"unrepresented: expected float32 (K, 3) and uint8 (K,), got {centers.shape}, {labels.shape}",
+        error=ValueError,
+    )
+    refuse_if(not np.isfinite(centers).all(), "unrepresented: expected finite centres", error=ValueError)
     return Balls.of_voxels(centers, voxel, labels)
 
 
@@ -206,15 +206,21 @@ def _edges(arrays: Arrays) -> LostEdges:
     if "edges" not in arrays:
         return NO_EDGES
     edges = arrays["edges"]
-    if edges.dtype != np.float32 or edges.shape != (edges.size // 4, 4) or not np.isfinite(edges).all():
-        raise ValueError(f"edges: expected finite float32 (K, 4), got {edges.dtype} {edges.shape}")
+    refuse_if(
+        edges.dtype != np.float32 or edges.shape != (edges.size // 4, 4) or not np.isfinite(edges).all(),
+        f"edges: expected finite float32 (K, 4), got {edges.dtype} {edges.shape}",
+        error=ValueError,
+    )
     return LostEdges(centers=edges[:, :3], radii=edges[:, 3])
 
 
 def _voxels(values: Array, name: str, kind: type[np.generic], header: Mapping[str, Any]) -> Array:
     wanted = (np.dtype(kind), tuple(header["shape"]))
-    if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
-        raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
+    refuse_if(
+        (values.dtype, values.shape) != wanted or len(values.shape) != 3,
+        f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}",
+        error=ValueError,
+    )
     return values
 
 

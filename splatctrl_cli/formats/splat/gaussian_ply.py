@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config.fixed import CENTER_LENGTH, CENTER_SHARE, SPARSEST, SPARSEST_SAMPLE
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.formats.ply import PlyFile, check_properties, read_table, write_table
 from splatctrl_cli.formats.splat.splat_format import (
     SplatFormat,
@@ -127,12 +127,12 @@ def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
             f" {moved:.3g} m",
             remedy=f"'splatctrl export {ply.path} -o OUT.ply' takes an origin off and names it; give OUT.ply",
         )
-    if step > size:
-        raise InputError(
-            f"{places}: were rounded to float32, whose steps of {step:g} m there are larger than the splats"
-            f" (sigma {float(np.median(sigmas)):.3g} m)",
-            remedy="write x, y and z again, as double or less an origin",
-        )
+    refuse_if(
+        step > size,
+        f"{places}: were rounded to float32, whose steps of {step:g} m there are larger than the splats"
+        f" (sigma {float(np.median(sigmas)):.3g} m)",
+        remedy="write x, y and z again, as double or less an origin",
+    )
     return centers
 
 
@@ -142,26 +142,26 @@ def log_sigmas(ply: PlyFile) -> Float64:
     They are none if no scale is below 0 and 95 % of splats are over SPARSEST times as large as their spacing.
     """
     found = [name for name in SCALES if name in ply.names]
-    if len(found) == 2:
-        raise InputError(
-            f"{ply.path}: expected scale_0 alone or scale_0 to scale_2, got {' and '.join(found)}: the flat splats of"
-            " 2D-GS have no third sigma",
-            remedy="write the log of a thickness [m] as scale_2",
-        )
+    refuse_if(
+        len(found) == 2,
+        f"{ply.path}: expected scale_0 alone or scale_0 to scale_2, got {' and '.join(found)}: the flat splats of"
+        " 2D-GS have no third sigma",
+        remedy="write the log of a thickness [m] as scale_2",
+    )
     logs = np.column_stack([ply.column(name if len(found) == 3 else "scale_0") for name in SCALES])
     if len(ply) < 2 or logs.min() < 0:
         return logs
     centers = exact_centers(ply)
-    some = centers[:: -(-len(centers) // SPARSEST_SAMPLE)]
-    spacing = float(np.median(np.asarray(cKDTree(centers).query(some, k=2)[0])[:, 1]))
-    if spacing > 0 and np.percentile(logs.mean(axis=1), 5) > np.log(SPARSEST * spacing):
-        raise InputError(
-            f"{ply.path}: scale_*: expected log(sigma [m]), got {logs.min():.3g} to {logs.max():.3g}: splats of"
-            f" {np.exp(min(float(np.median(logs)), 700.0)):.3g} m, {spacing:.3g} m apart",
-            remedy="the scales look like sigmas: write their logarithms"
-            if np.median(logs) < SPARSEST * spacing
-            else "write scales and centres in one unit",
-        )
+    nearest = cKDTree(centers).query(centers[:: -(-len(centers) // SPARSEST_SAMPLE)], k=2)[0]
+    spacing = float(np.median(np.asarray(nearest)[:, 1]))
+    refuse_if(
+        spacing > 0 and np.percentile(logs.mean(axis=1), 5) > np.log(SPARSEST * spacing),
+        f"{ply.path}: scale_*: expected log(sigma [m]), got {logs.min():.3g} to {logs.max():.3g}: splats of"
+        f" {np.exp(min(float(np.median(logs)), 700.0)):.3g} m, {spacing:.3g} m apart",
+        remedy="the scales look like sigmas: write their logarithms"
+        if np.median(logs) < SPARSEST * spacing
+        else "write scales and centres in one unit",
+    )
     return logs
 
 
@@ -189,8 +189,10 @@ def check_gaussians(where: str, gaussians: GaussianSet) -> None:
     groups: dict[str, Values] = {"center": g.centers, "sigma": g.scales, "rotation": g.quats_wxyz}
     groups |= {"opacity": g.opacities, "harmonics": g.harmonics}
     check_finite(where, len(g), groups)
-    if g.harmonics.shape[1] not in (1, 4, 9, 16):
-        raise InputError(f"{where}: harmonics: expected 1, 4, 9 or 16 coefficients, got {g.harmonics.shape[1]}")
+    refuse_if(
+        g.harmonics.shape[1] not in (1, 4, 9, 16),
+        f"{where}: harmonics: expected 1, 4, 9 or 16 coefficients, got {g.harmonics.shape[1]}",
+    )
     refuse(where, "sigma", g.scales, np.asarray((g.scales <= 0).any(axis=1)), "more than 0 m")
     refuse(where, "opacity", g.opacities, (g.opacities < 0) | (g.opacities > 1), "0 to 1")
     lengths = np.linalg.norm(g.quats_wxyz.astype(np.float64), axis=1)
@@ -201,9 +203,11 @@ def _harmonics(ply: PlyFile) -> Float32:
     """(N, K, 3); f_rest has each channel's in a row."""
     num_rest = sum(name.startswith("f_rest_") for name in ply.names)
     names = [f"f_rest_{index}" for index in range(num_rest)]
-    if num_rest not in REST_PER_DEGREE or not all(name in ply.names for name in names):
-        expected = ", ".join(map(str, REST_PER_DEGREE))
-        raise InputError(f"{ply.path}: f_rest_*: expected {expected} of them in a row from 0, got {num_rest}")
+    refuse_if(
+        num_rest not in REST_PER_DEGREE or not all(name in ply.names for name in names),
+        f"{ply.path}: f_rest_*: expected {', '.join(map(str, REST_PER_DEGREE))} of them in a row from 0, got"
+        f" {num_rest}",
+    )
     channels = [[f"f_dc_{channel}", *names[channel * num_rest // 3 :][: num_rest // 3]] for channel in range(3)]
     values = [[ply.column(name).astype(np.float32) for name in channel] for channel in channels]
     return np.ascontiguousarray(np.array(values).transpose(2, 1, 0))

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import SH_C0, SplatFormat, refuse, unit_quaternions
 from splatctrl_cli.formats.unpacking import read_bytes
-from splatctrl_cli.records import Array, Float32, GaussianSet, Label, UInt8
+from splatctrl_cli.records import Array, Float32, GaussianSet, Label
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942  # glTF, JSON, BIN
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -64,23 +64,28 @@ def _write(path: Path, document: Mapping[str, Any], tables: Sequence[Array]) -> 
 def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
     """A ``.glb``'s document and buffer. Raises InputError if truncated, or not version 2."""
     content = read_bytes(path)
-    if len(content) < 20 or struct.unpack_from("<I", content)[0] != MAGIC:
-        raise InputError(f"{path}: no .glb file: expected it to start with 'glTF', got {content[:4]!r}")
+    refuse_if(
+        len(content) < 20 or struct.unpack_from("<I", content)[0] != MAGIC,
+        f"{path}: no .glb file: expected it to start with 'glTF', got {content[:4]!r}",
+    )
     _, version, length, json_length, json_kind = struct.unpack_from("<IIIII", content)
-    if version != 2 or json_kind != JSON_CHUNK:
-        raise InputError(f"{path}: expected glTF 2 with its JSON first, got version {version}")
-    if length != len(content) or 20 + json_length > length:
-        raise InputError(
-            f"{path}: expected {length} bytes, got {len(content)}", remedy="copy or write the file again"
-        )
+    refuse_if(
+        version != 2 or json_kind != JSON_CHUNK, f"{path}: expected glTF 2 with its JSON first, got version {version}"
+    )
+    refuse_if(
+        length != len(content) or 20 + json_length > length,
+        f"{path}: expected {length} bytes, got {len(content)}",
+        remedy="copy or write the file again",
+    )
     with refuse_faults(f"{path}: its JSON cannot be read", ValueError):
         document = json.loads(content[20 : 20 + json_length])
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: expected a JSON object, got {type(document).__name__}")
+    refuse_if(not isinstance(document, dict), f"{path}: expected a JSON object, got {type(document).__name__}")
     rest = content[20 + json_length :]
     length, kind = struct.unpack_from("<II", rest) if len(rest) >= 8 else (0, 0)
-    if rest and (kind != BINARY_CHUNK or 8 + length > len(rest)):
-        raise InputError(f"{path}: expected a chunk BIN of {length} bytes after the JSON, got {len(rest)} bytes")
+    refuse_if(
+        rest and (kind != BINARY_CHUNK or 8 + length > len(rest)),
+        f"{path}: expected a chunk BIN of {length} bytes after the JSON, got {len(rest)} bytes",
+    )
     return document, rest[8 : 8 + length]
 
 
@@ -88,16 +93,19 @@ def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, w
     """(N, width) float32. Raises InputError for another width or missing data."""
     accessor, where = document["accessors"][index], f"{path}: accessor {index}"
     dtype = np.dtype(COMPONENTS[accessor["componentType"]])
-    if accessor["type"] != TYPES[width] or "sparse" in accessor or "bufferView" not in accessor:
-        raise InputError(f"{where}: expected a plain {TYPES[width]}, got {accessor['type']}")
+    refuse_if(
+        accessor["type"] != TYPES[width] or "sparse" in accessor or "bufferView" not in accessor,
+        f"{where}: expected a plain {TYPES[width]}, got {accessor['type']}",
+    )
     view = document["bufferViews"][accessor["bufferView"]]
-    if view["buffer"] != 0 or "uri" in document["buffers"][0]:
-        raise InputError(f"{where}: expected its data inside the file")
+    refuse_if(view["buffer"] != 0 or "uri" in document["buffers"][0], f"{where}: expected its data inside the file")
     num, row = int(accessor["count"]), width * dtype.itemsize
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     stride = int(view.get("byteStride", row))
-    if min(num, start, stride - row) < 0 or start + (num - 1) * stride + row > len(binary):
-        raise InputError(f"{where}: reaches beyond the {len(binary)} bytes of data")
+    refuse_if(
+        min(num, start, stride - row) < 0 or start + (num - 1) * stride + row > len(binary),
+        f"{where}: reaches beyond the {len(binary)} bytes of data",
+    )
     values = np.ndarray((num, width), dtype, binary, start, (stride, dtype.itemsize))
     if accessor.get("normalized", False):
         return np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1.0)).astype(np.float32)
@@ -110,9 +118,10 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     ``_LABEL`` is written if some Gaussian is not an object. Raises InputError for an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
+    colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
     tables: dict[str, Array] = {  # the first has its range beside it
         "POSITION": gaussians.centers,
-        "COLOR_0": _point_colors(gaussians),
+        "COLOR_0": np.rint(255.0 * np.column_stack([colors, gaussians.opacities])).astype(np.uint8),
         ROTATION: np.roll(gaussians.quats_wxyz, -1, axis=1),
         SCALE: gaussians.scales,
         OPACITY: gaussians.opacities[:, None],
@@ -143,11 +152,16 @@ def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """
     document, binary = read_glb(path)
     primitive = _primitive(path, document)
-    try:
+    with refuse_faults(
+        lambda error: f"{path}: glTF not understood: {type(error).__name__}: {error}",
+        KeyError,
+        IndexError,
+        TypeError,
+        ValueError,
+        AttributeError,
+    ):
         gaussians = _gaussians(path, primitive["attributes"], partial(_table, path, document, binary))
         extras = document["asset"].get("extras", {})
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: glTF not understood: {type(error).__name__}: {error}") from None
     check_gaussians(str(path), gaussians)
     return gaussians, {key: str(value) for key, value in extras.items()}
 
@@ -158,39 +172,37 @@ def coefficient_name(index: int) -> str:
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index - degree * degree}"
 
 
-def _point_colors(gaussians: GaussianSet) -> UInt8:
-    """(N, 4) red, green, blue, opacity, 0 to 255, for point clouds."""
-    colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
-    return np.rint(255.0 * np.column_stack([colors, gaussians.opacities])).astype(np.uint8)
-
-
 def _primitive(path: Path, document: Mapping[str, Any]) -> dict[str, Any]:
-    try:
+    with refuse_faults(
+        lambda error: f"{path}: glTF not understood: {type(error).__name__}: {error}",
+        KeyError,
+        TypeError,
+        AttributeError,
+    ):
         primitives = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]
         found = [primitive for primitive in primitives if EXTENSION in primitive.get("extensions", {})]
         names = [name for primitive in found for name in primitive["extensions"][EXTENSION].get("extensions", {})]
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: glTF not understood: {type(error).__name__}: {error}") from None
-    if len(found) != 1:
-        raise InputError(f"{path}: expected one primitive with {EXTENSION}, got {len(found)} of {len(primitives)}")
+    refuse_if(
+        len(found) != 1, f"{path}: expected one primitive with {EXTENSION}, got {len(found)} of {len(primitives)}"
+    )
     if names:
         raise InputError(f"{path}: its Gaussians are packed by {names[0]}, expected plain attributes")
     primitive: dict[str, Any] = found[0]
     kernel = primitive["extensions"][EXTENSION].get("kernel")
-    if kernel != PROPERTIES["kernel"]:
-        raise InputError(f"{path}: kernel of its Gaussians: expected {PROPERTIES['kernel']}, got {kernel}")
+    refuse_if(
+        kernel != PROPERTIES["kernel"],
+        f"{path}: kernel of its Gaussians: expected {PROPERTIES['kernel']}, got {kernel}",
+    )
     return primitive
 
 
 def _gaussians(path: Path, attributes: Mapping[str, int], table: Callable[[int, int], Float32]) -> GaussianSet:
     missing = [name for name in ("POSITION", ROTATION, SCALE, OPACITY, coefficient_name(0)) if name not in attributes]
-    if missing:
-        raise InputError(f"{path}: its Gaussians have no {', '.join(missing)} (they have {', '.join(attributes)})")
+    refuse_if(missing, f"{path}: its Gaussians have no {', '.join(missing)} (they have {', '.join(attributes)})")
     num = 1
     while coefficient_name(num) in attributes:
         num += 1
-    if num not in (1, 4, 9, 16):
-        raise InputError(f"{path}: harmonics: expected 1, 4, 9 or 16 coefficients, got {num}")
+    refuse_if(num not in (1, 4, 9, 16), f"{path}: harmonics: expected 1, 4, 9 or 16 coefficients, got {num}")
     centers, scales = table(attributes["POSITION"], 3), table(attributes[SCALE], 3)
     if (scales < 0).any():
         where = np.flatnonzero((scales < 0).any(axis=1))[0]

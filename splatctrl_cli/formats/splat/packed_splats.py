@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import (
     SH_C0,
@@ -60,18 +60,18 @@ def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str])
 def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """Read a ``.splat``, without comments. Raises InputError if truncated or invalid."""
     content = read_bytes(path)
-    if len(content) % ROW.itemsize:
-        raise InputError(f"{path}: expected a multiple of 32 bytes, one row per splat, got {len(content)}")
+    refuse_if(
+        len(content) % ROW.itemsize, f"{path}: expected a multiple of 32 bytes, one row per splat, got {len(content)}"
+    )
     rows = np.frombuffer(content, dtype=ROW)
     check_finite(str(path), len(rows), {"center": rows["center"], "sigma": rows["sigma"]})
     quats = (rows["quat_wxyz"].astype(np.float64) - 128.0) / 128.0
-    colors = rows["rgba"][:, :3].astype(np.float64) / 255.0
     gaussians = GaussianSet(
         centers=rows["center"].copy(),
         scales=rows["sigma"].copy(),
         quats_wxyz=unit_quaternions(str(path), quats),
         opacities=(rows["rgba"][:, 3] / 255.0).astype(np.float32),
-        harmonics=((colors - 0.5) / SH_C0).astype(np.float32)[:, None, :],
+        harmonics=(((rows["rgba"][:, :3].astype(np.float64) / 255.0) - 0.5) / SH_C0).astype(np.float32)[:, None, :],
         labels=np.zeros(len(rows), dtype=np.uint8),
     )
     check_gaussians(str(path), gaussians)
@@ -84,13 +84,11 @@ def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
     return replace(without_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
 
 
-def splat_bound(gaussians: GaussianSet) -> Differences:
-    """Half a step of each byte: 1/510 of colour and opacity, 1/256 of quaternions.
-
-    Four of 1/256 move a unit quaternion by at most 2/256, and turn by twice that: 0.9 degrees.
-    """
-    return Differences(center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0)
-
+# Half a step of each byte: 1/510 of colour and opacity, 1/256 of quaternions. Four of 1/256 move a unit quaternion by
+# at most 2/256, and turn by twice that: 0.9 degrees.
+SPLAT_BOUND = Differences(
+    center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0
+)
 
 MAGIC = 0x5053474E  # NGSP
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, number, degree, fraction bits, flags, reserved
@@ -179,38 +177,45 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
     """Fraction bits and bytes (N, width) by attribute. Raises InputError for another length."""
     start = content[:4]
     if start == PLAIN:
-        num, bits, widths = _parsed(path, content, (4,), len(content))
+        num, bits, widths = _parse_head(path, content, (4,), len(content))
         parts = _streams(path, content, [num * width for width in widths])
     elif start[:2] == GZIP:
-        num, bits, widths, body = _unzipped(path, content)
+        num, bits, widths, body = _unzip(path, content)
         parts = [body[i:j] for i, j in pairwise(np.cumsum([0, *widths]) * num)]
     else:
         raise InputError(f"{path}: no .spz file: expected it to start as gzip or with NGSP, got {start.hex()}")
     return bits, [np.frombuffer(part, np.uint8).reshape(num, w) for part, w in zip(parts, widths, strict=True)]
 
 
-def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
+def _parse_head(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
     """Number of Gaussians, fraction bits, bytes per attribute; size: the file's."""
-    if len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC:
-        raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}")
+    refuse_if(
+        len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC,
+        f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}",
+    )
     _, version, num, degree, bits, flags, _ = HEADER.unpack_from(head)
-    if version not in versions:
-        known = "2 or 3 in gzip and 4 in plain"
-        raise InputError(f"{path}: .spz version: expected {known}, got {version}", remedy="write it as version 3")
-    if degree > 3 or bits > 23:
-        raise InputError(f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}")
-    if flags & ~WAS_ANTIALIASED:
-        raise InputError(
-            f"{path}: has vendor extensions (flags {flags:#x}), expected none", remedy="write it without them"
-        )
+    refuse_if(
+        version not in versions,
+        f"{path}: .spz version: expected 2 or 3 in gzip and 4 in plain, got {version}",
+        remedy="write it as version 3",
+    )
+    refuse_if(
+        degree > 3 or bits > 23, f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}"
+    )
+    refuse_if(
+        flags & ~WAS_ANTIALIASED,
+        f"{path}: has vendor extensions (flags {flags:#x}), expected none",
+        remedy="write it without them",
+    )
     widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
-    if num * sum(widths) > FREE_BYTES + SPZ_RATIO * size:
-        raise InputError(f"{path}: announces {num} splats, more than a file of {size} bytes holds")
+    refuse_if(
+        num * sum(widths) > FREE_BYTES + SPZ_RATIO * size,
+        f"{path}: announces {num} splats, more than a file of {size} bytes holds",
+    )
     return num, bits, widths
 
 
-def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
-    """`_parsed` and the attributes, unpacking no more than announced."""
+def _unzip(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
     with (
         refuse_faults(
             f"{path}: no whole .spz file",
@@ -221,29 +226,30 @@ def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], by
         ),
         gzip.GzipFile(fileobj=BytesIO(content)) as stream,
     ):
-        num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
+        num, bits, widths = _parse_head(path, stream.read(HEADER.size), (2, 3), len(content))
         expected = num * sum(widths)
         body = stream.read(expected + 1)
-    if len(body) != expected:
-        got = "more" if len(body) > expected else len(body)
-        raise InputError(f"{path}: expected {expected} bytes for {num} splats, got {got}")
+    got = "more" if len(body) > expected else len(body)
+    refuse_if(len(body) != expected, f"{path}: expected {expected} bytes for {num} splats, got {got}")
     return num, bits, widths, body
 
 
 def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
     num_streams, place = content[HEADER.size - 1], int.from_bytes(content[HEADER.size : HEADER.size + 4], "little")
     start = place + 16 * num_streams
-    if num_streams not in (len(sizes), 5 if sizes[5] == 0 else 6) or not PLAIN_HEADER <= place <= len(content) - 16:
-        raise InputError(f"{path}: .spz version 4: expected 6 streams after {PLAIN_HEADER} bytes, got {num_streams}")
+    refuse_if(
+        num_streams not in (len(sizes), 5 if sizes[5] == 0 else 6) or not PLAIN_HEADER <= place <= len(content) - 16,
+        f"{path}: .spz version 4: expected 6 streams after {PLAIN_HEADER} bytes, got {num_streams}",
+    )
     table = np.frombuffer(content[place:start].ljust(16 * num_streams, b"\0"), "<u8").reshape(-1, 2).tolist()
-    if (expected := start + sum(packed for packed, _ in table)) != len(content):
-        raise InputError(
-            f"{path}: expected {expected} bytes, got {len(content)}", remedy="copy or write the file again"
-        )
+    refuse_if(
+        (expected := start + sum(packed for packed, _ in table)) != len(content),
+        f"{path}: expected {expected} bytes, got {len(content)}",
+        remedy="copy or write the file again",
+    )
     parts = [b""] * len(sizes)
     for index, (packed, size) in enumerate(table):
-        if size != sizes[index]:
-            raise InputError(f"{path}: stream {index}: expected {sizes[index]} bytes unpacked, got {size}")
+        refuse_if(size != sizes[index], f"{path}: stream {index}: expected {sizes[index]} bytes unpacked, got {size}")
         with refuse_faults(f"{path}: stream {index}", BadBlockError, remedy="copy or write the file again"):
             parts[index] = unpacked(content[start : start + packed], "zstd", size, size)
         start += packed
@@ -256,8 +262,7 @@ def _fraction_bits(centers: Float32) -> int:
     bits = FRACTION_BITS
     while largest * 2.0**bits > 2**23 - 1:
         bits -= 1
-    if bits < 0:
-        raise InputError(f".spz: expected coordinates up to 8388 km, got {largest:g} m")
+    refuse_if(bits < 0, f".spz: expected coordinates up to 8388 km, got {largest:g} m")
     return bits
 
 
@@ -274,8 +279,7 @@ def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
     sizes = np.rint(511.0 * np.minimum(np.abs(others) / SQRT_HALF, 1.0)).astype(np.uint32)
     words = largest.astype(np.uint32)
     for index in range(3):
-        sign = (others[:, index] < 0).astype(np.uint32)
-        words = (words << np.uint32(10)) | (sign << np.uint32(9)) | sizes[:, index]
+        words = (words << np.uint32(10)) | (np.uint32(others[:, index] < 0) << np.uint32(9)) | sizes[:, index]
     return np.asarray(words, dtype="<u4")
 
 
@@ -291,8 +295,7 @@ def _quaternions(table: UInt8) -> Float32:
         others = SQRT_HALF * (fields & np.uint32(0x1FF)) / 511.0 * np.where(fields >> np.uint32(9), -1.0, 1.0)
         quats = np.zeros((len(words), 4))
         quats[np.arange(4) != largest] = others.ravel()
-        rest = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))
-        np.put_along_axis(quats, largest, rest[:, None], axis=1)
+        np.put_along_axis(quats, largest, np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))[:, None], axis=1)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     return np.roll(quats, 1, axis=1).astype(np.float32)
 
@@ -305,7 +308,7 @@ ENTRIES = (
         write=write_splat,
         read=read_splat,
         held=held_by_splat,
-        bound=splat_bound,
+        bound=lambda _: SPLAT_BOUND,
         docs="""
 `.splat` | 32 bytes per Gaussian, no header | colour, opacity 1/510; rotation 0.9 degrees | labels, density,
     comments, view-dependent colour, colours outside 0 to 1

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.records import Array, Bool, Float32, Float64, Floats, GaussianSet
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
@@ -57,8 +57,7 @@ def refuse(where: str, name: str, values: Array, is_bad: Bool, expected: str) ->
 def check_finite(where: str, num: int, groups: Mapping[str, Array]) -> None:
     """Raise InputError at the first non-finite value, or for an array without `num` rows."""
     for name, values in groups.items():
-        if len(values) != num:
-            raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")
+        refuse_if(len(values) != num, f"{where}: {name}: expected {num} values, got {len(values)}")
         is_finite = np.isfinite(values.reshape(num, -1 if num else 1)).all(axis=1)
         refuse(where, name, values, np.asarray(~is_finite), "finite")
 
@@ -101,7 +100,7 @@ def differences(a: GaussianSet, b: GaussianSet, centers: Float64 | None = None) 
         rotation=_largest(_angles(a.quats_wxyz, b.quats_wxyz)),
         color=SH_C0 * _largest(a.harmonics[:, 0].astype(np.float64) - b.harmonics[:, 0]),
         opacity=_largest(a.opacities.astype(np.float64) - b.opacities),
-        harmonics=_largest(_padded(a.harmonics)[:, 1:] - _padded(b.harmonics)[:, 1:]),
+        harmonics=_largest(_pad(a.harmonics)[:, 1:] - _pad(b.harmonics)[:, 1:]),
     )
 
 
@@ -109,7 +108,7 @@ def _largest(values: Float64) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def _padded(harmonics: Float32) -> Float64:
+def _pad(harmonics: Float32) -> Float64:
     padded = np.zeros((len(harmonics), 16, 3))
     padded[:, : harmonics.shape[1]] = harmonics
     return padded

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError, refuse_if, require
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.ply import PlyFile, read_table, write_table
 from splatctrl_cli.formats.splat.gaussian_ply import (
@@ -69,12 +69,12 @@ def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
     """Convert round Gaussians. Raises InputError counting stretched and view-dependent ones."""
     num_stretched = int(np.count_nonzero(_is_stretched(gaussians)))
     num_coloured = int(np.count_nonzero(gaussians.harmonics[:, 1:].any(axis=(1, 2))))
-    if num_stretched or num_coloured:
-        raise InputError(
-            f"{where}: expected isotropic splats, got {num_stretched} of {len(gaussians)} whose scales differ and "
-            f"{num_coloured} whose colour depends on the view",
-            remedy="'splatctrl export --isotropic' writes the nearest isotropic set",
-        )
+    refuse_if(
+        num_stretched or num_coloured,
+        f"{where}: expected isotropic splats, got {num_stretched} of {len(gaussians)} whose scales differ and "
+        f"{num_coloured} whose colour depends on the view",
+        remedy="'splatctrl export --isotropic' writes the nearest isotropic set",
+    )
     return _round_splats(gaussians, gaussians.scales[:, 0])
 
 
@@ -137,39 +137,43 @@ def check_world(path: Path, comments: Mapping[str, str]) -> None:
     check_no_shell(path, comments)
     for key, known in (("units", METRES), ("frame", ("world",))):
         said = comments.get(key)
-        if said is not None and said.lower() not in known:
-            raise InputError(
-                f"{path}: comment '{key}: {said}': expected {known[0]}",
-                remedy="distances are in metres in the world: transform the splats, and correct the comment",
-            )
+        refuse_if(
+            said is not None and said.lower() not in known,
+            f"{path}: comment '{key}: {said}': expected {known[0]}",
+            remedy="distances are in metres in the world: transform the splats, and correct the comment",
+        )
 
 
 def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
     """Raise InputError for a shell, which is only rendered."""
-    if SHELL.keys() & comments.keys():
-        raise InputError(
-            f"{path}: the shell beyond the robot's reach, which is rendered only and has no distances",
-            remedy="give the scene's folder, or its splats.ply",
-        )
+    refuse_if(
+        SHELL.keys() & comments.keys(),
+        f"{path}: the shell beyond the robot's reach, which is rendered only and has no distances",
+        remedy="give the scene's folder, or its splats.ply",
+    )
 
 
 def read_shell(path: Path) -> SplatSet:
     """Read a shell. Raises as `read_ply`, and InputError for other splats."""
     splats, comments = read_ply(path)
-    if not SHELL.keys() <= comments.keys():
-        raise InputError(f"{path}: expected a shell, got other splats", remedy="reconstruct the scene again")
+    refuse_if(
+        not SHELL.keys() <= comments.keys(),
+        f"{path}: expected a shell, got other splats",
+        remedy="reconstruct the scene again",
+    )
     return splats
 
 
 def splats_of(ply: PlyFile) -> SplatSet:
     """A PLY table's splats. Raises as `read_ply`."""
     path = ply.path
-    if num := num_stretched(ply):
-        raise InputError(
-            f"{path}: expected isotropic splats (three equal scale_*), got {num} of {len(ply)} whose scales differ",
-            remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set;"
-            " score renders them as they are",
-        )
+    num = num_stretched(ply)
+    refuse_if(
+        num,
+        f"{path}: expected isotropic splats (three equal scale_*), got {num} of {len(ply)} whose scales differ",
+        remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set;"
+        " score renders them as they are",
+    )
     radii = sigma_of_log(str(path), "scale_0", log_sigmas(ply)[:, 0])
     splats = SplatSet(
         centers=centers_of(ply, radii),
@@ -206,12 +210,10 @@ def check_splats(where: str, splats: SplatSet) -> None:
 FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(__package__, SplatFormat)}
 
 
-def format_of(path: Path) -> SplatFormat:
-    """The suffix's format, PLY without one. Raises UsageError if unknown."""
-    found = FORMATS.get(path.suffix.lower() or ".ply")
-    if found is None:
-        raise UsageError(f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}")
-    return found
+def format_of(path: Path, error: type[SplatCtrlError] = UsageError) -> SplatFormat:
+    """The suffix's format, PLY without one. Raises `error` if unknown."""
+    said = f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}"
+    return require(FORMATS.get(path.suffix.lower() or ".ply"), said, error=error)
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
@@ -219,7 +221,7 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 
     Raises InputError if missing, truncated, unknown or invalid.
     """
-    kind = _known_format(path)
+    kind = format_of(path, InputError)
     if kind is not FORMATS[".ply"]:
         gaussians, comments = kind.read(path)
         is_round = not (_is_stretched(gaussians).any() or gaussians.harmonics[:, 1:].any())
@@ -233,7 +235,7 @@ def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
 
     If float32 would move them, an origin is subtracted, which the comment `ORIGIN` names. Raises as `read_splats`.
     """
-    if _known_format(path) is not FORMATS[".ply"]:
+    if format_of(path, InputError) is not FORMATS[".ply"]:
         splats, comments = read_splats(path)
         return splats, comments, splats.centers.astype(np.float64)
     ply = read_table(path, "vertex", REQUIRED)
@@ -250,13 +252,6 @@ def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
             moved.rows[name] = column
         named = " ".join(f"{value:.0f}" for value in origin)
         return _splats_or_gaussians(moved), {**comments, ORIGIN: named}, exact - origin
-
-
-def _known_format(path: Path) -> SplatFormat:
-    try:
-        return format_of(path)
-    except UsageError as error:
-        raise InputError(error.message) from None
 
 
 def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:
@@ -282,22 +277,22 @@ def describe_splats(path: Path, _head: bytes) -> Summary:
     """Summarise a splat file. Raises InputError for another kind."""
     found, comments = read_splats(path)
     gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
+    ranges: dict[str, Floats] = {}
+    if len(gaussians):
+        ranges = {
+            "lower_m": gaussians.centers.min(axis=0),
+            "upper_m": gaussians.centers.max(axis=0),
+            "sigma_m": np.percentile(gaussians.scales, [0, 50, 100]),
+            "opacity": np.percentile(gaussians.opacities, [0, 50, 100]),
+        }
+    labels = {label.name.lower(): int(np.count_nonzero(gaussians.labels == label)) for label in Label}
     facts: dict[str, object] = {
         "format": format_of(path).name,
         "splats": len(gaussians),
         "shape": "isotropic" if isinstance(found, SplatSet) else "anisotropic",
         "degree_of_harmonics": int(np.sqrt(gaussians.harmonics.shape[1])) - 1,
+        **({"labels": labels} if (gaussians.labels != Label.OBJECT).any() else {}),
+        **{name: [float(f"{value:.4g}") for value in values] for name, values in ranges.items()},
+        "comments": comments,
     }
-    if (gaussians.labels != Label.OBJECT).any():
-        facts["labels"] = {label.name.lower(): int(np.count_nonzero(gaussians.labels == label)) for label in Label}
-    if len(gaussians):
-        facts["lower_m"] = _rounded(gaussians.centers.min(axis=0))
-        facts["upper_m"] = _rounded(gaussians.centers.max(axis=0))
-        facts["sigma_m"] = _rounded(np.percentile(gaussians.scales, [0, 50, 100]))
-        facts["opacity"] = _rounded(np.percentile(gaussians.opacities, [0, 50, 100]))
-    facts["comments"] = comments
     return Summary(path=str(path), kind="splats", facts=facts)
-
-
-def _rounded(values: Floats) -> list[float]:
-    return [float(f"{value:.4g}") for value in values]

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import SplatFormat, unit_quaternions
 from splatctrl_cli.records import Array, Float32, GaussianSet, Label
@@ -45,10 +45,13 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
     field.CreateOpacitiesAttr(arrays.FloatArray.FromNumpy(g.opacities))
     field.CreateRadianceSphericalHarmonicsDegreeAttr(int(np.sqrt(g.harmonics.shape[1])) - 1)
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(to_float3(g.harmonics.reshape(-1, 3)))
-    field.CreateExtentAttr(to_float3(_extent(g)))
+    reach = 3.0 * g.scales.max(axis=1, keepdims=True)
+    corners = np.stack([(g.centers - reach).min(axis=0), (g.centers + reach).max(axis=0)])  # at any rotation
+    field.CreateExtentAttr(to_float3(corners.astype(np.float32)))
     if (g.labels != Label.OBJECT).any():
-        primvar = geometry.PrimvarsAPI(field).CreatePrimvar("label", kinds.IntArray, geometry.Tokens.vertex)
-        primvar.Set(arrays.IntArray.FromNumpy(g.labels.astype(np.int32)))
+        geometry.PrimvarsAPI(field).CreatePrimvar("label", kinds.IntArray, geometry.Tokens.vertex).Set(
+            arrays.IntArray.FromNumpy(g.labels.astype(np.int32))
+        )
     layer = stage.GetRootLayer()
     layer.customLayerData = {"frame": "world", **comments}
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
@@ -68,18 +71,16 @@ def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
     library.
     """
     usd, geometry, *_ = _library()
-    if not path.is_file():
-        raise InputError(f"{path}: cannot be read: no such file")
+    refuse_if(not path.is_file(), f"{path}: cannot be read: no such file")
     with tempfile.TemporaryDirectory() as folder:
         named = Path(folder) / f"{NAME}{suffix}"
         named.symlink_to(path.resolve())
-        try:
+        with refuse_faults(
+            lambda _: f"{path}: no USD file that the library can open", Exception
+        ):  # of the library's own type; it names lines of its source
             stage = usd.Stage.Open(str(named))
-        except Exception:  # of the library's own type; it names lines of its source
-            raise InputError(f"{path}: no USD file that the library can open") from None
         prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == PRIM_TYPE]
-        if len(prims) != 1:
-            raise InputError(f"{path}: expected one {PRIM_TYPE}, got {len(prims)}")
+        refuse_if(len(prims) != 1, f"{path}: expected one {PRIM_TYPE}, got {len(prims)}")
         gaussians = _gaussians(path, prims[0], geometry)
         comments = {key: str(value) for key, value in stage.GetRootLayer().customLayerData.items()}
     check_gaussians(str(path), gaussians)
@@ -87,25 +88,20 @@ def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def _library() -> tuple[Any, Any, Any, Any, Any]:
-    try:
+    with refuse_faults(
+        lambda _: "USD: the library usd-core is not installed",
+        ImportError,
+        remedy="pip install 'splatctrl-cli[usd]'",
+        error=UsageError,
+    ):
         from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
-    except ImportError:
-        raise UsageError(
-            "USD: the library usd-core is not installed", remedy="pip install 'splatctrl-cli[usd]'"
-        ) from None
-    if getattr(UsdVol, PRIM_TYPE, None) is None:
-        raise UsageError(
-            f"USD: expected usd-core 26.3 or later, which knows {PRIM_TYPE}, got {Usd.GetVersion()}",
-            remedy="pip install 'splatctrl-cli[usd]'",
-        )
+    refuse_if(
+        getattr(UsdVol, PRIM_TYPE, None) is None,
+        f"USD: expected usd-core 26.3 or later, which knows {PRIM_TYPE}, got {Usd.GetVersion()}",
+        remedy="pip install 'splatctrl-cli[usd]'",
+        error=UsageError,
+    )
     return Usd, UsdGeom, UsdVol, Vt, Sdf.ValueTypeNames
-
-
-def _extent(gaussians: GaussianSet) -> Float32:
-    """Corners (2, 3) around three sigmas of every Gaussian, at any rotation."""
-    reach = 3.0 * gaussians.scales.max(axis=1, keepdims=True)
-    lower, upper = (gaussians.centers - reach).min(axis=0), (gaussians.centers + reach).max(axis=0)
-    return np.stack([lower, upper]).astype(np.float32)
 
 
 def _gaussians(path: Path, prim: Any, geometry: Any) -> GaussianSet:
@@ -113,14 +109,16 @@ def _gaussians(path: Path, prim: Any, geometry: Any) -> GaussianSet:
     num = len(centers)
     degree = int(prim.GetAttribute(DEGREE).Get())
     harmonics = _array(path, prim, HARMONICS, 3)
-    if len(harmonics) != num * (degree + 1) ** 2:
-        raise InputError(
-            f"{path}: {HARMONICS}: expected {(degree + 1) ** 2} for each of {num} Gaussians, got {len(harmonics)}"
-        )
+    refuse_if(
+        len(harmonics) != num * (degree + 1) ** 2,
+        f"{path}: {HARMONICS}: expected {(degree + 1) ** 2} for each of {num} Gaussians, got {len(harmonics)}",
+    )
     primvars = geometry.PrimvarsAPI(prim)
     labels = np.asarray(primvars.GetPrimvar("label").Get() if primvars.HasPrimvar("label") else np.zeros(num))
-    if labels.shape != (num,) or labels.dtype.kind not in "iuf" or np.any((labels < 0) | (labels > 255)):
-        raise InputError(f"{path}: label: expected a number from 0 to 255 for each of {num} Gaussians")
+    refuse_if(
+        labels.shape != (num,) or labels.dtype.kind not in "iuf" or np.any((labels < 0) | (labels > 255)),
+        f"{path}: label: expected a number from 0 to 255 for each of {num} Gaussians",
+    )
     return GaussianSet(
         centers=centers,
         scales=_array(path, prim, "scales", 3),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 
-from splatctrl_cli.checks.check_views import are_far, check_views, rescaled
+from splatctrl_cli.checks.check_views import are_far, check_views, rescale_remedy
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
@@ -195,10 +195,10 @@ class CameraAgreement:
         )[0]
         for finding in [finding for finding in findings if finding.code == "views-scale"]:
             if not self._is_allowed:
+                remedy = rescale_remedy(self._units(), finding.value or 1.0)
                 raise InputError(
                     f"{self._name}: {finding.what}",
-                    remedy=f"{rescaled(self._units(), finding.value or 1.0)}, or correct the poses' unit; if both are"
-                    " right, give --allow-disagreement",
+                    remedy=f"{remedy}, or correct the poses' unit; if both are right, give --allow-disagreement",
                 )
             console.log(f"warning: {self._name}: {finding.what}")
 

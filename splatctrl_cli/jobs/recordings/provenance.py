@@ -115,7 +115,7 @@ def scene_mismatches(
     scene: SceneFolder, source: RecordSource, states: StateColumns, model: RobotModel
 ) -> Iterator[Reason]:
     """Mismatches of a reconstruction with a log and robot: provenance, times, and its own parts."""
-    if not scene.has_digests:
+    if scene.parts.digests is None:
         yield lacking(
             sentence=f"{scene.path} is of an earlier version: nothing tells whether its files are as written",
             remedy="reconstruct again",
@@ -220,7 +220,7 @@ def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Reason | None:
 
 def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
     """Splats unlike their occupancy grid: rescaled, moved, or removed."""
-    known = scene.known() if scene.has_digests else None
+    known = scene.known() if scene.parts.digests is not None else None
     if known is None:
         return
     used = scene.run.get("config", {})

@@ -10,9 +10,8 @@ from splatctrl_cli.checks.check_states import PoseAgreement, check_angles, check
 from splatctrl_cli.checks.clock_offset import (
     ClockOffset,
     ImageMotion,
-    RobotPoints,
     estimate_clock_offset,
-    states_asked,
+    select_states,
 )
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
@@ -318,9 +317,7 @@ def clock_of(model: RobotModel, logged: LoggedStates, motion: ImageMotion) -> Cl
     states = logged.states
     if not motion.cameras or not logged.source.has_clock or not len(states):
         return None
-    asked = states.select(states_asked(states.stamp_ns, motion))
+    asked = states.select(select_states(states.stamp_ns, motion))
     centers = model.sphere_centers_batch(asked.position[: len(asked)])
     moving = model.moving_spheres
-    return estimate_clock_offset(
-        asked, motion, RobotPoints(centers=centers[:, moving], radii=model.sphere_set.radii[moving])
-    )
+    return estimate_clock_offset(asked, motion, (centers[:, moving], model.sphere_set.radii[moving]))

@@ -10,7 +10,7 @@ from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.calibrated import LOGGED
-from splatctrl_cli.recording.log.survey import NAME, RobotDescription
+from splatctrl_cli.recording.log.survey import NAME
 from splatctrl_cli.recording.source import logged_descriptions
 from splatctrl_cli.recording.state.state_source import StateSource
 from splatctrl_cli.records import RecordSource, SphereSet
@@ -52,7 +52,7 @@ def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
     """Robot described by logs, None if none is. Raises InputError for several or an invalid one."""
     found = logged_descriptions(paths)
     if len(found) > 1:
-        where = ", ".join(description.where for _, description in found)
+        where = ", ".join(where for _, where, _ in found)
         raise InputError(f"{paths[0]}: {len(found)} robots, of {where}", remedy="give one of them with --urdf")
     return _urdf(*found[0]) if found else None
 
@@ -103,13 +103,13 @@ def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
 def differs(file: UrdfFile, paths: Sequence[Path]) -> str:
     """Describe how a model differs from all in the logs, or empty."""
     words = []
-    for path, description in logged_descriptions(paths):
+    for path, where, text in logged_descriptions(paths):
         try:
-            words.append(model_difference(file, _urdf(path, description)))
+            words.append(model_difference(file, _urdf(path, where, text)))
         except (InputError, ValueError, RuntimeError) as error:
             words.append(f"{path}: its {NAME} cannot be read: {error}")
     return words[0] if words and all(words) else ""
 
 
-def _urdf(path: Path, description: RobotDescription) -> UrdfFile:
-    return read_urdf(path / description.where.strip("/"), description.text)
+def _urdf(path: Path, where: str, text: str) -> UrdfFile:
+    return read_urdf(path / where.strip("/"), text)

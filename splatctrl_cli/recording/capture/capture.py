@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, npy_of
 from splatctrl_cli.formats.image_file import decode_file
@@ -25,11 +25,10 @@ from splatctrl_cli.recording.log.stored_frame import (
     FrameSource,
     StoredFrame,
     human_mask,
+    merge_joints,
     read_topics,
-    with_joints,
-    without_joints,
 )
-from splatctrl_cli.recording.log.survey import RobotDescription, Survey
+from splatctrl_cli.recording.log.survey import Survey
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, LossReport, UInt8
 
@@ -39,10 +38,8 @@ FORMAT, VERSION = "splatctrl-capture", 1
 def check_header(file: Path, header: Mapping[str, Any]) -> None:
     """Raise InputError naming the first missing or wrong entry."""
     for name, is_right, expected in _ENTRIES:
-        if name not in header:
-            raise InputError(f"{file}: {name} is missing", remedy=AGAIN)
-        if not is_right(header[name]):
-            raise InputError(f"{file}: {name}: expected {expected}", remedy=AGAIN)
+        refuse_if(name not in header, f"{file}: {name} is missing", remedy=AGAIN)
+        refuse_if(not is_right(header[name]), f"{file}: {name}: expected {expected}", remedy=AGAIN)
 
 
 def _is_text(value: object) -> bool:
@@ -101,20 +98,26 @@ def read_capture_header(path: Path) -> dict[str, Any]:
     """Read capture.json. Raises InputError if not ours, or of another version."""
     file = path / "capture.json"
     with refuse_faults(f"{file}: cannot be read", ValueError, OSError, remedy=AGAIN):
-        header = json.loads(file.read_text(encoding="utf-8"))
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise InputError(f"{file}: not a splatctrl capture", remedy="expected what `splatctrl ingest` writes")
-    if header.get("version") != VERSION:
-        raise InputError(
-            f"{file}: expected version {VERSION}, got {header.get('version')}", remedy="use a newer splatctrl"
-        )
+        header: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    refuse_if(
+        not isinstance(header, dict) or header.get("format") != FORMAT,
+        f"{file}: not a splatctrl capture",
+        remedy="expected what `splatctrl ingest` writes",
+    )
+    refuse_if(
+        header.get("version") != VERSION,
+        f"{file}: expected version {VERSION}, got {header.get('version')}",
+        remedy="use a newer splatctrl",
+    )
     check_header(file, header)
     sums = FileSums(path)
     for name in ("capture.json", "frames.csv", "joints.npz"):
-        if not (path / name).is_file():
-            raise InputError(f"{path / name}: missing", remedy=AGAIN)
-        if sums.get(name) != sha256(path / name):
-            raise InputError(f"{path / name}: its checksum differs from SHA256SUMS", remedy=AGAIN)
+        refuse_if(not (path / name).is_file(), f"{path / name}: missing", remedy=AGAIN)
+        refuse_if(
+            sums.get(name) != sha256(path / name),
+            f"{path / name}: its checksum differs from SHA256SUMS",
+            remedy=AGAIN,
+        )
     return header
 
 
@@ -152,8 +155,11 @@ class FrameRows:
             lines = iter(lambda: stream.readline(_MOST_ROW), b"")
             rows = csv.reader((line.decode("utf-8") for line in lines), strict=True)
             names = tuple(next(rows, ()))
-            if names[: len(COLUMNS)] != COLUMNS or names[len(COLUMNS) :] not in ((), *zip(MASKS), MASKS):
-                raise InputError(f"{self._file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
+            refuse_if(
+                names[: len(COLUMNS)] != COLUMNS or names[len(COLUMNS) :] not in ((), *zip(MASKS), MASKS),
+                f"{self._file}: expected columns {', '.join(COLUMNS)}",
+                remedy=AGAIN,
+            )
             for values in filter(None, rows):
                 row = _checked(dict(zip(names, values, strict=True)))
                 if row["camera"] in self._cameras:
@@ -177,8 +183,7 @@ class FileSums:
     def __init__(self, folder: Path) -> None:
         """Raises InputError without the file."""
         file = folder / SUMS
-        if not file.is_file():
-            raise InputError(f"{file}: missing", remedy=f"the capture was not finished; {AGAIN}")
+        refuse_if(not file.is_file(), f"{file}: missing", remedy=f"the capture was not finished; {AGAIN}")
         keys, sums = array("Q"), bytearray()
         with file.open("rb") as stream:
             while line := stream.readline(_MOST_ROW):
@@ -196,9 +201,7 @@ class FileSums:
     def get(self, name: str) -> str | None:
         """Hexadecimal sha256 of a name's last line, or None."""
         at = int(np.searchsorted(self._keys, np.uint64(_key(name.encode())), side="right")) - 1
-        if at < 0 or int(self._keys[at]) != _key(name.encode()):
-            return None
-        return bytes(self._sums[at]).hex()
+        return None if at < 0 or int(self._keys[at]) != _key(name.encode()) else bytes(self._sums[at]).hex()
 
 
 def _key(name: bytes) -> int:
@@ -249,11 +252,12 @@ class CaptureSource(FrameSource):
             found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
             chosen = options if options.joint_topic is not None else replace(options, joint_topic=kept.chosen)
             self.joint_names, self.states = joint_records(found, chosen, loss, joints)
-            self._loss = with_joints(without_joints(self._loss, kept.loss, kept.first_note), loss, kept.first_note)
+            self._loss = merge_joints(
+                merge_joints(self._loss, kept.loss, kept.first_note, sign=-1), loss, kept.first_note
+            )
 
     @property
     def loss(self) -> LossReport:
-        """The loss of `ingest`, and later damage."""
         loss = self._loss
         damaged = max(self._damaged, self._damaged_before, key=len)
         return replace(loss, damaged=loss.damaged + len(damaged), notes=[*loss.notes, *damaged])
@@ -270,7 +274,6 @@ class CaptureSource(FrameSource):
         yield from filter(None, map(self._stored_frame, self._rows))
 
     def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
-        """A row's frame; None, and counted, if a file of it is missing or damaged."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
         camera = self._cameras[row["camera"]]
@@ -317,32 +320,35 @@ class CaptureSource(FrameSource):
 
     def _read(self, name: str) -> bytes | None:
         path = self._path / name
-        if not path.is_file():
-            self._damaged.append(f"{name}: missing")
-            return None
-        data = path.read_bytes()
-        if self._sums.get(name) != hashlib.sha256(data).hexdigest():
-            self._damaged.append(f"{name}: its checksum differs from SHA256SUMS")
-            return None
-        return data
+        data = path.read_bytes() if path.is_file() else None
+        if data is not None and self._sums.get(name) == hashlib.sha256(data).hexdigest():
+            return data
+        fault = "missing" if data is None else "its checksum differs from SHA256SUMS"
+        self._damaged.append(f"{name}: {fault}")
+        return None
 
     def _checked(self, name: str) -> Path:
         file = self._path / name
-        if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise InputError(f"{file}: lies outside the capture", remedy=AGAIN)
-        if not file.is_file() or self._sums.get(name) != sha256(file):
-            raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=AGAIN)
+        refuse_if(
+            Path(name).is_absolute() or ".." in Path(name).parts, f"{file}: lies outside the capture", remedy=AGAIN
+        )
+        refuse_if(
+            not file.is_file() or self._sums.get(name) != sha256(file),
+            f"{file}: missing, or its checksum differs from SHA256SUMS",
+            remedy=AGAIN,
+        )
         return file
 
 
-def robot_description_of(path: Path) -> list[RobotDescription]:
-    """A capture's URDF, if any. Raises InputError if changed."""
+def read_robot_description(path: Path) -> list[tuple[str, str]]:
+    """Name and text of a capture's URDF, if any. Raises InputError if changed."""
     file = path / ROBOT
     if not file.is_file():
         return []
-    if FileSums(path).get(ROBOT) != sha256(file):
-        raise InputError(f"{file}: its checksum differs from SHA256SUMS", remedy=AGAIN)
-    return [RobotDescription(where=ROBOT, text=file.read_bytes().decode("utf-8"))]
+    refuse_if(
+        FileSums(path).get(ROBOT) != sha256(file), f"{file}: its checksum differs from SHA256SUMS", remedy=AGAIN
+    )
+    return [(ROBOT, file.read_bytes().decode("utf-8"))]
 
 
 def _pose(row: Mapping[str, str]) -> Float64:
@@ -362,16 +368,14 @@ def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | N
 
 def _read_joints(path: Path) -> StateColumns:
     file = path / "joints.npz"
-    try:
+    with refuse_faults(lambda error: str(error.message), InputError, remedy=AGAIN):
         content = NpzFile(file)
         stamps = content.stamps("stamp_ns", 1, 0, least=0)
         rows = {name: content.rows(name) for name in (*NEEDED[1:], *OPTIONAL) if name in (*NEEDED, *content.names)}
-    except InputError as error:
-        raise InputError(error.message, remedy=AGAIN) from None
-    if any(len(values) != len(stamps) for values in rows.values()):
-        raise InputError(
-            f"{file}: expected {len(stamps)} states in every array, got "
-            + ", ".join(f"{name} {len(values)}" for name, values in rows.items()),
-            remedy=AGAIN,
-        )
+    refuse_if(
+        any(len(values) != len(stamps) for values in rows.values()),
+        f"{file}: expected {len(stamps)} states in every array, got "
+        + ", ".join(f"{name} {len(values)}" for name, values in rows.items()),
+        remedy=AGAIN,
+    )
     return StateColumns(stamp_ns=stamps, **rows)

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.lib import format as npy
 
 from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
-from splatctrl_cli.errors import InputError, UsageError, WriteError
+from splatctrl_cli.errors import UsageError, WriteError, refuse_if
 from splatctrl_cli.files.output import sha256, write_json, write_table
+from splatctrl_cli.formats.image_file import PNG
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.capture.capture import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
 from splatctrl_cli.recording.log.messages import metres
@@ -29,7 +30,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     FrameSource,
     JointTopics,
     StoredFrame,
-    is_png,
+    is_kept,
     npy_bytes,
     write_rows,
     write_topics,
@@ -66,13 +67,10 @@ class Journal:
     def close(self) -> None:
         self._stream.close()
 
-    def kept(self) -> Entry | None:
-        """The earlier run's next frame, or None."""
+    def next_kept(self) -> Entry | None:
         found = next(self._kept, None)
-        if found is None:
-            return None
-        self.num_entries += 1
-        return Entry(**found)
+        self.num_entries += found is not None
+        return None if found is None else Entry(**found)
 
     def add(self, entry: Entry) -> None:
         self.num_entries += 1
@@ -96,7 +94,6 @@ class Journal:
 
 
 def read_identity(folder: Path) -> Mapping[str, Any] | None:
-    """An interrupted run's identity, or None."""
     path = folder / JOURNAL
     first = next(_lines(path), None) if path.is_file() else None
     return None if first is None else first.get("identity")
@@ -104,21 +101,11 @@ def read_identity(folder: Path) -> Mapping[str, Any] | None:
 
 def check_not_partial(folder: Path) -> None:
     """Raise InputError for an interrupted capture."""
-    if (folder / JOURNAL).is_file():
-        raise InputError(
-            f"{folder}: an ingest that was interrupted", remedy="continue it with the same command and --resume"
-        )
-
-
-def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Raise UsageError if a written frame differs from the source's."""
-    differing = [name for name in now if before.get(name) != now[name]]
-    if differing:
-        name = differing[0]
-        raise UsageError(
-            f"{folder}: --resume: {before.get('color')}: {name} was {before.get(name)}, is {now[name]}",
-            remedy="the source has changed; start over without --resume",
-        )
+    refuse_if(
+        (folder / JOURNAL).is_file(),
+        f"{folder}: an ingest that was interrupted",
+        remedy="continue it with the same command and --resume",
+    )
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
@@ -128,10 +115,11 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
                 yield json.loads(line)
 
 
+LENSES = "valid/"  # masks that a lens's frames share, out of order
 PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
-PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
+_FILTERED = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,16 +156,22 @@ def write_capture(
                 states.add(item)
                 num_states += 1
                 continue
-            row, kept = _row(item, cameras), journal.kept()
+            row, kept = _row(item, cameras), journal.next_kept()
             if kept is None:
                 journal.add(_write_frame(folder, item, row, cameras[item.camera]))
             else:
-                check_same_frame(folder, kept.row, row)
+                name = next((name for name in row if kept.row.get(name) != row[name]), "")
+                refuse_if(
+                    name,
+                    f"{folder}: --resume: {kept.row.get('color')}: {name} was {kept.row.get(name)}, is"
+                    f" {row.get(name)}",
+                    remedy="the source has changed; start over without --resume",
+                    error=UsageError,
+                )
                 num_resumed += 1
             if progress is not None:
                 progress(journal.num_entries)
-        if not journal.num_entries:
-            raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
+        refuse_if(not journal.num_entries, f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
         header = {
             "format": FORMAT,
             "version": VERSION,
@@ -219,19 +213,17 @@ def _write_index(
         shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
         header = header | {"joint_topics": write_topics(folder, topics, names.append)}
     write_json(folder / "capture.json", header)
-    of_lenses = {name: digest for entry in journal.entries() for digest, name in entry.sums if _is_of_lens(name)}
-    others = {name: sha256(folder / name) for name in [*names, "capture.json"]}
-    _write_sums(folder / SUMS, journal, of_lenses | others)
-
-
-def _is_of_lens(name: str) -> bool:
-    """True if a lens's frames share it, out of order."""
-    return name.startswith("valid/")
+    of_lenses = {
+        name: digest for entry in journal.entries() for digest, name in entry.sums if name.startswith(LENSES)
+    }
+    _write_sums(
+        folder / SUMS, journal, of_lenses | {name: sha256(folder / name) for name in [*names, "capture.json"]}
+    )
 
 
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
     """Write sorted lines; the journal is read once per image folder to bound memory."""
-    written = (name for entry in journal.entries() for _, name in entry.sums if not _is_of_lens(name))
+    written = (name for entry in journal.entries() for _, name in entry.sums if not name.startswith(LENSES))
     folders = {f"{name.rpartition('/')[0]}/" for name in written}
     with path.open("w", encoding="utf-8", newline="") as stream:
         for place in sorted([*folders, *others]):
@@ -241,11 +233,11 @@ def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """Make the frame's row of frames.csv without file names, and count the frame in `cameras`."""
-    if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
-        raise InputError(
-            f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
-        )
+    refuse_if(
+        stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera),
+        f"{stored.origin}: camera {stored.camera!r}: cannot name a folder",
+        remedy="rename the camera",
+    )
     intrinsics = vars(stored.intrinsics)
     camera = cameras.setdefault(
         stored.camera,
@@ -255,11 +247,11 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
             "num_frames": 0,
         },
     )
-    if any(camera[name] != value for name, value in intrinsics.items()):
-        raise InputError(
-            f"{stored.origin}: camera {stored.camera} changes its intrinsics; a capture holds one set of each camera",
-            remedy="leave --holdout to `reconstruct` and `score`",
-        )
+    refuse_if(
+        any(camera[name] != value for name, value in intrinsics.items()),
+        f"{stored.origin}: camera {stored.camera} changes its intrinsics; a capture holds one set of each camera",
+        remedy="leave --holdout to `reconstruct` and `score`",
+    )
     camera["num_frames"] += 1
     T = stored.T_world_camera
     pose = [repr(float(value)) for value in (*T[:3, 3], *quat_from_rotation(T[:3, :3]))]
@@ -273,18 +265,18 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
 
 def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
     stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
-    color = stored.color_file or encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
-    color_name = f"color/{stored.camera}/{stem}.{'png' if is_png(color) else 'jpg'}"
+    color = stored.color_file or encode_png(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
+    color_name = f"color/{stored.camera}/{stem}.{'png' if is_kept(color, PNG) else 'jpg'}"
     kind, depth = _depth_file(stored, unit)
     depth_name = f"depth/{stored.camera}/{stem}.{kind}"
     files = {color_name: color, depth_name: depth}
     named = {"color": color_name, "depth": depth_name}
     if stored.human is not None:
         named["human"] = f"human/{stored.camera}/{stem}.png"
-        files[named["human"]] = encoded(stored.human * np.uint8(255))
+        files[named["human"]] = encode_png(stored.human * np.uint8(255))
     if stored.valid is not None:
-        mask = encoded(stored.valid * np.uint8(255))
-        named["valid"] = f"valid/{stored.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
+        mask = encode_png(stored.valid * np.uint8(255))
+        named["valid"] = f"{LENSES}{stored.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
         files[named["valid"]] = mask
     for name, data in files.items():
         path = folder / name
@@ -311,11 +303,10 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
-    """Suffix and bytes of the depth image: the recorded PNG if its unit fits."""
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
-    return ("npy", npy_bytes(stored.depth)) if counts is None else ("png", encoded(counts))
+    return ("npy", npy_bytes(stored.depth)) if counts is None else ("png", encode_png(counts))
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
@@ -327,11 +318,9 @@ def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, n
     return counts if error <= (0.0 if is_exact else FLOAT_DEPTH_ERROR) else None
 
 
-def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
-    """Encode an image as PNG."""
-    is_written, data = cv2.imencode(".png", pixels, PNG)
-    if not is_written:
-        raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
+def encode_png(pixels: np.ndarray[Any, Any]) -> bytes:
+    is_written, data = cv2.imencode(".png", pixels, _FILTERED)
+    refuse_if(not is_written, f"an image of shape {pixels.shape} could not be encode_png as PNG", error=WriteError)
     return bytes(data)
 
 

@@ -11,18 +11,18 @@ import sqlite3
 import struct
 import tempfile
 import weakref
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 from urllib.parse import quote
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
-from splatctrl_cli.recording.container.foxglove import standing_in
+from splatctrl_cli.recording.container.foxglove import add_ros_type
 from splatctrl_cli.recording.container.mcap_log import ros_type_name
-from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.recording.container.raw_log import Damage, Part, RawLog, RawMessage, Topic
 from splatctrl_cli.records import SECOND_NS
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
@@ -31,17 +31,7 @@ _U32 = struct.Struct("<I")
 _MARK = b"compression="  # of a chunk's header, behind its length and perhaps the fields `op` and `size`
 _MARK_OFFSETS = (8, 16, 21, 29)
 
-Fields = dict[str, bytes]
-
-
-class BagRecord(NamedTuple):
-    """A record; of a cut one the body that is left."""
-
-    offset: int
-    kind: int
-    fields: Fields
-    body: bytes
-    is_cut: bool = False
+Fields = Mapping[str, bytes]
 
 
 class Bag1Log(RawLog):
@@ -53,50 +43,51 @@ class Bag1Log(RawLog):
         self.path = path
         self.files = (path,)
         self._size = path.stat().st_size
-        self._topics: dict[int, Topic] = {}
-        if next(self.records(Damage()), None) is None:
-            raise InputError(f"{path}: not a readable ROS 1 bag: no whole record", remedy="record or copy it again")
+        self.channels: dict[int, Topic] = {}
+        refuse_if(
+            next(self.records(Damage()), None) is None,
+            f"{path}: not a readable ROS 1 bag: no whole record",
+            remedy="record or copy it again",
+        )
         for record in self._connections():
-            self._connect(record.fields, record.body, Damage())
+            self._connect(record.fields, record.content, Damage())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield in file order; skips bad chunks, reads a cut one to its cut."""
         budget, num_indexed, num_chunks = Budget(self._size), 0, None
         for record in self.records(damage):
-            if record.kind == BAG_HEADER:
+            if record.opcode == BAG_HEADER:
                 num_chunks = number(record.fields, "chunk_count")
                 if number(record.fields, "index_pos") <= 0:
                     damage.add(f"{self.path.name}: has no index: cut, or still being written")
                     num_chunks = 0
-            elif record.kind == CHUNK_INFO:
+            elif record.opcode == CHUNK_INFO:
                 num_indexed += 1
-            elif record.kind == CHUNK:
+            elif record.opcode == CHUNK:
                 yield from self._chunk(record, budget, damage, names)
             elif not record.is_cut:
-                yield from self._read(record.kind, record.fields, record.body, record.offset, damage, names)
+                yield from self._read(record, damage, names)
         if num_chunks is None or num_indexed < num_chunks:
             damage.add(f"{self.path.name}: its index is not whole")
 
     def _chunk(
-        self, record: BagRecord, budget: Budget, damage: Damage, names: Collection[str] | None
+        self, record: Part, budget: Budget, damage: Damage, names: Collection[str] | None
     ) -> Iterator[RawMessage]:
         compression = record.fields.get("compression", b"").decode("latin-1")
         size = number(record.fields, "size")
         try:
             unpack = unpacked_start if record.is_cut else budget.unpacked
-            for kind, fields, body in records_in(unpack(record.body, compression, size)):
-                yield from self._read(kind, fields, body, record.offset, damage, names)
+            for each in records_in(unpack(record.content, compression, size), record.offset):
+                yield from self._read(each, damage, names)
         except (BadBlockError, ValueError) as error:
             if not record.is_cut:  # the cut has been counted
                 damage.add(f"{self.path.name}: the chunk at byte {record.offset} was left out: {error}")
 
-    def _read(
-        self, kind: int, fields: Fields, body: bytes, offset: int, damage: Damage, names: Collection[str] | None
-    ) -> Iterator[RawMessage]:
-        if kind == CONNECTION:
-            self._connect(fields, body, damage)
-        elif kind == MESSAGE:
-            topic, time = self._topics.get(number(fields, "conn")), fields.get("time", b"")
+    def _read(self, record: Part, damage: Damage, names: Collection[str] | None) -> Iterator[RawMessage]:
+        if record.opcode == CONNECTION:
+            self._connect(record.fields, record.content, damage)
+        elif record.opcode == MESSAGE:
+            topic, time = self.channels.get(number(record.fields, "conn")), record.fields.get("time", b"")
             if topic is None or len(time) != 8:
                 damage.add(f"{self.path.name}: a message without a connection or time")
             elif names is None or topic.name in names:
@@ -104,9 +95,9 @@ class Bag1Log(RawLog):
                 yield RawMessage(
                     topic=topic,
                     log_time_ns=seconds * SECOND_NS + nanoseconds,
-                    data=body,
+                    data=record.content,
                     file=self.path.name,
-                    offset=offset,
+                    offset=record.offset,
                 )
 
     def _connect(self, fields: Fields, body: bytes, damage: Damage) -> None:
@@ -120,9 +111,9 @@ class Bag1Log(RawLog):
             encoding="ros1",
             definition=told.get("message_definition", b"").decode("utf-8", "replace"),
         )
-        self._topics[number(fields, "conn")] = standing_in(topic)
+        self.channels[number(fields, "conn")] = add_ros_type(topic)
 
-    def records(self, damage: Damage) -> Iterator[BagRecord]:
+    def records(self, damage: Damage) -> Iterator[Part]:
         """Yield all records in order; only chunks, connections and messages have bodies. Losses go to `damage`."""
         with self.path.open("rb") as stream:
             if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
@@ -143,21 +134,20 @@ class Bag1Log(RawLog):
                 damage.add(f"{self.path.name}: bytes {offset} to {place} are damaged and were left out")
                 stream.seek(place)
 
-    def _connections(self) -> list[BagRecord]:
-        """The index's connections, if any."""
+    def _connections(self) -> list[Part]:
         with self.path.open("rb") as stream:
             stream.readline(64)
             first = self._record(stream, stream.tell())
-            place = number(first.fields, "index_pos") if first is not None and first.kind == BAG_HEADER else 0
+            place = number(first.fields, "index_pos") if first is not None and first.opcode == BAG_HEADER else 0
             if not 0 < place < self._size:
                 return []
             stream.seek(place)
             found = []
-            while (record := self._record(stream, stream.tell())) is not None and record.kind == CONNECTION:
+            while (record := self._record(stream, stream.tell())) is not None and record.opcode == CONNECTION:
                 found.append(record)
             return found
 
-    def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
+    def _record(self, stream: BinaryIO, offset: int) -> Part | None:
         """Read a record or None; the stream is left after it."""
         head = self._head(stream)
         if head is None:
@@ -165,10 +155,9 @@ class Bag1Log(RawLog):
         kind, fields, length = head
         end = stream.tell() + length
         is_cut = end > self._size
-        is_read = kind in {MESSAGE, CHUNK, CONNECTION} or is_cut
-        body = stream.read(min(length, MAX_BLOCK)) if is_read else b""
+        body = stream.read(min(length, MAX_BLOCK)) if is_cut or kind in {MESSAGE, CHUNK, CONNECTION} else b""
         stream.seek(min(end, self._size))
-        return BagRecord(offset, kind, fields, body, is_cut)
+        return Part(offset, kind, body, is_cut, fields)
 
     def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
         """Kind, fields and body length; the stream is left at the body."""
@@ -181,7 +170,6 @@ class Bag1Log(RawLog):
         return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
 
     def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
-        """Find the next whole chunk after `offset` by its header."""
         stream.seek(offset + 1)
         kept = b""
         while block := stream.read(PIECE):
@@ -209,9 +197,9 @@ class Bag1Log(RawLog):
         return int(_U32.unpack(content)[0]) if len(content) == 4 else None
 
 
-def fields_of(header: bytes) -> Fields | None:
+def fields_of(header: bytes) -> dict[str, bytes] | None:
     """A header's named fields; None if its lengths do not fit."""
-    found: Fields = {}
+    found: dict[str, bytes] = {}
     at = 0
     while at < len(header):
         length = int.from_bytes(header[at : at + 4], "little")
@@ -229,8 +217,8 @@ def number(fields: Fields, name: str) -> int:
     return int.from_bytes(value, "little") if len(value) in {4, 8} else -1
 
 
-def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
-    """Yield kind, fields and body of an unpacked chunk's records.
+def records_in(content: bytes, offset: int) -> Iterator[Part]:
+    """Yield the records of an unpacked chunk at byte `offset` of the file.
 
     Raises ValueError at bytes that are not a record.
     """
@@ -246,7 +234,7 @@ def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
         kind = fields.get("op", b"")
         if at > len(content) or len(kind) != 1:
             raise ValueError(f"{len(content) - body} bytes are not a record")
-        yield kind[0], fields, content[body:at]
+        yield Part(offset, kind[0], content[body:at], fields=fields)
 
 
 _WIDEST_HOLE = 1 << 40
@@ -279,7 +267,7 @@ class Db3Log(RawLog):
             if has_journal:
                 self._merge(end)
             with closing(self._opened()) as database:
-                self._topics = _topics(database)
+                self.channels = _topics(database)
         except (sqlite3.Error, ValueError) as error:
             remedy = "try 'ros2 bag reindex', or copy it again"
             if header[_FILE_FORMAT] == _WAL and not has_journal:
@@ -303,7 +291,6 @@ class Db3Log(RawLog):
         os.truncate(self._database, size)
 
     def _merge(self, size: int) -> None:
-        """Merge the journal into the copy, or leave it out."""
         try:
             with closing(sqlite3.connect(self._database)) as database:
                 self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]
@@ -320,7 +307,7 @@ class Db3Log(RawLog):
             damage.add(f"{self._journal.name}: holds no page that can be read; the bag was not closed")
         with closing(self._opened()) as database:
             for topic_id, log_time_ns, data in self._rows(database, damage):
-                topic = self._topics.get(topic_id)
+                topic = self.channels.get(topic_id)
                 if topic is None or not isinstance(data, bytes) or not isinstance(log_time_ns, int):
                     damage.add(f"{self.path.name}: a message without topic, time or data")
                 elif names is None or topic.name in names:
@@ -330,8 +317,9 @@ class Db3Log(RawLog):
         last, hole = -(1 << 62), 1  # hole: how many rows to pass over next
         for _ in range(1000):
             try:
-                query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id"
-                for number, *row in database.execute(query, (last,)):
+                for number, *row in database.execute(
+                    "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id", (last,)
+                ):
                     hole = min(hole, 1)
                     last = number
                     yield row[0], row[1], row[2]
@@ -355,8 +343,7 @@ class Db3Log(RawLog):
 
 def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
     found = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    if not {"topics", "messages"} <= found:
-        raise ValueError("no tables named topics and messages")
+    refuse_if(not {"topics", "messages"} <= found, "no tables named topics and messages", error=ValueError)
     definitions = {}
     if "message_definitions" in found:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
@@ -371,5 +358,5 @@ def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
             definition=str(text) if definition_format in {"ros2msg", "ros2idl"} else "",
             definition_format="idl" if definition_format == "ros2idl" else "msg",
         )
-        topics[number] = standing_in(topic)
+        topics[number] = add_ros_type(topic)
     return topics

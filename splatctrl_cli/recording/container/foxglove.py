@@ -21,6 +21,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
+from splatctrl_cli.errors import refuse_faults
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.container.raw_log import Topic
 
@@ -28,11 +29,14 @@ from splatctrl_cli.recording.container.raw_log import Topic
 @lru_cache(maxsize=16)
 def _pool(descriptor_set: bytes) -> Any:
     files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
-    try:
+    with refuse_faults(
+        "protobuf: the schema is not usable",
+        DecodeError,
+        DescriptorDatabaseConflictingDefinitionError,
+        error=ValueError,
+    ):
         for file in FileDescriptorSet.FromString(descriptor_set).file:
             files.Add(file)
-    except (DecodeError, DescriptorDatabaseConflictingDefinitionError) as error:
-        raise ValueError(f"protobuf: the schema is not usable: {error}") from None
     return DescriptorPool(files)
 
 
@@ -82,19 +86,17 @@ _TEXTS = {  # by the topic, what a text of the SDK stands for; metadata say the 
 }
 
 
-def stands_for(schema: str) -> str:
+def find_ros_type(schema: str) -> str:
     """The ROS type of a Foxglove schema, "" for others."""
-    for prefix in ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/"):
-        if schema.startswith(prefix):
-            return _STANDS_FOR.get(schema.removeprefix(prefix), "")
-    return ""
+    match = re.match(r"foxglove(?:\.|_msgs/(?:msg/)?)(.*)", schema, re.DOTALL)
+    return _STANDS_FOR.get(match[1], "") if match else ""
 
 
-def standing_in(topic: Topic) -> Topic:
+def add_ros_type(topic: Topic) -> Topic:
     """The topic with its ROS type, if of foxglove_msgs or SDK texts."""
     texts = _TEXTS if topic.type_name == TEXT else {}
     said = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
-    ros_type = said or stands_for(topic.type_name)
+    ros_type = said or find_ros_type(topic.type_name)
     return replace(topic, type_name=ros_type, schema=topic.type_name) if ros_type else topic
 
 
@@ -119,7 +121,6 @@ def _object(value: Any) -> Any:
 
 
 def _header(message: Any, frame_id: str | None = None) -> Any:
-    """A header; frame_id: for messages without that field."""
     frame_id = str(getattr(message, "frame_id", "")) if frame_id is None else frame_id
     time = getattr(message, "timestamp", None)
     seconds = _either(time, "sec", "seconds")
@@ -135,22 +136,6 @@ def _either(message: Any, *names: str) -> Any:
 def _data(message: Any) -> Any:
     value = message.data
     return np.frombuffer(base64.b64decode(value, validate=True) if isinstance(value, str) else value, dtype=np.uint8)
-
-
-def _compressed_image(message: Any) -> Any:
-    return SimpleNamespace(header=_header(message), format=message.format, data=_data(message))
-
-
-def _raw_image(message: Any) -> Any:
-    return SimpleNamespace(
-        header=_header(message),
-        width=int(message.width),
-        height=int(message.height),
-        encoding=str(message.encoding),
-        step=int(message.step),
-        is_bigendian=0,
-        data=_data(message),
-    )
 
 
 def _calibration(message: Any) -> Any:
@@ -183,16 +168,6 @@ def _transform(message: Any) -> Any:
     )
 
 
-def _joint_states(message: Any) -> Any:
-    """Joint states without velocities: an unset one looks like zero."""
-    return SimpleNamespace(
-        header=_header(message),
-        name=[str(joint.name) for joint in message.joints],
-        position=np.array([float(_either(joint, "position")) for joint in message.joints]),
-        velocity=np.zeros(0),
-    )
-
-
 def _sdk_text(message: Any) -> Any:
     """Parse an SDK text. Raises KeyError or ValueError for a missing field."""
     said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
@@ -211,12 +186,27 @@ def _sdk_text(message: Any) -> Any:
 
 
 _READERS: dict[str, Callable[[Any], Any]] = {
-    "CompressedImage": _compressed_image,
-    "CompressedVideo": _compressed_image,
-    "RawImage": _raw_image,
+    **dict.fromkeys(
+        ("CompressedImage", "CompressedVideo"),
+        lambda message: SimpleNamespace(header=_header(message), format=message.format, data=_data(message)),
+    ),
+    "RawImage": lambda message: SimpleNamespace(
+        header=_header(message),
+        width=int(message.width),
+        height=int(message.height),
+        encoding=str(message.encoding),
+        step=int(message.step),
+        is_bigendian=0,
+        data=_data(message),
+    ),
     "CameraCalibration": _calibration,
     "FrameTransform": lambda message: SimpleNamespace(transforms=[_transform(message)]),
-    "JointStates": _joint_states,
+    "JointStates": lambda message: SimpleNamespace(  # without velocities: an unset one looks like zero
+        header=_header(message),
+        name=[str(joint.name) for joint in message.joints],
+        position=np.array([float(_either(joint, "position")) for joint in message.joints]),
+        velocity=np.zeros(0),
+    ),
     "String": _sdk_text,
     "FrameTransforms": lambda message: SimpleNamespace(transforms=[_transform(item) for item in message.transforms]),
 }

@@ -9,9 +9,10 @@ import shutil
 import tempfile
 import weakref
 import zipfile
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from typing import Any
 import yaml
 import zstandard
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.summary import names_in
 from splatctrl_cli.formats.unpacking import (
     FREE_BYTES,
@@ -56,47 +57,32 @@ def unpack(path: Path, target: Path) -> str:
             written.write(piece)
 
 
-class UnpackedMessagesLog(JoinedLog):
-    """A log of zstd messages."""
-
-    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield unpacked messages; failures are counted."""
-        budget = Budget(sum(file.stat().st_size for file in self.files))
-        for message in super().messages(damage, names):
-            try:
-                yield replace(message, data=_unpacked_message(message.data, budget))
-            except BadBlockError as error:
-                damage.add(f"{message.topic.name}: a message was left out: {error}")
+def unpack_messages(messages: Iterable[RawMessage], damage: Damage, size: int) -> Iterator[RawMessage]:
+    """Yield unpacked zstd messages of a log of `size` bytes; failures are counted."""
+    budget = Budget(size)
+    for message in messages:
+        try:
+            yield replace(message, data=_unpacked_message(message.data, budget))
+        except BadBlockError as error:
+            damage.add(f"{message.topic.name}: a message was left out: {error}")
 
 
 def _unpacked_message(data: bytes, budget: Budget) -> bytes:
-    try:
+    with refuse_faults(lambda _: "is not a zstd frame", zstandard.ZstdError, error=BadBlockError):
         size = zstandard.frame_content_size(data)
-    except zstandard.ZstdError:
-        raise BadBlockError("is not a zstd frame") from None
-    if size >= 0:
-        return budget.unpacked(data, "zstd", size)
-    return budget.unpacked(data, "zstd", len(unpacked_start(data, "zstd", MAX_BLOCK)))
+    size = size if size >= 0 else len(unpacked_start(data, "zstd", MAX_BLOCK))
+    return budget.unpacked(data, "zstd", size)
 
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Container:
-    """A log format: suffix, first bytes, opener."""
-
-    suffix: str
-    magic: bytes
-    open: Callable[[Path], RawLog]
-
-
-CONTAINERS = (
-    Container(suffix=".mcap", magic=b"\x89MCAP0\r\n", open=McapLog),
-    Container(suffix=".bag", magic=b"#ROSBAG V", open=Bag1Log),
-    Container(suffix=".db3", magic=b"SQLite format 3", open=Db3Log),
-)
-SUFFIXES = tuple(kind.suffix for kind in CONTAINERS)
+CONTAINERS: Mapping[str, tuple[bytes, Callable[[Path], RawLog]]] = {  # first bytes and opener by suffix
+    ".mcap": (b"\x89MCAP0\r\n", McapLog),
+    ".bag": (b"#ROSBAG V", Bag1Log),
+    ".db3": (b"SQLite format 3", Db3Log),
+}
+SUFFIXES = tuple(CONTAINERS)
 
 
 class SessionLog(JoinedLog):
@@ -115,8 +101,9 @@ class SessionLog(JoinedLog):
         If parts share a topic, all are read: skipping would reorder its messages between passes.
         """
         pushed = None if names is None or self._share(names) else names
-        parts = (part.messages(damage, pushed) for part in self._parts)
-        for message in heapq.merge(*parts, key=lambda message: message.log_time_ns):
+        for message in heapq.merge(
+            *(part.messages(damage, pushed) for part in self._parts), key=lambda message: message.log_time_ns
+        ):
             if names is None or message.topic.name in names:
                 yield message
 
@@ -137,30 +124,29 @@ def open_raw_log(path: Path) -> RawLog:
     """
     if path.is_dir():
         return _open_folder(path)
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: the file is empty (0 bytes)", remedy="record or copy it again")
+    refuse_if(path.stat().st_size == 0, f"{path}: the file is empty (0 bytes)", remedy="record or copy it again")
     with path.open("rb") as stream:
         magic = stream.read(16)
-    kind = next((kind for kind in CONTAINERS if magic.startswith(kind.magic)), None)
-    if kind is not None:
-        log = kind.open(path)
+    open_kind = next((opener for first, opener in CONTAINERS.values() if magic.startswith(first)), None)
+    if open_kind is not None:
+        log = open_kind(path)
         first = () if isinstance(log, Bag1Log) else islice(log.messages(Damage()), 5)  # some may be damaged
         is_packed = any(m.topic.encoding == "cdr" and m.data.startswith(_ZSTD) for m in first)  # CDR begins with a 0
-        return UnpackedMessagesLog(path, (log,), log.container) if is_packed else log
+        unpack_all = partial(unpack_messages, size=sum(file.stat().st_size for file in log.files))
+        return JoinedLog(path, (log,), log.container, change=unpack_all) if is_packed else log
     if magic.startswith(_ZSTD):
         return _open_compressed(path)
-    if path.suffix in SUFFIXES:
-        raise InputError(
-            f"{path}: does not begin like a {path.suffix} file (first bytes {magic[:8]!r})",
-            remedy="the file is damaged or has the wrong name",
-        )
+    refuse_if(
+        path.suffix in SUFFIXES,
+        f"{path}: does not begin like a {path.suffix} file (first bytes {magic[:8]!r})",
+        remedy="the file is damaged or has the wrong name",
+    )
     raise InputError(
         f"{path}: unknown kind of file", remedy="expected .mcap, .bag, .db3, a bag folder, X.capture/ or a .toml"
     )
 
 
 def is_bag_folder(path: Path) -> bool:
-    """True for a likely ROS 2 bag."""
     return bool(_storage_files(path)) or (path / "metadata.yaml").is_file()
 
 
@@ -171,33 +157,32 @@ def _open_folder(path: Path) -> RawLog:
         _storage_files(path), key=lambda p: [int(n) for n in re.findall(r"\d+", p.name)]
     )
     missing = [file.name for file in files if not file.is_file()]
-    if missing:
-        raise InputError(f"{path}: metadata.yaml names {missing[0]}, which is not there", remedy="copy the whole bag")
-    if not files:
-        raise InputError(f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
+    refuse_if(
+        missing,
+        f"{path}: metadata.yaml names {''.join(missing[:1])}, which is not there",
+        remedy="copy the whole bag",
+    )
+    refuse_if(not files, f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
     mode, compression = str(told.get("compression_mode", "")).lower(), str(told.get("compression_format"))
-    if mode and compression != "zstd":
-        raise InputError(
-            f"{path}: compression {compression!r} is unknown, expected zstd", remedy="rewrite the bag with zstd"
-        )
+    refuse_if(
+        mode and compression != "zstd",
+        f"{path}: compression {compression!r} is unknown, expected zstd",
+        remedy="rewrite the bag with zstd",
+    )
     parts = tuple(open_raw_log(file) for file in files)
     kind = "mcap" if ".mcap" in files[0].suffixes else "sqlite3"
     return JoinedLog(path, parts, f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})", note=note)
 
 
-def told_formats(path: Path) -> set[str]:
+def read_formats(path: Path) -> set[str]:
     """Serialization formats in a bag folder's metadata.yaml."""
-    if not path.is_dir():
-        return set()
-    try:
+    with suppress(KeyError, TypeError):
         topics = _metadata(path)[0].get("topics_with_message_count") or ()
         return {str(topic["topic_metadata"]["serialization_format"]) for topic in topics}
-    except (KeyError, TypeError):
-        return set()
+    return set()
 
 
 def _open_compressed(path: Path) -> RawLog:
-    """Unpack into a temporary folder that lives as long as the log."""
     folder = Path(tempfile.mkdtemp(prefix="splatctrl-"))
     file = folder / path.stem
     with ExitStack() as stack:
@@ -205,10 +190,8 @@ def _open_compressed(path: Path) -> RawLog:
         note = unpack(path, file)
         with file.open("rb") as stream:
             start = stream.read(4)
-        if not start:
-            raise InputError(f"{path}: {note or 'holds nothing'}", remedy="copy it again")
-        if start == _ZSTD:
-            raise InputError(f"{path}: compressed twice", remedy="unpack it with zstd -d")
+        refuse_if(not start, f"{path}: {note or 'holds nothing'}", remedy="copy it again")
+        refuse_if(start == _ZSTD, f"{path}: compressed twice", remedy="unpack it with zstd -d")
         try:
             part = open_raw_log(file)
         except InputError as error:
@@ -224,14 +207,16 @@ def _storage_files(path: Path) -> list[Path]:
 
 
 def _metadata(path: Path) -> tuple[dict[str, Any], str]:
-    """Metadata and its fault; a bag can be read without."""
     file = path / "metadata.yaml"
     if not file.is_file():
         return {}, ""
     try:
         told = dict(yaml.safe_load(file.read_text(encoding="utf-8"))["rosbag2_bagfile_information"])
-        if not all(isinstance(name, str) for name in told.get("relative_file_paths") or ()):
-            raise ValueError("a file's name is not text")
+        refuse_if(
+            not all(isinstance(name, str) for name in told.get("relative_file_paths") or ()),
+            "a file's name is not text",
+            error=ValueError,
+        )
     except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):  # an undecodable text is a ValueError
         return {}, f"{file.name}: is not the metadata of a ROS 2 bag; read without it, files by their numbers"
     return told, ""
@@ -309,8 +294,7 @@ def refuse_foreign(path: Path) -> None:
         is_named = path.suffix.lower() in kind.suffixes
         is_marked = bool(kind.magic) and ends.startswith(kind.magic) and kind.mark in ends
         holds = kind.entry and ((path / kind.entry).exists() or any(name.startswith(kind.entry) for name in names))
-        if is_named or is_marked or holds:
-            raise InputError(f"{path}: {kind.what}, which is not read", remedy=kind.remedy)
+        refuse_if(is_named or is_marked or holds, f"{path}: {kind.what}, which is not read", remedy=kind.remedy)
 
 
 def _ends(path: Path) -> bytes:
@@ -321,8 +305,6 @@ def _ends(path: Path) -> bytes:
 
 
 def _entries(path: Path) -> list[str]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.namelist()
-    except (zipfile.BadZipFile, NotImplementedError):  # the second of a later version of the format
-        return []
+    with suppress(zipfile.BadZipFile, NotImplementedError), zipfile.ZipFile(path) as archive:
+        return archive.namelist()  # NotImplementedError: of a later version of the format
+    return []

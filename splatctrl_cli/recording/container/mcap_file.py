@@ -17,8 +17,9 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics
 
-from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE
-from splatctrl_cli.recording.container.raw_log import Damage
+from splatctrl_cli.errors import refuse_faults
+from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError
+from splatctrl_cli.recording.container.raw_log import Damage, Part
 
 __all__ = ["Channel", "Chunk", "ChunkIndex", "DataEnd", "Footer", "Schema", "Statistics", "parse_record"]
 MAGIC = b"\x89MCAP0\r\n"
@@ -26,10 +27,6 @@ MESSAGE, CHUNK, ATTACHMENT, SCHEMA, CHANNEL = 0x05, 0x06, 0x09, 0x03, 0x04
 DATA_END, FOOTER, CHUNK_INDEX, STATISTICS, MESSAGE_INDEX = 0x0F, 0x02, 0x08, 0x0B, 0x07
 FIRST_OPCODE = 0x01
 HEAD = struct.Struct("<BQ")  # opcode and length of what follows
-
-
-class BadRecordError(ValueError):
-    """A record too short for its fields."""
 
 
 class _Fields(ReadDataStream):  # type: ignore[misc]
@@ -77,13 +74,13 @@ _KINDS: dict[int, Any] = {  # by opcode
 
 
 def parse_record(opcode: int, content: bytes) -> Any:
-    """A record, None if not in `_KINDS`. Raises BadRecordError."""
+    """A record, None if not in `_KINDS`. Raises BadBlockError."""
     if opcode not in _KINDS:
         return None
-    try:
+    with refuse_faults(
+        lambda _: f"a record of {len(content)} bytes ends within a field", EndOfFile, error=BadBlockError
+    ):
         return _KINDS[opcode].read(_Fields(BytesIO(content)))
-    except EndOfFile:
-        raise BadRecordError(f"a record of {len(content)} bytes ends within a field") from None
 
 
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, start, end, unpacked size, crc; then the compression's name
@@ -91,18 +88,7 @@ _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _FOOTER_SIZE = HEAD.size + 20
 
 
-class Part(NamedTuple):
-    """A record; attachments and unknown ones have no content."""
-
-    offset: int
-    opcode: int
-    content: bytes
-    is_cut: bool = False
-
-
 class McapFile:
-    """A reader of one file's records."""
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self.size = path.stat().st_size
@@ -118,7 +104,6 @@ class McapFile:
             yield from _Walk(stream, self.path.name, self.size, damage, places, has_crc=not is_known).parts()
 
     def summary(self) -> list[Part]:
-        """The summary section's records, if readable."""
         with self.path.open("rb") as stream:
             footer = _footer(stream, self.size)
             if footer is None or not len(MAGIC) <= footer.summary_start < self.size:
@@ -137,7 +122,7 @@ class McapFile:
     def chunk_indexes(self) -> list[ChunkIndex]:
         found: list[ChunkIndex] = []
         for part in self.summary():
-            with suppress(BadRecordError):
+            with suppress(BadBlockError):
                 found += [parse_record(CHUNK_INDEX, part.content)] if part.opcode == CHUNK_INDEX else []
         return sorted(found, key=lambda index: index.chunk_start_offset)
 
@@ -191,7 +176,6 @@ class _Walk:
                 return
 
     def _part(self, offset: int, opcode: int, length: int, head: bytes) -> Part:
-        """Read a record, without content if too large or unknown."""
         self._count(head)
         if opcode == ATTACHMENT:
             self._check_attachment(offset, length)
@@ -252,7 +236,7 @@ class _Walk:
         if opcode != DATA_END or length > PIECE:
             return
         here, expected = self._stream.tell(), 0
-        with suppress(BadRecordError):
+        with suppress(BadBlockError):
             expected = parse_record(DATA_END, self._stream.read(length)).data_section_crc
         self._stream.seek(here)
         if expected and self._crc is not None and self._crc != expected:
@@ -279,7 +263,7 @@ class _Walk:
     def _check_end(self, part: Part) -> None:
         try:
             footer = parse_record(FOOTER, part.content)
-        except BadRecordError:
+        except BadBlockError:
             self._add("its footer is damaged")
             return
         after = self._stream.tell()
@@ -296,7 +280,6 @@ class _Walk:
             self._add("checksum of the summary differs")
 
     def _pass_over(self, length: int, crc: int = 0) -> int:
-        """Skip bytes; return their checksum, from `crc` on."""
         while length > 0 and (piece := self._take(min(length, PIECE))):
             crc = zlib.crc32(piece, crc)
             length -= len(piece)
@@ -333,6 +316,4 @@ def _attachment_length(head: bytes) -> int | None:
         if at + 4 > len(head):
             return None
         at += 4 + int.from_bytes(head[at : at + 4], "little")
-    if at + 8 > len(head):
-        return None
-    return at + 8 + int.from_bytes(head[at : at + 8], "little")
+    return None if at + 8 > len(head) else at + 8 + int.from_bytes(head[at : at + 8], "little")

@@ -8,11 +8,12 @@ import struct
 import zlib
 from collections.abc import Collection, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.formats.unpacking import BadBlockError, Budget, unpacked_start
-from splatctrl_cli.recording.container.foxglove import standing_in, stands_for
+from splatctrl_cli.recording.container.foxglove import add_ros_type, find_ros_type
 from splatctrl_cli.recording.container.mcap_file import (
     CHANNEL,
     CHUNK,
@@ -24,7 +25,6 @@ from splatctrl_cli.recording.container.mcap_file import (
     MESSAGE_INDEX,
     SCHEMA,
     STATISTICS,
-    BadRecordError,
     Channel,
     Chunk,
     ChunkIndex,
@@ -38,15 +38,8 @@ from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
 MOST_HEADS = 100_000  # records that are visited: a second or so
 
 
-@dataclass(frozen=True, kw_only=True)
-class LogIndex:
-    """Messages by channel, log times [ns], chunks in file order; notes: gaps."""
-
-    counts: dict[int, int]
-    first_ns: int
-    last_ns: int
-    chunks: tuple[ChunkIndex, ...]
-    notes: tuple[str, ...]
+LogIndex = tuple[dict[int, int], tuple[int, int], tuple[ChunkIndex, ...], tuple[str, ...]]
+"""Messages by channel, first and last log time [ns], chunks in file order, and what is missing, in words."""
 
 
 def index_by_heads(file: McapFile) -> LogIndex:
@@ -64,8 +57,21 @@ def index_by_heads(file: McapFile) -> LogIndex:
                 break
             content = head[HEAD.size :]
             if opcode == CHUNK:
-                with suppress(BadRecordError):
-                    chunks.append(_chunk_index(content, offset, length))
+                with suppress(BadBlockError):
+                    chunk: Chunk = parse_record(CHUNK, content)
+                    chunks.append(
+                        ChunkIndex(
+                            message_start_time=chunk.message_start_time,
+                            message_end_time=chunk.message_end_time,
+                            chunk_start_offset=offset,
+                            chunk_length=length + HEAD.size,
+                            message_index_offsets={},
+                            message_index_length=0,
+                            compression=chunk.compression,
+                            compressed_size=chunk.compressed_size,
+                            uncompressed_size=chunk.uncompressed_size,
+                        )
+                    )
             elif opcode == MESSAGE_INDEX and chunks:
                 channel, size = struct.unpack_from("<HI", content)
                 counts[channel] = counts.get(channel, 0) + size // 16
@@ -80,36 +86,14 @@ def index_by_heads(file: McapFile) -> LogIndex:
             num_heads += 1
     stamps += [stamp for c in chunks for stamp in (c.message_start_time, c.message_end_time)]
     notes = [] if offset + HEAD.size >= file.size else [f"counted up to byte {offset} of {file.size}"]
-    return LogIndex(
-        counts=counts,
-        first_ns=min(stamps, default=0),
-        last_ns=max(stamps, default=0),
-        chunks=tuple(chunks),
-        notes=("has no summary: counted by the heads of its records", *notes),
-    )
-
-
-def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex:
-    chunk: Chunk = parse_record(CHUNK, content)
-    return ChunkIndex(
-        message_start_time=chunk.message_start_time,
-        message_end_time=chunk.message_end_time,
-        chunk_start_offset=offset,
-        chunk_length=length + HEAD.size,
-        message_index_offsets={},
-        message_index_length=0,
-        compression=chunk.compression,
-        compressed_size=chunk.compressed_size,
-        uncompressed_size=chunk.uncompressed_size,
-    )
+    span_ns = min(stamps, default=0), max(stamps, default=0)
+    return counts, span_ns, tuple(chunks), ("has no summary: counted by the heads of its records", *notes)
 
 
 _MESSAGE = struct.Struct("<HIQQ")
 
 
 class McapLog(RawLog):
-    """One MCAP file."""
-
     container = "MCAP"
 
     def __init__(self, path: Path) -> None:
@@ -117,7 +101,7 @@ class McapLog(RawLog):
         self.files = (path,)
         self._file = McapFile(path)
         self._schemas: dict[int, Schema] = {}
-        self._topics: dict[int, Topic] = {}
+        self.channels: dict[int, Topic] = {}
         self._statistics: Statistics | None = None
         self._budget = Budget(self._file.size)
         self._whole: tuple[int, int] | None = None  # the file's state when a pass found all its checksums right
@@ -126,23 +110,10 @@ class McapLog(RawLog):
                 self._declare(part.opcode, part.content, Damage())
 
     def index(self) -> LogIndex:
-        """The index by summary, else by the heads of records."""
-        found = self._statistics
-        if found is not None:
-            chunks = tuple(self._file.chunk_indexes())
-            if len(chunks) == found.chunk_count:
-                return LogIndex(
-                    counts=dict(found.channel_message_counts),
-                    first_ns=found.message_start_time,
-                    last_ns=found.message_end_time,
-                    chunks=chunks,
-                    notes=(),
-                )
-        return index_by_heads(self._file)
-
-    def topic_of(self, channel: int) -> Topic | None:
-        """A declared channel's topic, or None."""
-        return self._topics.get(channel)
+        found, chunks = self._statistics, tuple(self._file.chunk_indexes())
+        if found is None or len(chunks) != found.chunk_count:
+            return index_by_heads(self._file)
+        return dict(found.channel_message_counts), (found.message_start_time, found.message_end_time), chunks, ()
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.
@@ -155,9 +126,9 @@ class McapLog(RawLog):
             if part.opcode == CHUNK and part.content:
                 yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
             elif part.opcode == MESSAGE and part.content:
-                message = self._message(part.content, 0, len(part.content), part.offset, damage, names)
-                if message is not None:
-                    yield message
+                yield from filter(
+                    None, [self._message(part.content, 0, len(part.content), part.offset, damage, names)]
+                )
             elif part.opcode in {SCHEMA, CHANNEL}:
                 self._declare(part.opcode, part.content, damage)
         self._whole = state if damage.count == count else None
@@ -191,22 +162,22 @@ class McapLog(RawLog):
                     damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are not a record")
                 return
             if opcode == MESSAGE:
-                message = self._message(records, start, at, offset, damage, names)
-                if message is not None:
-                    yield message
+                yield from filter(None, [self._message(records, start, at, offset, damage, names)])
             elif opcode in {SCHEMA, CHANNEL}:
                 self._declare(opcode, records[start:at], damage)
 
     def _records_in(self, content: bytes, offset: int, damage: Damage, *, is_cut: bool) -> bytes:
-        """A chunk's records, its start if cut, empty if damaged."""
         try:
             chunk: Chunk = parse_record(CHUNK, content)
             if is_cut or len(chunk.records) < chunk.compressed_size:
                 return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
             records = self._budget.unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
-            if chunk.uncompressed_crc and self._whole is None and zlib.crc32(records) != chunk.uncompressed_crc:
-                raise BadBlockError("checksum differs")
-        except (BadRecordError, BadBlockError) as error:
+            refuse_if(
+                chunk.uncompressed_crc and self._whole is None and zlib.crc32(records) != chunk.uncompressed_crc,
+                "checksum differs",
+                error=BadBlockError,
+            )
+        except BadBlockError as error:
             if not is_cut:  # the cut has been counted
                 damage.add(f"{self.path.name}: the chunk at byte {offset} was left out: {error}")
             return b""
@@ -219,7 +190,7 @@ class McapLog(RawLog):
             damage.add(f"{self.path.name}: a message record of {end - start} bytes")
             return None
         channel, _, log_time_ns, _ = _MESSAGE.unpack_from(records, start)
-        topic = self._topics.get(channel)
+        topic = self.channels.get(channel)
         if topic is None:
             damage.add(f"{self.path.name}: a message of undeclared channel {channel}")
             return None
@@ -236,13 +207,13 @@ class McapLog(RawLog):
     def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
         try:
             record = parse_record(opcode, content)
-        except BadRecordError as error:
+        except BadBlockError as error:
             damage.add(f"{self.path.name}: a schema or channel was left out: {error}")
             return
         if isinstance(record, Schema):
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
-            self._topics[record.id] = _topic(record, self._schemas.get(record.schema_id))
+            self.channels[record.id] = _topic(record, self._schemas.get(record.schema_id))
         elif isinstance(record, Statistics):
             self._statistics = record
 
@@ -251,7 +222,7 @@ def _topic(channel: Channel, schema: Schema | None) -> Topic:
     if schema is None:
         return Topic(name=channel.topic, type_name="", encoding=channel.message_encoding)
     is_ros, is_protobuf = schema.encoding in {"ros2msg", "ros2idl", "ros1msg"}, schema.encoding == "protobuf"
-    type_name, ros_type = ros_type_name(schema.name) if is_ros else schema.name, stands_for(schema.name)
+    type_name, ros_type = ros_type_name(schema.name) if is_ros else schema.name, find_ros_type(schema.name)
     topic = Topic(
         name=channel.topic,
         type_name=ros_type or type_name,
@@ -260,7 +231,7 @@ def _topic(channel: Channel, schema: Schema | None) -> Topic:
         definition_format={"ros2idl": "idl", "protobuf": "protobuf"}.get(schema.encoding, "msg"),
         schema=type_name if ros_type else "",
     )
-    return standing_in(topic) if is_ros else topic
+    return add_ros_type(topic) if is_ros else topic
 
 
 def ros_type_name(name: str) -> str:

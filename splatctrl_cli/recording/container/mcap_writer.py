@@ -21,9 +21,9 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_faults
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.records import MILLIMETRES, Float64, Intrinsics, JointState, RgbdFrame
+from splatctrl_cli.records import MILLIMETRES, Float64, JointState, RgbdFrame
 
 FOREVER = "    sec: 9223372036\n    nsec: 854775807\n"
 LATCHED = (  # rosbag2's form of reliable, transient local, keep the last one
@@ -87,7 +87,24 @@ class McapLog:
         color = self._new("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=jpeg.reshape(-1))
         millimetres = np.rint(frame.depth.astype(np.float64) * MILLIMETRES)
         millimetres = np.where(millimetres < np.iinfo(np.uint16).max, millimetres, 0).astype("<u2")  # else no return
-        self._add(f"/{frame.camera}/color/camera_info", self._camera_info(header, frame.intrinsics), frame.stamp_ns)
+        k = frame.intrinsics
+        info = self._new(
+            "sensor_msgs/msg/CameraInfo",
+            header=header,
+            height=k.height,
+            width=k.width,
+            distortion_model="plumb_bob",
+            d=np.zeros(5),
+            k=np.array([k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1], dtype=np.float64),
+            r=np.eye(3).reshape(-1),
+            p=np.array([k.fx, 0, k.cx, 0, 0, k.fy, k.cy, 0, 0, 0, 1, 0], dtype=np.float64),
+            binning_x=0,
+            binning_y=0,
+            roi=self._new(
+                "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+            ),
+        )
+        self._add(f"/{frame.camera}/color/camera_info", info, frame.stamp_ns)
         self._add(f"/{frame.camera}/color/image_raw/compressed", color, frame.stamp_ns)
         self._add(f"/{frame.camera}/depth/image_raw", self._image(header, "16UC1", millimetres), frame.stamp_ns)
         if frame.human is not None:
@@ -107,24 +124,6 @@ class McapLog:
             is_bigendian=0,
             step=pixels.itemsize * pixels.shape[1],
             data=pixels.reshape(-1).view(np.uint8),
-        )
-
-    def _camera_info(self, header: Any, k: Intrinsics) -> Any:
-        return self._new(
-            "sensor_msgs/msg/CameraInfo",
-            header=header,
-            height=k.height,
-            width=k.width,
-            distortion_model="plumb_bob",
-            d=np.zeros(5),
-            k=np.array([k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1], dtype=np.float64),
-            r=np.eye(3).reshape(-1),
-            p=np.array([k.fx, 0, k.cx, 0, 0, k.fy, k.cy, 0, 0, 0, 1, 0], dtype=np.float64),
-            binning_x=0,
-            binning_y=0,
-            roi=self._new(
-                "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-            ),
         )
 
     def _transform(self, T: Float64) -> Any:
@@ -176,11 +175,11 @@ REMEDY = "pip install 'splatctrl-cli[mcap]'"
 @contextmanager
 def foxglove_log(path: Path) -> Iterator["FoxgloveLog"]:
     """Open a log, complete and closed after the block. Raises UsageError without libraries."""
-    try:
+    with refuse_faults(
+        "an MCAP of Foxglove's schemas needs their libraries", ImportError, remedy=REMEDY, error=UsageError
+    ):
         register = import_module("mcap_protobuf.schema").register_schema
         import_module(f"{SCHEMAS}.PointCloud_pb2")
-    except ImportError as error:
-        raise UsageError(f"an MCAP of Foxglove's schemas needs their libraries: {error}", remedy=REMEDY) from None
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start(library="splatctrl")

@@ -1,10 +1,12 @@
 """Recorded messages as bytes, in file order; damage is counted, not raised."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 MAX_NOTES = 100  # a long log can be damaged in a million places
 
@@ -40,6 +42,16 @@ class RawMessage:
     offset: int = -1
 
 
+class Part(NamedTuple):
+    """A record of a file; attachments and unknown ones have no content. fields: a ROS 1 bag's."""
+
+    offset: int
+    opcode: int
+    content: bytes
+    is_cut: bool = False
+    fields: Mapping[str, bytes] = MappingProxyType({})
+
+
 @dataclass(kw_only=True)
 class Damage:
     """A record of what a pass over a log could not read.
@@ -69,24 +81,23 @@ class Damage:
 
     @property
     def all_notes(self) -> list[str]:
-        """Damage, then remarks with counts."""
         return [*self.notes, *(text if num == 1 else f"{text} ({num} times)" for text, num in self.remarks.items())]
 
 
 class RawLog:
     """A log that can be read repeatedly.
 
-    container: the kind of file in words, such as ``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``.
+    container: the kind of file in words, such as ``MCAP``, ``ROS 1 bag``. channels: declared topics by number.
     """
 
     path: Path
     files: tuple[Path, ...]
     container: str
-    _topics: Mapping[Any, Topic]
+    channels: Mapping[Any, Topic]
 
     def topics(self) -> tuple[Topic, ...]:
         """Topics in the index, even without messages; none without an index."""
-        return tuple(self._topics.values())
+        return tuple(self.channels.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages of `names` (None: all) in file order; losses go to `damage`."""
@@ -94,14 +105,21 @@ class RawLog:
 
 
 class JoinedLog(RawLog):
-    """Logs read in turn; `note` is a fault of the whole, counted as damage."""
+    """Logs read in turn, messages changed; `note` is a fault of the whole, counted as damage."""
 
     def __init__(
-        self, path: Path, parts: Sequence[RawLog], container: str, *, files: tuple[Path, ...] = (), note: str = ""
+        self,
+        path: Path,
+        parts: Sequence[RawLog],
+        container: str,
+        *,
+        files: tuple[Path, ...] = (),
+        note: str = "",
+        change: Callable[[Iterator[RawMessage], Damage], Iterator[RawMessage]] | None = None,
     ) -> None:
         self.path, self.container = path, container
         self.files = files or tuple(file for part in parts for file in part.files)
-        self._parts, self._note = parts, note
+        self._parts, self._note, self._change = parts, note, change
 
     def topics(self) -> tuple[Topic, ...]:
         return tuple(dict.fromkeys(topic for part in self._parts for topic in part.topics()))
@@ -109,5 +127,5 @@ class JoinedLog(RawLog):
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         if self._note:
             damage.add(self._note)
-        for part in self._parts:
-            yield from part.messages(damage, names)
+        messages = chain.from_iterable(part.messages(damage, names) for part in self._parts)
+        yield from messages if self._change is None else self._change(messages, damage)

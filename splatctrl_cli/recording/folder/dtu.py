@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.formats.image_file import decode_file, read_pfm, write_pfm
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import MILLIMETRES, Bool, Float32, Float64, Intrinsics, UInt8
@@ -64,13 +64,13 @@ def read_dtu(
     quarter). Depth of another size is sampled, not blended; a smaller one sets only the pixels it was made for. Drops
     views without depth. Raises InputError naming the file.
     """
-    scan, folder = chosen_scan(root, scan_folders(root), scan)
+    scan, folder = choose_scan(root, scan_folders(root), scan)
 
     def camera(number: int, size: tuple[int, int]) -> tuple[Intrinsics, Float64]:
         path = _camera_file(root, number)
         K, T_camera_world, _ = read_camera_file(path)
         T_camera_world[:3, 3] /= MILLIMETRES
-        return fitted_intrinsics(K, size, path), invert_transform(T_camera_world)
+        return fit_intrinsics(K, size, path), invert_transform(T_camera_world)
 
     found = read_views(
         scan,
@@ -81,22 +81,22 @@ def read_dtu(
         shrink=shrink,
         keeps_without_depth=False,
     )
-    if not found.views:
-        raise InputError(
-            f"{root}: scan '{scan}' has no depth", remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on"
-        )
+    refuse_if(
+        not found.views,
+        f"{root}: scan '{scan}' has no depth",
+        remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on",
+    )
     check_lengths(f"{root}: scan '{scan}'", found.views)
     return replace(found, files=(*found.files, *(_camera_file(root, number) for number in found.numbers)))
 
 
-def chosen_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tuple[str, Path]:
+def choose_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tuple[str, Path]:
     """The scan of that name, or the only one. Raises InputError with the choices."""
-    if scan is None and len(folders) == 1:
-        scan = next(iter(folders))
-    if scan is None or scan not in folders:
-        got = "several scans" if scan is None else f"no scan '{scan}'"
-        raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(folders) or 'none is there'}")
-    return scan, folders[scan]
+    name = next(iter(folders)) if scan is None and len(folders) == 1 else scan or ""
+    got = "several scans" if scan is None else f"no scan '{scan}'"
+    return name, require(
+        folders.get(name), f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(folders) or 'none is there'}"
+    )
 
 
 def read_views(
@@ -153,29 +153,27 @@ def read_views(
 
 def check_lengths(where: str, views: Sequence[DtuView]) -> None:
     """Raise InputError if depth or camera distances are not millimetres."""
-    known = [view.depth[view.depth > 0] for view in views]
-    medians = [float(np.median(depth)) for depth in known if depth.size]
+    medians = [float(np.median(view.depth[view.depth > 0])) for view in views if (view.depth > 0).any()]
     if not medians:
         return
     median, (low, high) = float(np.median(medians)), PLAUSIBLE_DEPTH
-    if not low <= median <= high:
-        raise InputError(
-            f"{where}: depth: expected {MILLIMETRES * low:g} to {MILLIMETRES * high:g} mm, got a median of"
-            f" {MILLIMETRES * median:.3g}",
-            remedy="give lengths in millimetres",
-        )
+    refuse_if(
+        not low <= median <= high,
+        f"{where}: depth: expected {MILLIMETRES * low:g} to {MILLIMETRES * high:g} mm, got a median of"
+        f" {MILLIMETRES * median:.3g}",
+        remedy="give lengths in millimetres",
+    )
     centers = np.array([view.T_world_camera[:3, 3] for view in views])
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if 0 < spread < LEAST_SPREAD * median:
-        raise InputError(
-            f"{where}: cameras: expected millimetres, as the depth's median of {MILLIMETRES * median:.0f} mm, got"
-            f" cameras within {MILLIMETRES * spread:.3g} mm of their middle",
-            remedy="give translations in millimetres",
-        )
+    refuse_if(
+        0 < spread < LEAST_SPREAD * median,
+        f"{where}: cameras: expected millimetres, as the depth's median of {MILLIMETRES * median:.0f} mm, got"
+        f" cameras within {MILLIMETRES * spread:.3g} mm of their middle",
+        remedy="give translations in millimetres",
+    )
 
 
 def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
-    """Write a new DTU folder of one scan."""
     cameras = root / "Cameras"
     rectified = root / "Rectified" / f"{scan}_train"
     depths = root / "Depths_raw" / scan
@@ -197,12 +195,12 @@ def write_png(path: Path, image: UInt8) -> None:
 def scan_folders(root: Path) -> dict[str, Path]:
     """Image folders by scan. Raises InputError without Rectified."""
     rectified = root / "Rectified"
-    if not rectified.is_dir():
-        raise InputError(
-            f"{root}: expected a DTU folder with Cameras, Rectified and Depths_raw, or scans with cameras_sphere.npz,"
-            " got none",
-            remedy="give the folder that holds Rectified, or the scans in IDR's layout",
-        )
+    refuse_if(
+        not rectified.is_dir(),
+        f"{root}: expected a DTU folder with Cameras, Rectified and Depths_raw, or scans with cameras_sphere.npz,"
+        " got none",
+        remedy="give the folder that holds Rectified, or the scans in IDR's layout",
+    )
     return {path.name.removesuffix("_train"): path for path in sorted(rectified.iterdir()) if path.is_dir()}
 
 
@@ -214,17 +212,14 @@ def _images(folder: Path) -> dict[int, Path]:
             number = int(match[1]) - 1
             if number not in found or match[2] == str(LIGHT):
                 found[number] = path
-    if not found:
-        raise InputError(f"{folder}: expected images such as rect_001_3_r5000.png, got none")
+    refuse_if(not found, f"{folder}: expected images such as rect_001_3_r5000.png, got none")
     return dict(sorted(found.items()))
 
 
 def read_image(path: Path) -> UInt8:
     """RGB (H, W, 3), ignoring the orientation tag. Raises InputError if unreadable."""
     image = decode_file(path.read_bytes(), color=True) if path.is_file() else None
-    if image is None:
-        raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
-    return np.asarray(image, dtype=np.uint8)
+    return np.asarray(require(image, f"{path}: not an image that can be read", remedy="copy the file anew"), np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool:
@@ -232,31 +227,27 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
     image = read_image(path)
     if image.shape[1::-1] != size:
         width, height = size
-        if image.shape[1] * height != image.shape[0] * width:
-            raise InputError(
-                f"{path}: expected a mask of {width}x{height} or of that shape, got {image.shape[1]}x{image.shape[0]}"
-            )
+        refuse_if(
+            image.shape[1] * height != image.shape[0] * width,
+            f"{path}: expected a mask of {width}x{height} or of that shape, got {image.shape[1]}x{image.shape[0]}",
+        )
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     return np.asarray((image >= 128).all(axis=2))
 
 
 def _mask_file(folder: Path, number: int) -> Path:
     """``007.png`` or the like in the folder (RegNeRF) or ``mask`` (IDR)."""
-    for place in (folder, folder / "mask"):
-        for path in sorted(place.glob("*.png")):
-            if path.stem.isdecimal() and int(path.stem) == number:
-                return path
-    raise InputError(
-        f"{folder}: expected a mask {number:03d}.png, got none", remedy="give the folder of this scan's masks"
+    files = (path for place in (folder, folder / "mask") for path in sorted(place.glob("*.png")))
+    found = next((path for path in files if path.stem.isdecimal() and int(path.stem) == number), None)
+    return require(
+        found, f"{folder}: expected a mask {number:03d}.png, got none", remedy="give the folder of this scan's masks"
     )
 
 
 def _camera_file(root: Path, number: int) -> Path:
     candidates = [root / "Cameras" / part / f"{number:08d}_cam.txt" for part in ("train", ".")]
-    for path in candidates:
-        if path.is_file():
-            return path
-    raise InputError(f"{candidates[-1]}: missing", remedy="every image needs its camera file")
+    found = next(filter(Path.is_file, candidates), None)
+    return require(found, f"{candidates[-1]}: missing", remedy="every image needs its camera file")
 
 
 def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
@@ -265,56 +256,51 @@ def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
     Lengths have the file's unit; depth 0 is none.
     """
     words = path.read_text(encoding="utf-8", errors="replace").split()
-    try:
+    with refuse_faults(
+        lambda _: f"{path}: expected 'extrinsic' (4x4), 'intrinsic' (3x3) and a depth range, got another text",
+        ValueError,
+        remedy="copy the file again",
+    ):
         extrinsic = np.array(words[words.index("extrinsic") + 1 :][:16], dtype=np.float64).reshape(4, 4)
         rest = words[words.index("intrinsic") + 1 :]
         K, nearest = np.array(rest[:9], dtype=np.float64).reshape(3, 3), float(rest[9]) if rest[9:] else 0.0
-    except ValueError:
-        raise InputError(
-            f"{path}: expected 'extrinsic' (4x4), 'intrinsic' (3x3) and a depth range, got another text",
-            remedy="copy the file again",
-        ) from None
     R = extrinsic[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        raise InputError(f"{path}: extrinsic: expected a rotation in its first three columns")
+    refuse_if(
+        not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0,
+        f"{path}: extrinsic: expected a rotation in its first three columns",
+    )
     return K, extrinsic, nearest
 
 
-def fitted_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
+def fit_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     """Fit K to an image of `size` (width, height), whichever common size it is for.
 
     Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves it to (u + 0.5) scale -
-    0.5, as in `shrunk`. MVSNet's cameras for 640x512, and for a quarter, are instead multiples of those for 1600x1200
+    0.5, as in `shrink_view`. MVSNet's cameras for 640x512, and for a quarter, are multiples of those for 1600x1200
     (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders agree.
     """
     width, height = size
-    shift, crop = 0.0, (0, 0)
-    if _is_centered(K, width, height):
-        scale = 1.0
-    elif _is_centered(K, width / 4, height / 4):
-        scale = 4.0
-    elif _is_centered(K, *RAW) and size == CROPPED:
-        scale, crop = 0.5, CROP
-    elif _is_centered(K, *RAW) and width * RAW[1] == height * RAW[0]:
-        scale = width / RAW[0]
-        shift = 0.5 * scale - 0.5
-    else:
-        raise InputError(
-            f"{path}: principal point ({K[0, 2]:g}, {K[1, 2]:g}) fits no image of {width}x{height}, nor a quarter of "
-            f"it, nor 1600x1200"
-        )
-    return Intrinsics(
-        fx=float(K[0, 0] * scale),
-        fy=float(K[1, 1] * scale),
-        cx=float(K[0, 2] * scale + shift - crop[0]),
-        cy=float(K[1, 2] * scale + shift - crop[1]),
-        width=width,
-        height=height,
+    ratio = width / RAW[0]
+    sizes: list[tuple[float, float, float, float, tuple[int, int]]] = [  # columns, rows, scale, shift, crop
+        (width, height, 1.0, 0.0, (0, 0)),
+        (width / 4, height / 4, 4.0, 0.0, (0, 0)),
+        *([(*RAW, 0.5, 0.0, CROP)] if size == CROPPED else []),
+        *([(*RAW, ratio, 0.5 * ratio - 0.5, (0, 0))] if width * RAW[1] == height * RAW[0] else []),
+    ]
+    for columns, rows, scale, shift, crop in sizes:
+        if abs(K[0, 2] / columns - 0.5) < 0.1 and abs(K[1, 2] / rows - 0.5) < 0.1:
+            return Intrinsics(
+                fx=float(K[0, 0] * scale),
+                fy=float(K[1, 1] * scale),
+                cx=float(K[0, 2] * scale + shift - crop[0]),
+                cy=float(K[1, 2] * scale + shift - crop[1]),
+                width=width,
+                height=height,
+            )
+    raise InputError(
+        f"{path}: principal point ({K[0, 2]:g}, {K[1, 2]:g}) fits no image of {width}x{height}, nor a quarter of it,"
+        f" nor 1600x1200"
     )
-
-
-def _is_centered(K: Float64, width: float, height: float) -> bool:
-    return bool(abs(K[0, 2] / width - 0.5) < 0.1 and abs(K[1, 2] / height - 0.5) < 0.1)
 
 
 def _depth_file(root: Path, scan: str, number: int) -> Path | None:
@@ -328,8 +314,7 @@ def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
     depth = np.where(np.isfinite(depth) & (depth > 0), depth / np.float32(MILLIMETRES), np.float32(0))
     if visual.is_file():
         shown = cv2.cvtColor(read_image(visual), cv2.COLOR_RGB2GRAY)
-        if shown.shape != depth.shape:
-            raise InputError(f"{visual}: expected a grey image of {depth.shape[1]}x{depth.shape[0]}")
+        refuse_if(shown.shape != depth.shape, f"{visual}: expected a grey image of {depth.shape[1]}x{depth.shape[0]}")
         depth = np.where(shown > 10, depth, np.float32(0))
     width, height = size
     if depth.shape == (height, width):
@@ -354,12 +339,10 @@ def _camera_text(view: DtuView) -> str:
     K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
     known = view.depth[view.depth > 0].astype(np.float64) * MILLIMETRES
     near, far = (float(np.floor(known.min())), float(np.ceil(known.max()))) if known.size else (425.0, 935.0)
-    rows = ["extrinsic", *_rows(T_camera_world), "", "intrinsic", *_rows(K), "", f"{near:g} {(far - near) / 191:.6g}"]
-    return "\n".join(rows) + "\n"
-
-
-def _rows(matrix: Float64) -> list[str]:
-    return [" ".join(f"{value + 0.0:.10g}" for value in row) for row in matrix]
+    pose, lens = (
+        [" ".join(f"{value + 0.0:.10g}" for value in row) for row in matrix] for matrix in (T_camera_world, K)
+    )
+    return "\n".join(["extrinsic", *pose, "", "intrinsic", *lens, "", f"{near:g} {(far - near) / 191:.6g}"]) + "\n"
 
 
 def _pairs(views: Sequence[DtuView]) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.recording.folder.dtu import DtuScan, DtuView, Shrink, read_dtu
@@ -20,8 +20,7 @@ HOLDOUT_CAMERA = "holdout"
 def view_numbers(words: Sequence[str]) -> list[int]:
     """Parse view numbers such as ``2`` and ``5``. Raises UsageError for other words."""
     bad = [word for word in words if not word.isdigit()]
-    if bad:
-        raise UsageError(f"--holdout: expected view numbers such as 2,5, got {bad[0]!r}")
+    refuse_if(bad, f"--holdout: expected view numbers such as 2,5, got {''.join(bad[:1])!r}", error=UsageError)
     return [int(word) for word in words]
 
 
@@ -54,15 +53,19 @@ class DtuSource:
             scan,
             masks,
             depths,
-            lambda view: shrunk(view, _factor(view, protocol) if downscale is None else downscale),
+            lambda view: shrink_view(view, _factor(view, protocol) if downscale is None else downscale),
         )
         self.scan, self.name = found.name, f"{root.name}/{found.name}"
         self._files = found.files
         self._views = dict(zip(found.numbers, found.views, strict=True))
         numbers = tuple(self._views)
         if protocol is not None:
-            if holdout:
-                raise UsageError("--holdout: the protocol says what is held out", remedy="leave one of them out")
+            refuse_if(
+                holdout,
+                "--holdout: the protocol says what is held out",
+                remedy="leave one of them out",
+                error=UsageError,
+            )
             self.split = protocol.split(numbers, f"{root}/{found.name}")
         else:
             self.split = _held_out(numbers, frozenset(holdout), root)
@@ -74,11 +77,16 @@ class DtuSource:
 
     def _read(self, scan: str | None, masks: Path | None, depths: Path | None, shrink: Shrink) -> DtuScan:
         if self.layout == "MVSNet":
-            if depths is not None:
-                raise UsageError(f"--depths {depths}: MVSNet's layout has its own", remedy="leave it out")
+            refuse_if(
+                depths is not None,
+                f"--depths {depths}: MVSNet's layout has its own",
+                remedy="leave it out",
+                error=UsageError,
+            )
             return read_dtu(self._root, scan, masks, shrink)
-        if masks is not None:
-            raise UsageError(f"--masks {masks}: IDR's layout has its own", remedy="leave it out")
+        refuse_if(
+            masks is not None, f"--masks {masks}: IDR's layout has its own", remedy="leave it out", error=UsageError
+        )
         return read_idr(self._root, scan, depths, shrink)
 
     @property
@@ -110,15 +118,18 @@ class DtuSource:
         }
 
 
-def shrunk(view: DtuView, factor: int) -> DtuView:
+def shrink_view(view: DtuView, factor: int) -> DtuView:
     """Merge every `factor` x `factor` pixels: mean colour, the middle's depth, the first's mask.
 
     Colour and mask follow RegNeRF (regnerf/internal/datasets.py, downsample). Pixel (0, 0) has its centre at (0, 0):
     u becomes (u + 0.5) / factor - 0.5. Raises UsageError for a factor that does not divide the size.
     """
     k = view.intrinsics
-    if factor < 1 or k.width % factor or k.height % factor:
-        raise UsageError(f"--downscale {factor}: expected a whole factor of {k.width}x{k.height}")
+    refuse_if(
+        factor < 1 or k.width % factor or k.height % factor,
+        f"--downscale {factor}: expected a whole factor of {k.width}x{k.height}",
+        error=UsageError,
+    )
     if factor == 1:
         return view
     size = (k.width // factor, k.height // factor)
@@ -152,10 +163,18 @@ def _factor(view: DtuView, protocol: ScoreProtocol | None) -> int:
 
 def _held_out(numbers: tuple[int, ...], holdout: frozenset[int], root: Path) -> Split:
     outside = sorted(holdout - set(numbers))
-    if outside:
-        raise UsageError(f"--holdout {outside[0]}: {root} has no such view", remedy=f"views: {_span(numbers)}")
-    if holdout and len(holdout) == len(numbers):
-        raise UsageError(f"--holdout: all {len(numbers)} views of {root} are held out", remedy="leave some")
+    refuse_if(
+        outside,
+        f"--holdout {min(outside, default=0)}: {root} has no such view",
+        remedy=f"views: {_span(numbers)}",
+        error=UsageError,
+    )
+    refuse_if(
+        holdout and len(holdout) == len(numbers),
+        f"--holdout: all {len(numbers)} views of {root} are held out",
+        remedy="leave some",
+        error=UsageError,
+    )
     return Split(training=tuple(n for n in numbers if n not in holdout), scored=tuple(sorted(holdout)))
 
 

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, did_you_mean
+from splatctrl_cli.errors import InputError, did_you_mean, refuse_faults, refuse_if, require
 from splatctrl_cli.recording.folder.poses import AXES, CONVENTIONS, FORMATS, rigid
 from splatctrl_cli.recording.log.registration import DISTORTION_MODELS
 from splatctrl_cli.records import Float64, Intrinsics
@@ -107,24 +107,18 @@ class ImagePart:
 
     @property
     def name(self) -> str:
-        """The file's name with the number."""
         return f"{self.file.name}#{self.number}"
-
-    def is_file(self) -> bool:
-        return self.file.is_file()
-
-    def absolute(self) -> Path:
-        return self.file.absolute()
-
-    def relative_to(self, root: Path) -> Path:
-        """The whole file, from a folder."""
-        return self.file.relative_to(root)
 
     def __str__(self) -> str:
         return str(self.file.with_name(self.name))
 
 
 ImageFile = Path | ImagePart
+
+
+def whole_file(image: ImageFile) -> Path:
+    """The file that an image is, or is a part of."""
+    return image.file if isinstance(image, ImagePart) else image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,18 +170,15 @@ class Description:
         """``depth_to_color`` (4, 4): maps depth-camera to colour-camera coordinates."""
         where = f"{self.path}: depth_camera.depth_to_color"
         rows = self.depth_camera.depth_to_color if self.depth_camera is not None else []
-        try:
+        with refuse_faults(lambda _: f"{where}: expected a 4x4 matrix", ValueError, remedy=_HELP):
             matrix = np.array(rows, dtype=np.float64) if rows else np.eye(4)
-        except ValueError:
-            raise _refused(f"{where}: expected a 4x4 matrix") from None
         return rigid(matrix, where)
 
 
 T = TypeVar("T")
 
 
-def _refused(what: str) -> InputError:
-    return InputError(what, remedy="see splatctrl help input")
+_HELP = "see splatctrl help input"
 
 
 def read_description(path: Path, root: Path | None = None) -> Description:
@@ -211,9 +202,7 @@ def read_table(
     _check_keys(content, {name, *beside}, str(path), "")
     if fill is not None and isinstance(content.get(name), dict):
         content[name] = fill(content[name])
-    if (table := _optional(kind, content, name, path)) is None:
-        raise _refused(f"{path}: [{name}] is missing")
-    return table
+    return require(_optional(kind, content, name, path), f"{path}: [{name}] is missing", remedy=_HELP)
 
 
 def has_table(path: Path, name: str) -> bool:
@@ -229,22 +218,28 @@ def read_rig(path: Path, root: Path | None = None) -> list[Description]:
     """
     content = _content(path)
     cameras = content.pop("cameras", [])
-    if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
-        raise _refused(f"{path}: cameras: expected tables [[cameras]], got {cameras!r}")
+    refuse_if(
+        not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras),
+        f"{path}: cameras: expected tables [[cameras]], got {cameras!r}",
+        remedy=_HELP,
+    )
     names = [camera.get("name") for camera in cameras]
-    if None in names or len(set(names)) < len(names):
-        raise _refused(f"{path}: [[cameras]]: expected a name for each of its own, got {names}")
-    if cameras and not {"camera", "frames", "split"}.isdisjoint(content):
-        raise InputError(
-            f"{path}: [[cameras]] beside [camera], [frames] or [split]", remedy="leave the single tables out"
-        )
-    return [_read(_of_camera(content, camera, path), path, root) for camera in cameras]
+    refuse_if(
+        None in names or len(set(names)) < len(names),
+        f"{path}: [[cameras]]: expected a name for each of its own, got {names}",
+        remedy=_HELP,
+    )
+    refuse_if(
+        cameras and not {"camera", "frames", "split"}.isdisjoint(content),
+        f"{path}: [[cameras]] beside [camera], [frames] or [split]",
+        remedy="leave the single tables out",
+    )
+    return [_read(_describe_camera(content, camera, path), path, root) for camera in cameras]
 
 
-def _of_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> dict[str, Any]:
+def _describe_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> dict[str, Any]:
     for key in ("color", "depth", "poses"):
-        if not isinstance(camera.get(key), str):
-            raise _refused(f"{path}: [[cameras]]: {key} is missing")
+        refuse_if(not isinstance(camera.get(key), str), f"{path}: [[cameras]]: {key} is missing", remedy=_HELP)
     return {
         **common,
         "camera": {key: value for key, value in camera.items() if key not in ("color", "depth", "poses")},
@@ -254,10 +249,8 @@ def _of_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> di
 
 
 def _content(path: Path) -> dict[str, Any]:
-    try:
+    with refuse_faults(f"{path}: not TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=_HELP):
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise _refused(f"{path}: not TOML: {error}") from None
 
 
 def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
@@ -265,12 +258,11 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         *("path", "listed", "is_depth_resized", "unpaired", "num_damaged", "supply", "notes")
     }
     _check_keys(content, known, str(path), "")
-    try:
+    with refuse_faults(
+        lambda _: f"{path}: root: no home folder of {content.get('root')}", RuntimeError, remedy="give --root"
+    ):  # ~ of a person who is not here
         folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()
-    except RuntimeError:  # ~ of a person who is not here
-        raise InputError(f"{path}: root: no home folder of {content.get('root')}", remedy="give --root") from None
-    if not folder.is_dir():
-        raise InputError(f"{path}: root {folder}: no such folder", remedy="correct `root`, or give --root")
+    refuse_if(not folder.is_dir(), f"{path}: root {folder}: no such folder", remedy="correct `root`, or give --root")
     description = Description(
         path=path,
         root=folder,
@@ -282,27 +274,27 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         stamps=_optional(StampsTable, content, "stamps", path) or StampsTable(),
         split=_optional(SplitTable, content, "split", path) or SplitTable(),
     )
-    choices: list[tuple[str, str, tuple[str, ...]]] = [
-        ("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
-    ]
-    if (poses := description.poses) is not None:
-        choices[:0] = [
-            ("poses.format", poses.format, FORMATS),
-            ("poses.convention", poses.convention, CONVENTIONS),
-            ("poses.axes", poses.axes, AXES),
-        ]
-    for key, value, allowed in choices:
-        if value not in allowed:
-            raise _refused(f"{path}: {key}: expected one of {', '.join(allowed)}, got {value!r}")
+    poses = description.poses
+    for key, value, allowed in [
+        *([] if poses is None else [("poses.format", poses.format, FORMATS)]),
+        *([] if poses is None else [("poses.convention", poses.convention, CONVENTIONS)]),
+        *([] if poses is None else [("poses.axes", poses.axes, AXES)]),
+        ("depth.encoding", description.depth.encoding, DEPTH_ENCODINGS),
+    ]:
+        refuse_if(
+            value not in allowed, f"{path}: {key}: expected one of {', '.join(allowed)}, got {value!r}", remedy=_HELP
+        )
     for name, camera in (("camera", description.camera), ("depth_camera", description.depth_camera)):
         if camera is not None:
             check_camera(camera, f"{path}: {name}")
-    if not 0 < description.depth.scale < 1e3:
-        raise _refused(f"{path}: depth.scale: expected metres per count, got {description.depth.scale}")
-    if description.poses is None or description.poses.format != "nerfstudio":
+    refuse_if(
+        not 0 < description.depth.scale < 1e3,
+        f"{path}: depth.scale: expected metres per count, got {description.depth.scale}",
+        remedy=_HELP,
+    )
+    if poses is None or poses.format != "nerfstudio":
         for name in ("camera", "frames"):
-            if getattr(description, name) is None:
-                raise _refused(f"{path}: [{name}] is missing")
+            refuse_if(getattr(description, name) is None, f"{path}: [{name}] is missing", remedy=_HELP)
     return description
 
 
@@ -310,33 +302,44 @@ def check_camera(camera: CameraTable, where: str) -> None:
     """Raise InputError naming an impossible size or focal length."""
     for name in ("width", "height", "fx", "fy"):
         value = getattr(camera, name)
-        if not 1e-2 <= value < 1e5:
-            raise _refused(f"{where}.{name}: expected a positive number of pixels, got {value}")
+        refuse_if(
+            not 1e-2 <= value < 1e5,
+            f"{where}.{name}: expected a positive number of pixels, got {value}",
+            remedy=_HELP,
+        )
     for name in ("cx", "cy"):
-        if not abs(getattr(camera, name)) < 1e5:
-            raise _refused(f"{where}.{name}: expected pixels, got {getattr(camera, name)}")
-    if not all(isinstance(value, int | float) for value in camera.distortion):
-        raise _refused(f"{where}.distortion: expected numbers, got {camera.distortion}")
-    if camera.distortion_model not in DISTORTION_MODELS:
-        names = ", ".join(DISTORTION_MODELS)
-        raise _refused(f"{where}.distortion_model: expected one of {names}, got {camera.distortion_model!r}")
+        refuse_if(
+            not abs(getattr(camera, name)) < 1e5,
+            f"{where}.{name}: expected pixels, got {getattr(camera, name)}",
+            remedy=_HELP,
+        )
+    refuse_if(
+        not all(isinstance(value, int | float) for value in camera.distortion),
+        f"{where}.distortion: expected numbers, got {camera.distortion}",
+        remedy=_HELP,
+    )
+    names, model = ", ".join(DISTORTION_MODELS), camera.distortion_model
+    said = f"{where}.distortion_model: expected one of {names}, got {model!r}"
+    refuse_if(model not in DISTORTION_MODELS, said, remedy=_HELP)
 
 
 def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T | None:
     if name not in content:
         return None
     table = content[name]
-    if not isinstance(table, dict):
-        raise _refused(f"{path}: {name}: expected a table [{name}], got {table!r}")
+    refuse_if(not isinstance(table, dict), f"{path}: {name}: expected a table [{name}], got {table!r}", remedy=_HELP)
     declared = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
     _check_keys(table, set(declared), str(path), f"{name}.")
     for key, f in declared.items():
-        if key not in table and f.default is MISSING and f.default_factory is MISSING:
-            raise _refused(f"{path}: {name}.{key} is missing")
-    return kind(**{key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()})
+        refuse_if(
+            key not in table and f.default is MISSING and f.default_factory is MISSING,
+            f"{path}: {name}.{key} is missing",
+            remedy=_HELP,
+        )
+    return kind(**{key: _convert(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()})
 
 
-def _typed(value: Any, hint: Any, where: str) -> Any:
+def _convert(value: Any, hint: Any, where: str) -> Any:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     good = {
         int: isinstance(value, int) and is_number,
@@ -346,8 +349,7 @@ def _typed(value: Any, hint: Any, where: str) -> Any:
         float | None: is_number,
         int | None: isinstance(value, int) and is_number,
     }.get(hint, isinstance(value, list))
-    if not good:
-        raise _refused(f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}")
+    refuse_if(not good, f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}", remedy=_HELP)
     return float(value) if hint in (float, float | None) else value
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_APART, UNIT_BASELINE, UNIT_DEPTH
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
@@ -16,13 +16,14 @@ from splatctrl_cli.recording.folder.folder_description import (
     ImageFile,
     ListedView,
     PosesTable,
+    whole_file,
 )
 from splatctrl_cli.recording.folder.poses import (
     READERS,
-    Trajectory,
     read_matrix_blocks,
     read_matrix_file,
     stamp_of_text,
+    trajectory,
     world_camera,
 )
 from splatctrl_cli.recording.source_options import SourceOptions, still_note
@@ -51,7 +52,7 @@ class View:
     depth_scale: float
     valid: Path | None = None
 
-    def in_unit(self, metres: float) -> "View":
+    def convert(self, metres: float) -> "View":
         """Scale pose and depth to metres; metres: per length of the recording."""
         T = self.T_world_camera.copy()
         T[:3, 3] *= metres
@@ -107,17 +108,21 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
     loss.notes.extend(still_note(name) for name in options.camera_poses if any(v.lens.name == name for v in views))
     if not views:
         file = "" if description.poses is None else description.poses.file
-        if file and "*" not in file and not (description.root / file).is_file():
-            raise InputError(
-                f"{description.root / file}: no such file, and no other file has its poses",
-                remedy="copy it too, or give --camera-pose NAME=identity for a camera that stands still",
-            )
+        refuse_if(
+            file and "*" not in file and not (description.root / file).is_file(),
+            f"{description.root / file}: no such file, and no other file has its poses",
+            remedy="copy it too, or give --camera-pose NAME=identity for a camera that stands still",
+        )
         remedy = "check the clock or the numbers that images and poses share, or give --camera-pose"
         raise InputError(f"{description.path}: {file} has no pose for any image ({names[0]}, ...)", remedy=remedy)
     if held and all(view.camera == HOLDOUT for view in views):
         remedy = "leave some to train with"
-        if options.holdout is not None:
-            raise UsageError(f"--holdout: all {len(views)} views are held out", remedy=remedy)
+        refuse_if(
+            options.holdout is not None,
+            f"--holdout: all {len(views)} views are held out",
+            remedy=remedy,
+            error=UsageError,
+        )
         raise InputError(f"{description.path}: [split] holds all {len(views)} views out", remedy=remedy)
     return sorted(views, key=lambda view: (view.stamp_ns, view.name))
 
@@ -126,18 +131,22 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
     """Keep views with files; others count as unpaired. Raises InputError for a file outside."""
     root, present, absent = description.root.absolute(), [], []
     for view in description.listed:
-        files = [path for path in (view.color, view.depth, view.valid) if path is not None]
+        files = [whole_file(path) for path in (view.color, view.depth, view.valid) if path is not None]
         for path in files:
-            if not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)):
-                raise InputError(
-                    f"{description.path}: {path} is not in {description.root}",
-                    remedy="give the folder that holds all files",
-                )
+            refuse_if(
+                not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)),
+                f"{description.path}: {path} is not in {description.root}",
+                remedy="give the folder that holds all files",
+            )
         missing = [path for path in files if not path.is_file()]
         absent += missing[:1]
         present += [] if missing else [view]
-        loss.unpaired_color += view.depth in missing and view.color not in missing
-        loss.unpaired_depth += view.color in missing and view.depth not in missing
+        has_color, has_depth = (
+            whole_file(view.color) not in missing,
+            view.depth is None or whole_file(view.depth) not in missing,
+        )
+        loss.unpaired_color += has_color and not has_depth
+        loss.unpaired_depth += has_depth and not has_color
     if absent:
         loss.notes.append(f"{len(absent)} of {len(description.listed)} views lack a file ({absent[0]}, ...)")
     if not present:
@@ -170,11 +179,11 @@ def _scale(description: Description, view: ListedView, options: SourceOptions) -
     if options.depth_scale is not None:
         return options.depth_scale
     scale = description.depth.scale if view.depth_scale is None else view.depth_scale
-    if not 0 < scale < np.inf:
-        raise InputError(
-            f"{description.path}: depth of {view.name}: expected metres per count, got {scale}",
-            remedy="correct the file, or give --depth-scale",
-        )
+    refuse_if(
+        not 0 < scale < np.inf,
+        f"{description.path}: depth of {view.name}: expected metres per count, got {scale}",
+        remedy="correct the file, or give --depth-scale",
+    )
     return scale
 
 
@@ -184,18 +193,19 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
     colors = dict(find_files(description.root, frames.color))
     depths = dict(find_files(description.root, frames.depth))
     for pattern, found in ((frames.color, colors), (frames.depth, depths)):
-        if not found:
-            raise InputError(
-                f"{description.path}: no file matches {description.root / pattern}", remedy="correct [frames] or root"
-            )
+        refuse_if(
+            not found,
+            f"{description.path}: no file matches {description.root / pattern}",
+            remedy="correct [frames] or root",
+        )
     masks = _masks(description, list(colors), loss)
     names = [name for name in colors if name in depths]
-    if not names:
-        raise InputError(
-            f"{description.path}: no colour file has a depth file of the same name"
-            f" ({next(iter(colors))!r}, {next(iter(depths))!r}, ...)",
-            remedy="the * of [frames] color and depth must stand for the same text",
-        )
+    refuse_if(
+        not names,
+        f"{description.path}: no colour file has a depth file of the same name"
+        f" ({next(iter(colors))!r}, {next(iter(depths))!r}, ...)",
+        remedy="the * of [frames] color and depth must stand for the same text",
+    )
     loss.unpaired_color += len(colors) - len(names)
     loss.unpaired_depth += len(depths) - len(names)
     poses = {} if camera.name in options.camera_poses else _poses(description, {name: colors[name] for name in names})
@@ -206,17 +216,16 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
 
 
 def _masks(description: Description, names: list[str], loss: LossReport) -> dict[str, Path]:
-    """Masks by view name; missing ones are noted in `loss`."""
     assert description.frames is not None
     pattern = description.frames.human_mask
     if not pattern:
         return {}
     masks = dict(find_files(description.root, pattern))
-    if not any(name in masks for name in names):
-        raise InputError(
-            f"{description.path}: no file of {description.root / pattern} is named like a colour image",
-            remedy="the * of [frames] human_mask and color must stand for the same text",
-        )
+    refuse_if(
+        not any(name in masks for name in names),
+        f"{description.path}: no file of {description.root / pattern} is named like a colour image",
+        remedy="the * of [frames] human_mask and color must stand for the same text",
+    )
     num_without = sum(name not in masks for name in names)
     if num_without:
         loss.notes.append(f"{num_without} of {len(names)} colour images have no mask")
@@ -225,11 +234,8 @@ def _masks(description: Description, names: list[str], loss: LossReport) -> dict
 
 def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float64]:
     table, root = description.poses, description.root
-    if table is None:
-        raise InputError(
-            f"{description.path}: [poses] is missing",
-            remedy="describe them, or give --camera-pose NAME=identity for a camera that stands still",
-        )
+    remedy = "describe them, or give --camera-pose NAME=identity for a camera that stands still"
+    table = require(table, f"{description.path}: [poses] is missing", remedy=remedy)
     if table.format == "matrix-files":
         files = dict(find_files(root, table.file))
         if "" in files:  # a camera that does not move
@@ -239,8 +245,8 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
     file = root / table.file
     by_key = read_matrix_blocks(file, table.heading) if is_of_blocks else READERS[table.format](file)
     if table.format == "tum":
-        trajectory = Trajectory(by_key)
-        at_stamp = {name: trajectory.at(stamp) for name in colors if (stamp := stamp_of_text(name)) is not None}
+        pose_at = trajectory(by_key)
+        at_stamp = {name: pose_at(stamp) for name in colors if (stamp := stamp_of_text(name)) is not None}
         return {name: pose for name, pose in at_stamp.items() if pose is not None}
     if table.format == "nerfstudio":
         keys = {name: path.relative_to(root).as_posix() for name, path in colors.items()}
@@ -268,21 +274,13 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """Stamp by layout, file name, frame number and rate, or one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns
     if stamps.names:
-        stamp_ns = stamp_of_text(view.name)
-        if stamp_ns is None:
-            raise InputError(
-                f"{description.path}: stamps.names: expected seconds, got {view.name!r}",
-                remedy="see splatctrl help input",
-            )
-        return stamp_ns
-    if stamps.rate is not None:
-        return round(_number(view.name) * SECOND_NS / stamps.rate)
-    return position * SECOND_NS
+        said = f"{description.path}: stamps.names: expected seconds, got {view.name!r}"
+        return require(stamp_of_text(view.name), said, remedy="see splatctrl help input")
+    return round(_number(view.name) * SECOND_NS / stamps.rate) if stamps.rate is not None else position * SECOND_NS
 
 
 def _number(name: str) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, pose_at
@@ -23,7 +23,7 @@ from splatctrl_cli.recording.folder.dtu import (
     DtuView,
     Shrink,
     check_lengths,
-    chosen_scan,
+    choose_scan,
     read_views,
     write_png,
 )
@@ -35,12 +35,8 @@ PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
 
 def idr_scans(root: Path) -> dict[str, Path]:
     """Scan folders by name: `root`, or its children."""
-    folders = [root] if is_idr(root) else sorted(p for p in root.glob("*") if is_idr(p))
-    return {path.name.removeprefix("dtu_"): path for path in folders}
-
-
-def is_idr(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in CAMERAS)
+    scans = [path for path in (root, *sorted(root.glob("*"))) if any((path / name).is_file() for name in CAMERAS)]
+    return {path.name.removeprefix("dtu_"): path for path in (scans[:1] if root in scans else scans)}
 
 
 def read_idr(
@@ -50,13 +46,12 @@ def read_idr(
 
     `shrink` maps each view. A view without a depth map has depth 0. Raises InputError naming the file.
     """
-    scan, folder = chosen_scan(root, idr_scans(root), scan)
+    scan, folder = choose_scan(root, idr_scans(root), scan)
     path = next(folder / name for name in CAMERAS if (folder / name).is_file())
     projections = _projections(path)
-    images = _numbered(folder / "image", len(projections))
-    if not images:
-        raise InputError(f"{folder / 'image'}: expected images such as 000000.png, got none")
-    masks = _numbered(folder / "mask", len(projections))
+    images = _number_images(folder / "image", len(projections))
+    refuse_if(not images, f"{folder / 'image'}: expected images such as 000000.png, got none")
+    masks = _number_images(folder / "mask", len(projections))
     missing = [number for number in images if number not in masks]
     if masks and missing:
         raise InputError(f"{folder / 'mask'}: expected a mask for each image, got none for image {missing[0]}")
@@ -72,8 +67,10 @@ def read_idr(
     found = read_views(
         scan, images, camera, depth_of=depth_of, mask_of=masks.get, shrink=shrink, keeps_without_depth=True
     )
-    if depths is not None and len(found.without_depth) == len(found.views):
-        raise InputError(f"{depths}: expected depth_map_0000.pfm and so on, got none")
+    refuse_if(
+        depths is not None and len(found.without_depth) == len(found.views),
+        f"{depths}: expected depth_map_0000.pfm and so on, got none",
+    )
     check_lengths(f"{folder}", found.views)
     return replace(found, files=(*found.files, path))
 
@@ -126,15 +123,17 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
     """
     M = P[:, :3]
     determinant = np.linalg.det(M)
-    if not np.isfinite(P).all() or abs(determinant) < 1e-12 * np.linalg.norm(M) ** 3:
-        raise InputError(f"{where}: expected a camera's projection, got a matrix that cannot be inverted")
+    refuse_if(
+        not np.isfinite(P).all() or abs(determinant) < 1e-12 * np.linalg.norm(M) ** 3,
+        f"{where}: expected a camera's projection, got a matrix that cannot be inverted",
+    )
     K, R = cv2.decomposeProjectionMatrix(P if determinant > 0 else -P)[:2]
     signs = np.where(np.diag(K) < 0, -1.0, 1.0)  # K diag(signs), diag(signs) R: a camera with a positive focal length
     K, R = np.asarray(K, np.float64) * signs, signs[:, None] * np.asarray(R, np.float64)
     return K / K[2, 2], pose_at(-np.linalg.solve(M, P[:, 3]) / MILLIMETRES, R.T)
 
 
-def _numbered(folder: Path, num: int) -> dict[int, Path]:
+def _number_images(folder: Path, num: int) -> dict[int, Path]:
     """Images by camera number: in order if there are `num`, else by name.
 
     Raises InputError for another name.
@@ -145,12 +144,12 @@ def _numbered(folder: Path, num: int) -> dict[int, Path]:
     found: dict[int, Path] = {}
     for path in paths:
         number = int(path.stem) if path.stem.isdecimal() else num
-        if number >= num or number in found:
-            raise InputError(
-                f"{path}: expected one picture for each of {num} cameras, or their numbers as names, got {len(paths)}"
-                f" and this one" + (f" beside {found[number].name}" if number in found else ""),
-                remedy=f"name it by its camera's number, as {0:06d}.png to {num - 1:06d}.png, or take it away",
-            )
+        refuse_if(
+            number >= num or number in found,
+            f"{path}: expected one picture for each of {num} cameras, or their numbers as names, got {len(paths)}"
+            f" and this one" + (f" beside {found[number].name}" if number in found else ""),
+            remedy=f"name it by its camera's number, as {0:06d}.png to {num - 1:06d}.png, or take it away",
+        )
         found[number] = path
     return dict(sorted(found.items()))
 
@@ -167,24 +166,25 @@ def _projections(path: Path) -> list[Float64]:
     except Exception as error:  # numpy raises many kinds for a file that is not an archive
         raise InputError(f"{path}: not the cameras of a scan: {error}") from None
     low, high = PLAUSIBLE_RADIUS
-    if not low <= radius <= high:
-        raise InputError(
-            f"{path}: scale_mat_0: expected a sphere of {low:g} to {high:g} m around the object, got {radius:g} m",
-            remedy="world lengths have to be millimetres, as DTU's; this file may hold cameras in the unit sphere",
-        )
+    refuse_if(
+        not low <= radius <= high,
+        f"{path}: scale_mat_0: expected a sphere of {low:g} to {high:g} m around the object, got {radius:g} m",
+        remedy="world lengths have to be millimetres, as DTU's; this file may hold cameras in the unit sphere",
+    )
     return world
 
 
 def _intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     width, height = size
-    if abs(K[0, 1]) > 1.0:  # [px]; our cameras have none
-        raise InputError(f"{path}: expected cameras without skew, got one of {K[0, 1]:.2f} px")
-    if not (0.2 < K[0, 2] / width < 0.8 and 0.2 < K[1, 2] / height < 0.8):
-        raise InputError(
-            f"{path}: principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px does not lie about the middle of an image of"
-            f" {width}x{height}",
-            remedy="the images have to have the size that the cameras were made for",
-        )
+    refuse_if(
+        abs(K[0, 1]) > 1.0, f"{path}: expected cameras without skew, got one of {K[0, 1]:.2f} px"
+    )  # [px]; our cameras have none
+    refuse_if(
+        not (0.2 < K[0, 2] / width < 0.8 and 0.2 < K[1, 2] / height < 0.8),
+        f"{path}: principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px does not lie about the middle of an image of"
+        f" {width}x{height}",
+        remedy="the images have to have the size that the cameras were made for",
+    )
     return Intrinsics(
         fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), width=width, height=height
     )

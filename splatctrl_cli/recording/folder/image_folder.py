@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import UNIT_BASELINE
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.summary import names_in
 from splatctrl_cli.formats.arrays import DAMAGE, npy_of
-from splatctrl_cli.formats.image_file import decode_file, read_pfm
+from splatctrl_cli.formats.image_file import PNG, decode_file, read_pfm
 from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.recording.capture.capture_writer import check_not_partial
 from splatctrl_cli.recording.container.log_formats import SUFFIXES, is_bag_folder
@@ -29,20 +29,20 @@ from splatctrl_cli.recording.folder.folder_description import (
     ImageFile,
     read_description,
     read_rig,
+    whole_file,
 )
 from splatctrl_cli.recording.folder.folder_views import UNITS, View, find_files, length_unit, views_of
 from splatctrl_cli.recording.folder.idr import idr_scans
 from splatctrl_cli.recording.folder.layout import Layout, images_of
-from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
+from splatctrl_cli.recording.folder.layout_nerfstudio import fill_transforms
 from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
-from splatctrl_cli.recording.log.registration import DepthToColor, Lens, Undistortion, undistortion_of
+from splatctrl_cli.recording.log.registration import Lens, correct_lens
 from splatctrl_cli.recording.log.stored_frame import (
     FrameSource,
     StoredFrame,
     check_depth,
     human_mask,
     is_kept,
-    is_png,
 )
 from splatctrl_cli.recording.source_options import SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.records import Bool, Float32, Float64, LossReport, UInt8
@@ -64,7 +64,7 @@ class ImageFolderSource(FrameSource):
     def __init__(self, path: Path, options: SourceOptions, *descriptions: Description) -> None:
         options.refuse(_NOT_FOR_FOLDERS, "an image folder", path)
         self.name = path.name
-        self._descriptions = tuple(map(with_transforms, descriptions))
+        self._descriptions = tuple(map(fill_transforms, descriptions))
         self._description = self._descriptions[0]
         stamps = self._description.stamps
         self.has_clock = stamps.rate is not None or stamps.names
@@ -83,17 +83,15 @@ class ImageFolderSource(FrameSource):
         self.cameras = tuple(names) if options.cameras is None else options.cameras
         refuse_unknown_cameras(path, self.cameras, names)
         self._views = [view for view in self._views if view.camera in self.cameras]
+        self.depth_fault = InputError(
+            f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
+            remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
+        )
 
     @property
     def has_depth(self) -> bool:
         """True if any view has a depth file; without, every depth is 0."""
         return any(view.depth is not None for view in self._views)
-
-    def no_depth(self) -> InputError:
-        return InputError(
-            f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
-            remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
-        )
 
     @property
     def loss(self) -> LossReport:
@@ -118,7 +116,7 @@ class ImageFolderSource(FrameSource):
             unit = length_unit(median, apart)
             if unit == 1.0:
                 return ""
-            self._views = [view.in_unit(unit) for view in self._views]
+            self._views = [view.convert(unit) for view in self._views]
             words = (
                 f"lengths are taken as {UNITS[unit]}: the median depth is {median:.4g}, and the cameras are up to"
                 f" {apart:.4g} apart"
@@ -145,13 +143,6 @@ class ImageFolderSource(FrameSource):
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
 
-    def count_views(self) -> dict[str, int]:
-        return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
-
-    def digests(self) -> dict[str, str]:
-        """sha256 of description, pose files and images, by path below the root."""
-        return dict(self._digests)
-
     @cached_property
     def _digests(self) -> dict[str, str]:
         found: dict[str, Path] = {}
@@ -159,7 +150,7 @@ class ImageFolderSource(FrameSource):
             lens = None if len(self._descriptions) == 1 else description.camera
             views = [view for view in self._views if lens is None or view.lens == lens]
             of_views = ((view.color, view.depth, view.human, view.valid) for view in views)
-            files = [path for paths in of_views for path in paths if path is not None]
+            files = [whole_file(path) for paths in of_views for path in paths if path is not None]
             if description.poses is not None:
                 files.extend(path for _, path in find_files(description.root, description.poses.file))
             named = {str(path.relative_to(description.root)): path.absolute() for path in files}
@@ -179,14 +170,14 @@ class ImageFolderSource(FrameSource):
             self._damaged.append(f"{broken}: not an image that can be read")
             return None
         _check_size(view.color, color, view.lens)
-        color = lens.color(np.asarray(color))
+        color = lens.remap(np.asarray(color), cv2.INTER_LINEAR)
         human = None if view.human is None else self._human(view.human, lens)
         valid = self._valid(view, lens)
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
-        is_counts = lens.depth_to_color is None and not (
-            view.depth is None or _is_float(self._description.depth.encoding, view.depth)
+        is_counts = lens.depth_lens is None and not (
+            view.depth is None or self._description.depth.encoding == "float32" or view.depth.suffix == ".npy"
         )
-        is_plain = lens.undistortion is None
+        is_plain = lens.maps is None
         return StoredFrame(
             stamp_ns=view.stamp_ns,
             camera=view.camera,
@@ -213,33 +204,22 @@ class ImageFolderSource(FrameSource):
         ):
             return None
         data = view.depth.read_bytes()
-        return data if is_png(data) else None
+        return data if is_kept(data, PNG) else None
 
     def _lens(self, view: View) -> Lens:
-        table = view.lens
+        table, depth_camera = view.lens, self._description.depth_camera
         if table.name not in self._lenses:
-            undistortion, depth_camera = _undistortion(table), self._description.depth_camera
-            lens = Lens(
-                intrinsics=table.intrinsics if undistortion is None else undistortion.intrinsics,
-                undistortion=undistortion,
-            )
+            lens = _corrected(table)
             if depth_camera is not None:
-                bent = _undistortion(depth_camera)
                 lens = replace(
-                    lens,
-                    depth_to_color=DepthToColor(
-                        depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
-                        color_intrinsics=lens.intrinsics,
-                        T_color_depth=self._description.T_color_depth,
-                        undistortion=bent,
-                    ),
+                    lens, depth_lens=_corrected(depth_camera), T_color_depth=self._description.T_color_depth
                 )
             self._lenses[table.name] = lens
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
         """Pixels that the lens saw and the mask keeps (None: all)."""
-        seen = None if lens.undistortion is None else lens.undistortion.valid
+        seen = lens.valid
         if view.valid is None:
             return seen
         mask = self._human(view.valid, lens)
@@ -252,7 +232,7 @@ class ImageFolderSource(FrameSource):
         if pixels is None:
             self._damaged.append(f"{path}: not an image that can be read")
             return None
-        return lens.labels(human_mask(pixels, lens.intrinsics, str(path)))
+        return lens.remap(human_mask(pixels, lens.intrinsics, str(path)))
 
     def _depth(self, view: View, lens: Lens) -> Float32 | None:
         """(H, W) [m] at colour's pixels, 0 = no return; None if unreadable."""
@@ -270,7 +250,7 @@ class ImageFolderSource(FrameSource):
 
     def _recorded_depth(self, path: ImageFile, scale: float) -> Float32 | None:
         table = self._description.depth
-        if _is_float(table.encoding, path):
+        if table.encoding == "float32" or path.suffix == ".npy":  # which always has floats (nerfstudio)
             pixels = _float_pixels(path)
             if pixels is None:
                 return None
@@ -279,11 +259,11 @@ class ImageFolderSource(FrameSource):
         counts = decode_file(path.read_bytes(), color=False)
         if counts is None:
             return None
-        if counts.dtype != np.uint16 or counts.ndim != 2:
-            raise InputError(
-                f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes",
-                remedy="see splatctrl help input",
-            )
+        refuse_if(
+            counts.dtype != np.uint16 or counts.ndim != 2,
+            f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes",
+            remedy="see splatctrl help input",
+        )
         if table.encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)
         counts = np.where(counts == table.invalid, np.uint16(0), counts)
@@ -291,13 +271,8 @@ class ImageFolderSource(FrameSource):
         return metres(counts, scale)
 
 
-def _is_float(encoding: str, path: ImageFile) -> bool:
-    """True for floats, which every .npy has (nerfstudio)."""
-    return encoding == "float32" or path.suffix == ".npy"
-
-
-def _undistortion(camera: CameraTable) -> Undistortion | None:
-    return undistortion_of(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, np.float64))
+def _corrected(camera: CameraTable) -> Lens:
+    return correct_lens(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, np.float64))
 
 
 def _float_pixels(path: ImageFile) -> NDArray[np.float32] | None:
@@ -316,11 +291,11 @@ def _float_pixels(path: ImageFile) -> NDArray[np.float32] | None:
 
 
 def _check_size(path: ImageFile, pixels: NDArray[Any], camera: CameraTable) -> None:
-    if pixels.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"{path}: expected {camera.width}x{camera.height} as described, got {pixels.shape[1]}x{pixels.shape[0]}",
-            remedy="correct the size, or describe the depth camera in [depth_camera]",
-        )
+    refuse_if(
+        pixels.shape[:2] != (camera.height, camera.width),
+        f"{path}: expected {camera.width}x{camera.height} as described, got {pixels.shape[1]}x{pixels.shape[0]}",
+        remedy="correct the size, or describe the depth camera in [depth_camera]",
+    )
 
 
 def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
@@ -363,11 +338,11 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
     """Open a dataset's folder. Raises InputError for an unknown layout."""
     check_not_partial(folder)
     layout = layout_of(folder)
-    if layout is None and ((folder / "Rectified").is_dir() or idr_scans(folder)):
-        raise InputError(
-            f"{folder}: a DTU data set, which only reconstruct and score read",
-            remedy='give it as --dtu (in a suite dtu = "{recording}")',
-        )
+    refuse_if(
+        layout is None and ((folder / "Rectified").is_dir() or idr_scans(folder)),
+        f"{folder}: a DTU data set, which only reconstruct and score read",
+        remedy='give it as --dtu (in a suite dtu = "{recording}")',
+    )
     if layout is None:
         names = ", ".join(known.name for known in LAYOUTS)
         raise unknown_folder(
@@ -393,14 +368,12 @@ def unknown_folder(folder: Path, what: str, remedy: str) -> InputError:
 
 
 def _bare_images(folder: Path) -> str:
-    """Words for missing depth in a folder of colour; "" without images."""
     num = max(len(images_of(place)) for place in (folder, *(folder / name for name in _COLORS)) if place.is_dir())
     is_colmap = any((folder / place).exists() for place in ("sparse", "images.bin", "images.txt"))
     return f"depth is missing: images{' of a COLMAP model' if is_colmap else ''} alone ({num})" if num else ""
 
 
 def _readable_in(folder: Path) -> str:
-    """Names of readable parts, or ""."""
     found = []
     for name in names_in(folder)[:_MOST_LOOKED_AT]:
         path = folder / name

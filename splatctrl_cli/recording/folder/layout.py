@@ -9,20 +9,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.formats.image_file import decode_file, image_head
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
-    DepthTable,
     Description,
     ImageFile,
     ImagePart,
     ListedView,
-    PosesTable,
     StampsTable,
     check_camera,
 )
-from splatctrl_cli.recording.folder.poses import read_matrix_file, read_numbers
+from splatctrl_cli.recording.folder.poses import read_numbers
 from splatctrl_cli.recording.log.survey import paired
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -49,7 +47,7 @@ class Layout:
     docs: str = ""
 
 
-def marked(*alternatives: str) -> Callable[[Path], bool]:
+def find_marks(*alternatives: str) -> Callable[[Path], bool]:
     """Make a test of folders: every name of one alternative; "/" means a folder."""
 
     def has(folder: Path, mark: str) -> bool:
@@ -58,7 +56,7 @@ def marked(*alternatives: str) -> Callable[[Path], bool]:
     return lambda folder: any(all(has(folder, mark) for mark in marks.split()) for marks in alternatives)
 
 
-def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions], Description]:
+def ask_description(name: str, *examples: str) -> Callable[[Path, SourceOptions], Description]:
     """Make a reader that refuses a folder and asks for a description."""
 
     def refuse(folder: Path, _: SourceOptions) -> Description:
@@ -71,7 +69,7 @@ def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions],
     return refuse
 
 
-def named_lens(lenses: list[CameraTable], table: CameraTable, where: str) -> CameraTable:
+def add_lens(lenses: list[CameraTable], table: CameraTable, where: str) -> CameraTable:
     """A lens's camera, of those known or added to them as ``camera``, ``camera-1``, ``camera-2``, ...
 
     Raises as `check_camera`.
@@ -84,112 +82,80 @@ def named_lens(lenses: list[CameraTable], table: CameraTable, where: str) -> Cam
     return lenses[-1]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pairs:
-    """A layout's views, described at `path`, and numbers of unpaired colour and depth files.
-
-    Raises InputError without a view.
-    """
-
-    path: Path
-    views: Sequence[ListedView]
-    unpaired: tuple[int, int]
-
-    def __post_init__(self) -> None:
-        if not self.views:
-            raise InputError(f"{self.path}: no colour image has a depth image", remedy=_WHOLE)
-
-    def moved(self, change: Callable[[Float64], Float64]) -> "Pairs":
-        """Apply `change` to each known pose."""
-        return replace(
-            self, views=[v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in self.views]
-        )
+def list_views(path: Path, views: Sequence[ListedView], num_colors: int, num_depths: int) -> Description:
+    """Describe the views of so many colour and depth files. Raises InputError without a view."""
+    refuse_if(not views, f"{path}: no colour image has a depth image", remedy=_WHOLE)
+    unpaired = (num_colors - len(views), num_depths - len(views))
+    return Description(path=path, root=path, poses=None, listed=tuple(views), unpaired=unpaired)
 
 
-def paired_by_name(
+def move_poses(pairs: Description, change: Callable[[Float64], Float64]) -> Description:
+    views = (v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in pairs.listed)
+    return replace(pairs, listed=tuple(views))
+
+
+def pair_names(
     path: Path,
     colors: Mapping[Key, Path],
     depths: Mapping[Key, Path],
     pose: Callable[[Key], Float64 | None],
     name: Callable[[Key], str] = str,
-) -> Pairs:
+) -> Description:
     """Pair files of equal key, which gives name and pose."""
     views = [
         ListedView(name=name(key), color=color, depth=depths[key], matrix=pose(key))
         for key, color in colors.items()
         if key in depths
     ]
-    return Pairs(path=path, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views)))
+    return list_views(path, views, len(colors), len(depths))
 
 
-def paired_by_stamp(
+def pair_stamps(
     path: Path,
     colors: Sequence[tuple[int, Path]],
     depths: Sequence[tuple[int, Path]],
     pose_at: Callable[[int], Float64 | None],
     options: SourceOptions,
-) -> Pairs:
+) -> Description:
     """Pair files by stamp [ns] within the tolerance; the pose is at colour's stamp."""
-    tolerance_ns = round(options.pairing_tolerance_s * 1e9)
-    pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
-    return Pairs(
-        path=path,
-        views=[
-            ListedView(
-                name=f"{colors[i][0] / 1e9:.6f}",
-                color=colors[i][1],
-                depth=depths[j][1],
-                matrix=pose_at(colors[i][0]),
-                stamp_ns=colors[i][0],
-            )
-            for i, j in pairs
-        ],
-        unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)),
-    )
+    views = [
+        ListedView(
+            name=f"{colors[i][0] / 1e9:.6f}",
+            color=colors[i][1],
+            depth=depths[j][1],
+            matrix=pose_at(colors[i][0]),
+            stamp_ns=colors[i][0],
+        )
+        for i, j in paired(
+            [stamp for stamp, _ in colors], [stamp for stamp, _ in depths], round(options.pairing_tolerance_s * 1e9)
+        ).tolist()
+    ]
+    return list_views(path, views, len(colors), len(depths))
 
 
-def described(
-    pairs: Pairs,
+def describe(
+    pairs: Description,
     root: Path,
     options: SourceOptions,
     *,
-    poses: PosesTable,
     lens: Callable[[ImageFile], CameraTable] | None = None,
-    depth_camera: CameraTable | None = None,
-    depth: DepthTable | None = None,
     has_stamps: bool = False,
-    is_depth_resized: bool = False,
-    num_damaged: int = 0,
-    supply: str = Description.supply,
-    notes: tuple[str, ...] = (),
+    **fields: Any,
 ) -> Description:
-    """Describe paired views with the lens of --intrinsics, else `lens` of the first image.
+    """Complete listed views with the lens of --intrinsics, else `lens` of the first image, and further fields.
 
     Without `lens` each view has one. Raises InputError if a camera is impossible.
     """
-    first = pairs.views[0]
-    camera = first.camera if lens is None else given_lens(options, first.color) or lens(first.color)
-    for table in (camera, depth_camera):
+    first = pairs.listed[0]
+    camera = first.camera if lens is None else lens_option(options, first.color) or lens(first.color)
+    found = replace(pairs, root=root, camera=camera, stamps=StampsTable(names=has_stamps), **fields)
+    for table in (camera, found.depth_camera):
         if table is not None:
-            check_camera(table, str(pairs.path))
-    return Description(
-        path=pairs.path,
-        root=root,
-        poses=poses,
-        camera=camera,
-        depth_camera=depth_camera,
-        depth=depth or DepthTable(),
-        stamps=StampsTable(names=has_stamps),
-        listed=tuple(pairs.views),
-        is_depth_resized=is_depth_resized,
-        unpaired=pairs.unpaired,
-        num_damaged=num_damaged,
-        supply=supply,
-        notes=notes,
-    )
+            check_camera(table, str(found.path))
+    return found
 
 
-def given_lens(options: SourceOptions, image: ImageFile) -> CameraTable | None:
+def lens_option(options: SourceOptions, image: ImageFile) -> CameraTable | None:
     """The lens of --intrinsics for ``camera``, in the size of `image`; None if not given."""
     values = options.intrinsics.get(CAMERA)
     return None if values is None else pinhole(values[:4], image, values[4:])
@@ -205,44 +171,41 @@ def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[floa
 def read_K(path: Path) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy of a text file's 3x3 matrix."""
     values = read_numbers(path)
-    if len(values) != 9:
-        raise InputError(
-            f"{path}: expected a 3x3 matrix, got {len(values)} numbers",
-            remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
-        )
+    refuse_if(
+        len(values) != 9,
+        f"{path}: expected a 3x3 matrix, got {len(values)} numbers",
+        remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+    )
     return values[0], values[4], values[2], values[5]
 
 
 def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Float64) -> CameraTable | None:
     """The depth camera posed in the colour camera; None if they are the same."""
-    if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= 1e-6:
-        return None
-    return replace(depth, depth_to_color=T_color_depth.tolist())
+    is_same = depth == color and np.abs(T_color_depth - np.eye(4)).max() <= 1e-6
+    return None if is_same else replace(depth, depth_to_color=T_color_depth.tolist())
 
 
 def image_size(path: ImageFile) -> tuple[int, int]:
     """Columns and rows. Raises InputError if it is no image."""
     if isinstance(path, ImagePart):
         return path.size
-    try:
+    with refuse_faults(lambda error: f"{path}: {error.strerror}", OSError, remedy=_WHOLE):
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}", remedy=_WHOLE) from None
     if (head := image_head(data)) is not None:
         return head.width, head.height
-    pixels = decode_file(data, color=False)
-    if pixels is None:
-        raise InputError(f"{path}: not an image that can be read", remedy=_WHOLE)
-    return int(pixels.shape[1]), int(pixels.shape[0])
+    height, width, *_ = require(
+        decode_file(data, color=False), f"{path}: not an image that can be read", remedy=_WHOLE
+    ).shape
+    return int(width), int(height)
 
 
 def images_of(folder: Path) -> dict[str, Path]:
     """Images by stem, sorted by numbers."""
     files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGES]
-    return {path.stem: path for path in sorted(files, key=lambda p: by_numbers(p.stem))}
+    return {path.stem: path for path in sorted(files, key=lambda p: number_key(p.stem))}
 
 
-def by_numbers(name: str) -> tuple[list[int], str]:
+def number_key(name: str) -> tuple[list[int], str]:
     """A key that sorts 2 before 10."""
     return [int(number) for number in re.findall(r"\d+", name)], name
 
@@ -250,11 +213,6 @@ def by_numbers(name: str) -> tuple[list[int], str]:
 def pose_or_none(matrix: Float64) -> Float64 | None:
     """The matrix, None if not finite: how trackers write a loss."""
     return matrix if np.isfinite(matrix).all() else None
-
-
-def read_pose(path: Path) -> Float64 | None:
-    """A pose (4, 4); None if the file is missing or tracking was lost."""
-    return pose_or_none(read_matrix_file(path)) if path.is_file() else None
 
 
 def read_json(path: Path) -> Any:

@@ -19,6 +19,7 @@ folder with ``depth`` in its name.
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,9 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.geometry import invert_transform, pose_at
-from splatctrl_cli.recording.folder.dtu import fitted_intrinsics, read_camera_file
+from splatctrl_cli.recording.folder.dtu import fit_intrinsics, read_camera_file
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     DepthTable,
@@ -39,16 +40,16 @@ from splatctrl_cli.recording.folder.folder_description import (
 from splatctrl_cli.recording.folder.layout import (
     CAMERA,
     Layout,
-    Pairs,
-    described,
+    add_lens,
+    describe,
+    find_marks,
     image_size,
     images_of,
-    marked,
-    named_lens,
-    paired_by_stamp,
+    list_views,
+    pair_stamps,
     read_json,
 )
-from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, read_rows, stamp_of_text
+from splatctrl_cli.recording.folder.poses import read_numbers, read_rows, stamp_of_text, trajectory
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import MILLIMETRE, Float64
 
@@ -61,21 +62,16 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
     root = _frames(folder)
     assert root is not None
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
-    pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, Trajectory(_poses(root / TRAJECTORY)).at, options)
+    pairs = pair_stamps(root / TRAJECTORY, colors, depths, trajectory(_poses(root / TRAJECTORY)), options)
     lenses: list[CameraTable] = []
     pincams = {
         stamp: path
         for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))
         if (stamp := _stamp_ns(path))
     }
-    return described(
-        replace(
-            pairs,
-            views=[
-                replace(view, camera=named_lens(lenses, _arkit_lens(pincams, view), str(root)))
-                for view in pairs.views
-            ],
-        ),
+    views = (replace(v, camera=add_lens(lenses, _arkit_lens(pincams, v), str(root))) for v in pairs.listed)
+    return describe(
+        replace(pairs, listed=tuple(views)),
         root,
         options,
         poses=PosesTable(format="rotation-vectors", file=TRAJECTORY),
@@ -90,8 +86,7 @@ def _frames(folder: Path) -> Path | None:
 
 
 def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder", remedy="download lowres_wide and lowres_depth")
+    refuse_if(not folder.is_dir(), f"{folder}: no such folder", remedy="download lowres_wide and lowres_depth")
     return [(stamp_ns, path) for path in images_of(folder).values() if (stamp_ns := _stamp_ns(path)) is not None]
 
 
@@ -123,10 +118,11 @@ def _arkit_lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
             remedy="download lowres_wide_intrinsics",
         )
     values = read_numbers(pincams[near])
-    if len(values) != 6 or not np.isfinite(values).all():
-        raise InputError(
-            f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {values}", remedy="copy the file again"
-        )
+    refuse_if(
+        len(values) != 6 or not np.isfinite(values).all(),
+        f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {values}",
+        remedy="copy the file again",
+    )
     width, height, fx, fy, cx, cy = values
     return CameraTable(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy)
 
@@ -145,17 +141,15 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
     for sensor in _sensors(folder):
         path = folder / f"{Path(FILE).stem}{sensor}.json"
         color_folder = next((f for name in COLOR_FOLDERS if (f := folder / f"{name}{sensor}").is_dir()), None)
-        if color_folder is None:
-            raise InputError(
-                f"{folder}: expected a folder rgb{sensor} or gray{sensor}, got none", remedy="unpack the whole scene"
-            )
-        colors, depths = images_of(color_folder), images_of(folder / f"depth{sensor}")
+        said = f"{folder}: expected a folder rgb{sensor} or gray{sensor}, got none"
+        colors = images_of(require(color_folder, said, remedy="unpack the whole scene"))
+        depths = images_of(folder / f"depth{sensor}")
         views += _views(path, sensor, colors, depths)
         files.append(path)
         num_colors, num_depths = num_colors + len(colors), num_depths + len(depths)
     name = FILE if len(files) == 1 else f"{Path(FILE).stem}*.json"
-    return described(
-        Pairs(path=files[0], views=views, unpaired=(num_colors - len(views), num_depths - len(views))),
+    return describe(
+        list_views(files[0], views, num_colors, num_depths),
         folder,
         options,
         poses=PosesTable(format="bop", file=files[0].name if len(files) == 1 else name, convention="world_to_camera"),
@@ -163,7 +157,6 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
 
 
 def _sensors(folder: Path) -> list[str]:
-    """Suffixes of the sensors' file names, such as ``_cam1``; empty for ``scene_camera.json``."""
     stem = Path(FILE).stem
     found = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
     return [sensor for sensor in found if (folder / f"depth{sensor}").is_dir()]
@@ -171,8 +164,11 @@ def _sensors(folder: Path) -> list[str]:
 
 def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, Path]) -> list[ListedView]:
     content = read_json(path)
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected an object by image number, got {type(content).__name__}", remedy=_REMEDY)
+    refuse_if(
+        not isinstance(content, dict),
+        f"{path}: expected an object by image number, got {type(content).__name__}",
+        remedy=_REMEDY,
+    )
     entries = {int(key): entry for key, entry in content.items() if key.isdigit()}
     lenses: list[CameraTable] = []
     views, prefix = [], sensor.removeprefix("_")
@@ -182,7 +178,13 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
         if name not in depths or entry is None:
             continue
         where = f"{path}: image {int(name)}"
-        try:
+        with refuse_faults(
+            partial("{}: expected BOP's fields, got no usable {}".format, where),
+            KeyError,
+            TypeError,
+            ValueError,
+            remedy=_REMEDY,
+        ):
             fx, _, cx, _, fy, cy, _, _, _ = (float(value) for value in entry["cam_K"])
             lens = CameraTable(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, name=prefix or CAMERA)
             view = ListedView(
@@ -190,11 +192,9 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
                 color=color,
                 depth=depths[name],
                 matrix=_pose(entry),
-                camera=named_lens(lenses, lens, where),
+                camera=add_lens(lenses, lens, where),
                 depth_scale=float(entry["depth_scale"]) * MILLIMETRE,
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{where}: expected BOP's fields, got no usable {error}", remedy=_REMEDY) from None
         views.append(view)
     return views
 
@@ -236,13 +236,13 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
         (K, T_camera_world, _), depth = cameras[stem], depths.get(int(stem) if stem.isdigit() else -1)
         if depth is None and depths:
             continue
-        k = fitted_intrinsics(K, image_size(color), files[stem])
+        k = fit_intrinsics(K, image_size(color), files[stem])
         T_camera_world[:3, 3] *= unit
         lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
-        lens = named_lens(lenses, lens, str(files[stem]))
+        lens = add_lens(lenses, lens, str(files[stem]))
         views.append(ListedView(name=stem, color=color, depth=depth, matrix=T_camera_world, camera=lens))
-    return described(
-        Pairs(path=folder, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views))),
+    return describe(
+        list_views(folder, views, len(colors), len(depths)),
         folder,
         options,
         poses=PosesTable(format="matrix-files", file=_CAMERAS, convention="world_to_camera"),
@@ -257,10 +257,11 @@ def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and "depth" not in path.name.lower()]
     found = [{stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)]
     most = max(found, key=len)
-    if not most:
-        raise InputError(
-            f"{folder}: no image is named like a camera file ({min(stems)}_cam.txt)", remedy="copy the images too"
-        )
+    refuse_if(
+        not most,
+        f"{folder}: no image is named like a camera file ({min(stems)}_cam.txt)",
+        remedy="copy the images too",
+    )
     return most
 
 
@@ -306,7 +307,7 @@ BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1
     Layout(
         name="MVSNet scene",
         order=10,
-        matches=marked(_CAMERAS),
+        matches=find_marks(_CAMERAS),
         read=read_mvsnet,
         docs="""
 MVSNet scene (DTU, BlendedMVS, Tanks and Temples, colmap2mvsnet) | `cams/*_cam.txt`, images | world to camera |

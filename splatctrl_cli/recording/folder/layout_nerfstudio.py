@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.recording.folder.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.recording.folder.layout import Layout, image_size, marked, named_lens
+from splatctrl_cli.recording.folder.layout import Layout, add_lens, find_marks, image_size
 from splatctrl_cli.recording.folder.poses import read_nerfstudio
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -35,13 +35,12 @@ def read(folder: Path, options: SourceOptions) -> Description:
     """Describe the folder; depth defaults to millimetres."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
-    return with_transforms(
+    return fill_transforms(
         Description(path=folder / file, root=folder, poses=PosesTable(format="nerfstudio", file=file, axes="opengl"))
     )
 
 
-def with_transforms(description: Description) -> Description:
-    """Fill missing camera and views from transforms.json."""
+def fill_transforms(description: Description) -> Description:
     table = description.poses
     is_whole = bool(description.listed or (description.camera and description.frames))
     if is_whole or table is None or table.format != "nerfstudio":
@@ -50,29 +49,29 @@ def with_transforms(description: Description) -> Description:
     content, matrices = read_nerfstudio(path)
     lenses: list[CameraTable] = []
     views = [_view(content, entry, path, lenses, description, matrices) for entry in content["frames"]]
-    if not views:
-        raise InputError(f"{path}: no frames", remedy="give a transforms.json with frames")
+    refuse_if(not views, f"{path}: no frames", remedy="give a transforms.json with frames")
     bare = [view.name for view in views if view.depth is None]
-    if bare and len(bare) < len(views):
-        raise InputError(
-            f"{path}: {bare[0]}: depth_file_path is missing ({len(bare)} of {len(views)} frames)",
-            remedy="add it, or leave the frame out",
-        )
+    refuse_if(
+        0 < len(bare) < len(views),
+        f"{path}: {''.join(bare[:1])}: depth_file_path is missing ({len(bare)} of {len(views)} frames)",
+        remedy="add it, or leave the frame out",
+    )
     if description.frames is not None:
-        if len(lenses) > 1:
-            raise InputError(
-                f"{path}: {len(lenses)} different sets of intrinsics beside [frames]",
-                remedy="leave [frames] out, or give [camera]",
-            )
+        refuse_if(
+            len(lenses) > 1,
+            f"{path}: {len(lenses)} different sets of intrinsics beside [frames]",
+            remedy="leave [frames] out, or give [camera]",
+        )
         return replace(description, camera=views[0].camera)
     stems = [Path(view.name).stem for view in views]
     is_short = len(set(stems)) == len(stems)  # else the path without suffix
     names = stems if is_short else [str(Path(view.name).with_suffix("")) for view in views]
-    named = (replace(view, name=name) for view, name in zip(views, names, strict=True))
     return replace(
         description,
         camera=views[0].camera,
-        listed=tuple(sorted(named, key=lambda v: v.name)),
+        listed=tuple(
+            sorted((replace(view, name=name) for view, name in zip(views, names, strict=True)), key=lambda v: v.name)
+        ),
         is_depth_resized=True,
         supply=SUPPLY,
     )
@@ -91,52 +90,61 @@ def _view(
     depth = _only(entry, ("depth_file_path", "depth_path"), path)
     scale = _only(said, ("depth_unit_scale_factor", "integer_depth_scale"), path)
     mask = entry.get("mask_path")
-    try:
+    with refuse_faults(
+        lambda error: f"{path}: {name}: expected numbers, got {error}",
+        TypeError,
+        ValueError,
+        ZeroDivisionError,
+        remedy="correct the file",
+    ):
         applied = float(content.get("applied_scale", 1.0))
         matrix = matrices[name].copy()
         matrix[:3, 3] *= 1.0 / applied
         unit = None if scale is None else float(scale)
-    except (TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(f"{path}: {name}: expected numbers, got {error}", remedy="correct the file") from None
     return ListedView(
         name=name,
         color=color,
         depth=None if depth is None else path.parent / str(depth).replace("\\", "/"),
         matrix=matrix,
-        camera=description.camera or named_lens(lenses, _camera(said, color, path), str(path)),
+        camera=description.camera or add_lens(lenses, _camera(said, color, path), str(path)),
         depth_scale=unit,
         valid=None if not mask else path.parent / str(mask).replace("\\", "/"),
     )
 
 
 def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
-    """The value of any key, or None. Raises InputError if two differ."""
     found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
-    if len(set(found.values())) > 1:
-        both = " and ".join(f"{key} = {value}" for key, value in found.items())
-        raise InputError(f"{path}: {both} differ", remedy="leave one of them out")
+    both = " and ".join(f"{key} = {value}" for key, value in found.items())
+    refuse_if(len(set(found.values())) > 1, f"{path}: {both} differ", remedy="leave one of them out")
     return next(iter(found.values()), None)
 
 
 def _image(path: Path) -> Path:
     """An image whose name may omit `.png` or `.jpg`, as in Blender's scenes."""
-    if path.suffix:
-        return path
-    return next((file for end in (".png", ".jpg") if (file := path.with_name(path.name + end)).is_file()), path)
+    ends = () if path.suffix else (".png", ".jpg")
+    return next((file for end in ends if (file := path.with_name(path.name + end)).is_file()), path)
 
 
 def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
     model = str(said.get("camera_model") or ("OPENCV_FISHEYE" if said.get("is_fisheye") else "OPENCV"))
-    if model not in _MODELS:
-        raise InputError(
-            f"{path}: camera_model: expected one of {', '.join(_MODELS)}, got {model!r}",
-            remedy="undistort the images",
-        )
-    if "is_fisheye" in said and bool(said["is_fisheye"]) != (model == "OPENCV_FISHEYE"):
-        raise InputError(
-            f"{path}: camera_model is {model}, but is_fisheye is {said['is_fisheye']}", remedy="correct one of them"
-        )
-    try:
+    refuse_if(
+        model not in _MODELS,
+        f"{path}: camera_model: expected one of {', '.join(_MODELS)}, got {model!r}",
+        remedy="undistort the images",
+    )
+    refuse_if(
+        "is_fisheye" in said and bool(said["is_fisheye"]) != (model == "OPENCV_FISHEYE"),
+        f"{path}: camera_model is {model}, but is_fisheye is {said.get('is_fisheye')}",
+        remedy="correct one of them",
+    )
+    with refuse_faults(
+        lambda error: f"{path}: no usable {error} in the intrinsics",
+        KeyError,
+        TypeError,
+        ValueError,
+        ZeroDivisionError,
+        remedy="give [camera] and [frames] in a description",
+    ):
         distortion = [float(said.get(key, 0.0)) for key in _COEFFICIENTS[model]]
         further = sorted(key for key in _ALL if key not in _COEFFICIENTS[model] and float(said.get(key, 0.0)))
         if further:
@@ -157,17 +165,13 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
             distortion=distortion,
             distortion_model=_MODELS[model],
         )
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(
-            f"{path}: no usable {error} in the intrinsics", remedy="give [camera] and [frames] in a description"
-        ) from None
 
 
 ENTRIES = (
     Layout(
         name="nerfstudio",
         order=4,
-        matches=marked(*FILES),
+        matches=find_marks(*FILES),
         read=read,
         docs="""
 nerfstudio, instant-ngp, Blender | `transforms.json` or `transforms_train.json`, `depth_file_path` or `depth_path` |

@@ -6,7 +6,7 @@ whichever fits.
 """
 
 import struct
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config.fixed import CLOUD_POINTS, CLOUD_RESIDUAL
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.formats.image_file import MOST_PIXELS
 from splatctrl_cli.geometry import invert_transform, project, transform_from, transform_points
 from splatctrl_cli.libraries import of_extra
@@ -27,7 +27,7 @@ from splatctrl_cli.recording.folder.folder_description import (
     ListedView,
     PosesTable,
 )
-from splatctrl_cli.recording.folder.layout import CAMERA, Layout, Pairs, by_numbers, described, marked
+from splatctrl_cli.recording.folder.layout import CAMERA, Layout, describe, find_marks, list_views, number_key
 from splatctrl_cli.recording.folder.poses import stamp_of_text
 from splatctrl_cli.recording.log.stored_frame import npy_bytes
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -41,37 +41,22 @@ _DAMAGE = (ValueError, TypeError, KeyError, RuntimeError, OSError, MemoryError, 
 _AGAIN = "copy the file again"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cloud:
-    """A cloud as written: points (H, W, 3) float64, color (H, W, 3) uint8 RGB, VIEWPOINT.
+_library = partial(of_extra, "pypcd4", "pcd", "point clouds (.pcd)")
 
-    A missing point is NaN.
+
+def read_cloud(path: Path) -> tuple[Float64, UInt8, Float64]:
+    """Points (H, W, 3), NaN for none, colour (H, W, 3) RGB, and VIEWPOINT of an organised cloud, as written.
+
+    Raises InputError for another.
     """
-
-    points: Float64
-    color: UInt8
-    T_world_camera: Float64
-
-    def in_camera(self, *, is_world: bool) -> Float64:
-        """Points (H, W, 3) in the camera; is_world: the file's are in world."""
-        return transform_points(invert_transform(self.T_world_camera), self.points) if is_world else self.points
-
-
-def read_cloud(path: Path) -> Cloud:
-    """Read an organised coloured cloud. Raises InputError for another."""
     said = _head(path)
     size = (said.height, said.width)
-    try:
+    with _refuse_damage(path):
         columns = _library().PointCloud.from_path(path).pc_data
         points = np.stack([columns[axis].astype(np.float64).reshape(size) for axis in "xyz"], axis=-1)
         packed = columns["rgb" if "rgb" in said.fields else "rgba"].view(np.uint32).reshape(size)
-    except _DAMAGE as error:
-        raise _unreadable(path, error) from None
-    return Cloud(
-        points=points,
-        color=np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8),
-        T_world_camera=_viewpoint(said),
-    )
+    color = np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
+    return points, color, _viewpoint(said)
 
 
 def pinhole_of(points: Float64) -> Intrinsics | None:
@@ -102,9 +87,9 @@ def residual(points: Float64, camera: Intrinsics | None) -> float:
 
 def read(path: Path, options: SourceOptions) -> Description:
     """Describe clouds; --depth-scale is metres per length of points and VIEWPOINT."""
-    files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"), key=lambda p: by_numbers(p.stem))
+    files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"), key=lambda p: number_key(p.stem))
     heads, unit = [_head(file) for file in files], options.depth_scale or 1.0
-    k, is_world, notes = _fitted(files[0], options)
+    k, is_world, notes = _fit_lens(files[0], options)
     stamps = [stamp_of_text(file.stem) if "." in file.stem else None for file in files]
     has_stamps = None not in stamps
     views = []
@@ -122,17 +107,17 @@ def read(path: Path, options: SourceOptions) -> Description:
             )
         )
     if all(tuple(head.viewpoint) == _UNSET for head in heads) and CAMERA not in options.camera_poses:
-        if len(files) > 1:
-            raise InputError(
-                f"{path}: no poses: VIEWPOINT is the origin in all {len(files)} clouds",
-                remedy="write poses as VIEWPOINT, or give --camera-pose camera=identity where it stands still",
-            )
+        refuse_if(
+            len(files) > 1,
+            f"{path}: no poses: VIEWPOINT is the origin in all {len(files)} clouds",
+            remedy="write poses as VIEWPOINT, or give --camera-pose camera=identity where it stands still",
+        )
         notes.append("VIEWPOINT is the origin: the camera's own frame is the world")
     others = sorted({name for head in heads for name in head.fields} - {"x", "y", "z", "rgb", "rgba"})
     notes += [f"fields {', '.join(others)} are not used"] if others else []
     lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
-    return described(
-        Pairs(path=path, views=views, unpaired=(0, 0)),
+    return describe(
+        list_views(path, views, len(views), len(views)),
         path.parent if path.is_file() else path,
         options,
         poses=PosesTable(format="pcd", file=f"*{SUFFIX}" if path.is_dir() else path.name),
@@ -143,16 +128,18 @@ def read(path: Path, options: SourceOptions) -> Description:
     )
 
 
-def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
-    cloud, given = read_cloud(path), options.intrinsics.get(CAMERA)
-    fits = []
+def _fit_lens(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
+    (written, _, T), given = read_cloud(path), options.intrinsics.get(CAMERA)
+    fits, (height, width) = [], written.shape[:2]
     for is_world in (False, True):
-        points = cloud.in_camera(is_world=is_world)
-        height, width = points.shape[:2]
+        points = transform_points(invert_transform(T), written) if is_world else written
         camera = pinhole_of(points)
         if given is not None:
-            if len(given) > 4:
-                raise UsageError(f"--intrinsics: expected FX,FY,CX,CY for {path.name}, got distortion coefficients")
+            refuse_if(
+                len(given) > 4,
+                f"--intrinsics: expected FX,FY,CX,CY for {path.name}, got distortion coefficients",
+                error=UsageError,
+            )
             fx, fy, cx, cy = given
             camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
         fits.append((residual(points, camera), is_world, camera))
@@ -172,14 +159,10 @@ def _unfit(path: Path, far: float, what: str) -> InputError:
     )
 
 
-def _library() -> Any:
-    return of_extra("pypcd4", "pcd", "point clouds (.pcd)")
-
-
 def _head(path: Path) -> Any:
     """Read a header. Raises InputError if not organised or without colour."""
     lines: list[str] = []
-    try:
+    with _refuse_damage(path):
         with path.open("rb") as stream:
             for _ in range(_MOST_LINES):
                 line = stream.readline(1 << 12).decode("ascii").strip()
@@ -187,28 +170,35 @@ def _head(path: Path) -> Any:
                 if line.startswith("DATA"):
                     break
         said = _library().MetaData.parse_header(lines)
-    except _DAMAGE as error:
-        raise _unreadable(path, error) from None
-    if said.height <= 1:
-        raise InputError(
-            f"{path}: not organised: {said.width} points in one row",
-            remedy="record clouds before any filter, in the rows and columns of the image, NaN where nothing is seen",
-        )
-    if not 0 < said.width * said.height <= MOST_PIXELS or said.points != said.width * said.height:
-        raise InputError(f"{path}: {said.points} points of {said.width}x{said.height}", remedy=_AGAIN)
-    if not np.linalg.norm(said.viewpoint[3:]) > 0.5:
-        raise InputError(f"{path}: VIEWPOINT: expected a quaternion, got {said.viewpoint[3:]}", remedy=_AGAIN)
-    if not {"rgb", "rgba"} & set(said.fields):
-        raise InputError(
-            f"{path}: no colour: expected a field rgb or rgba, got {' '.join(said.fields)}",
-            remedy="save clouds with colour (PCL: PointXYZRGB, PointXYZRGBL)",
-        )
+    refuse_if(
+        said.height <= 1,
+        f"{path}: not organised: {said.width} points in one row",
+        remedy="record clouds before any filter, in the rows and columns of the image, NaN where nothing is seen",
+    )
+    refuse_if(
+        not 0 < said.width * said.height <= MOST_PIXELS or said.points != said.width * said.height,
+        f"{path}: {said.points} points of {said.width}x{said.height}",
+        remedy=_AGAIN,
+    )
+    refuse_if(
+        not np.linalg.norm(said.viewpoint[3:]) > 0.5,
+        f"{path}: VIEWPOINT: expected a quaternion, got {said.viewpoint[3:]}",
+        remedy=_AGAIN,
+    )
+    refuse_if(
+        not {"rgb", "rgba"} & set(said.fields),
+        f"{path}: no colour: expected a field rgb or rgba, got {' '.join(said.fields)}",
+        remedy="save clouds with colour (PCL: PointXYZRGB, PointXYZRGBL)",
+    )
     return said
 
 
-def _unreadable(path: Path, error: Exception) -> InputError:
-    said = " ".join(str(error).split())[:200] or type(error).__name__
-    return InputError(f"{path}: not a PCD that can be read: {said}", remedy=_AGAIN)
+def _refuse_damage(path: Path) -> AbstractContextManager[None]:
+    def text(error: Exception) -> str:
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        return f"{path}: not a PCD that can be read: {said}"
+
+    return refuse_faults(text, *_DAMAGE, remedy=_AGAIN)
 
 
 def _viewpoint(said: Any) -> Float64:
@@ -222,11 +212,9 @@ def _is_seen(points: Float64) -> Bool:
 
 
 def _color_file(path: Path) -> bytes:
-    try:
-        color = read_cloud(path).color
-    except InputError:
-        return b""
-    return cv2.imencode(".png", color[..., ::-1], _FAST)[1].tobytes()
+    with suppress(InputError):
+        return cv2.imencode(".png", read_cloud(path)[1][..., ::-1], _FAST)[1].tobytes()
+    return b""
 
 
 def _depth_file(path: Path, camera: Intrinsics, first: Path, *, is_world: bool) -> bytes:
@@ -235,9 +223,10 @@ def _depth_file(path: Path, camera: Intrinsics, first: Path, *, is_world: bool) 
     Raises InputError if the camera is not the first cloud's.
     """
     try:
-        points = read_cloud(path).in_camera(is_world=is_world)
+        points, _, T = read_cloud(path)
     except InputError:
         return b""
+    points = transform_points(invert_transform(T), points) if is_world else points
     seen = _is_seen(points)
     far = residual(points, camera)
     if seen.any() and far > CLOUD_RESIDUAL:
@@ -249,7 +238,7 @@ ENTRIES = (
     Layout(
         name="PCD clouds",
         order=12,
-        matches=marked(f"*{SUFFIX}"),
+        matches=find_marks(f"*{SUFFIX}"),
         read=read,
         suffix=SUFFIX,
         docs="""

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.formats.image_file import MOST_PIXELS
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.recording.folder.folder_description import (
@@ -31,10 +31,11 @@ from splatctrl_cli.recording.folder.folder_description import (
 )
 from splatctrl_cli.recording.folder.layout import (
     Layout,
-    Pairs,
-    described,
-    given_lens,
-    marked,
+    describe,
+    find_marks,
+    lens_option,
+    list_views,
+    move_poses,
     own_depth_camera,
     pinhole,
     pose_or_none,
@@ -76,27 +77,28 @@ class _Sens:
 def read_sens(path: Path, options: SourceOptions) -> Description:
     """Describe the file, or a folder's only one; depth is registered to colour."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"))
-    if len(files) > 1:
-        raise InputError(f"{path}: {len(files)} files *{SUFFIX}", remedy=f"give one of them, such as {files[0]}")
+    refuse_if(len(files) > 1, f"{path}: {len(files)} files *{SUFFIX}", remedy=f"give one of them, such as {files[0]}")
     file, root = files[0], files[0].parent
     sens = _head(file)
     frames = list(_frames(file, sens))
-    if not frames:
-        raise InputError(f"{file}: expected frames, got none", remedy=_AGAIN)
+    refuse_if(not frames, f"{file}: expected frames, got none", remedy=_AGAIN)
     has_stamps = len({frame.stamp_ns for frame in frames}) == len(frames)
     views = frames if has_stamps else [replace(frame, stamp_ns=None) for frame in frames]
     missing = sens.num_frames - len(frames)
     color, depth = frames[0].color, frames[0].depth
     assert depth is not None
-    lens = given_lens(options, color) or _lens(sens.color, color, f"{file} (colour)")
-    own = _lens(sens.depth, depth, f"{file} (depth)")
-    return described(
-        Pairs(path=file, views=views, unpaired=(0, 0)).moved(lambda T: T @ sens.T_base_color),
+    lens = lens_option(options, color) or _lens(sens.color, color, f"{file} (colour)")
+    return describe(
+        move_poses(list_views(file, views, len(views), len(views)), lambda T: T @ sens.T_base_color),
         root,
         options,
         poses=PosesTable(format="sens", file=file.name),
         lens=lambda _: lens,
-        depth_camera=own_depth_camera(lens, own, invert_transform(sens.T_base_color) @ sens.T_base_depth),
+        depth_camera=own_depth_camera(
+            lens,
+            _lens(sens.depth, depth, f"{file} (depth)"),
+            invert_transform(sens.T_base_color) @ sens.T_base_depth,
+        ),
         depth=DepthTable(scale=sens.depth_scale),
         has_stamps=has_stamps,
         num_damaged=missing,
@@ -106,40 +108,38 @@ def read_sens(path: Path, options: SourceOptions) -> Description:
 
 def _lens(K: Float64, image: ImageFile, where: str) -> CameraTable:
     lens = pinhole((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), image)
-    if abs(2 * lens.cx - lens.width) > 0.25 * lens.width:
-        raise InputError(
-            f"{where}: cx {lens.cx:g} is not near the middle of {image.name}, {lens.width} columns wide",
-            remedy="scale the intrinsics with the images, or give --intrinsics camera=FX,FY,CX,CY",
-        )
+    refuse_if(
+        abs(2 * lens.cx - lens.width) > 0.25 * lens.width,
+        f"{where}: cx {lens.cx:g} is not near the middle of {image.name}, {lens.width} columns wide",
+        remedy="scale the intrinsics with the images, or give --intrinsics camera=FX,FY,CX,CY",
+    )
     return lens
 
 
 def _head(path: Path) -> _Sens:
     with path.open("rb") as stream:
-        try:
+        with refuse_faults(lambda _: f"{path}: ends within its head", struct.error, remedy=_AGAIN):
             version, length = struct.unpack("<IQ", stream.read(12))
-            if version != VERSION or length > _MOST_NAME:
-                raise InputError(
-                    f"{path}: expected a sensor file of version {VERSION}, got {version}",
-                    remedy="export it with ScanNet's SensReader",
-                )
+            refuse_if(
+                version != VERSION or length > _MOST_NAME,
+                f"{path}: expected a sensor file of version {VERSION}, got {version}",
+                remedy="export it with ScanNet's SensReader",
+            )
             stream.read(length)
             *matrices, color, depth, wide, high, depth_wide, depth_high, shift = _HEAD.unpack(stream.read(_HEAD.size))
             (num_frames,) = struct.unpack("<Q", stream.read(8))
-        except struct.error:
-            raise InputError(f"{path}: ends within its head", remedy=_AGAIN) from None
         first = stream.tell()
-    if color not in _COLORS or depth not in (_RAW, _ZLIB):
-        raise InputError(
-            f"{path}: expected colour as PNG or JPEG (1, 2) and depth as words, plain or zlib (0, 1), got {color} and"
-            f" {depth}",
-            remedy="export it with ScanNet's SensReader",
-        )
-    if not (0 < shift < np.inf and 0 < depth_wide * depth_high <= MOST_PIXELS):
-        raise InputError(
-            f"{path}: expected counts per metre and a size of depth, got {shift} and {depth_wide}x{depth_high}",
-            remedy=_AGAIN,
-        )
+    refuse_if(
+        color not in _COLORS or depth not in (_RAW, _ZLIB),
+        f"{path}: expected colour as PNG or JPEG (1, 2) and depth as words, plain or zlib (0, 1), got {color} and"
+        f" {depth}",
+        remedy="export it with ScanNet's SensReader",
+    )
+    refuse_if(
+        not (0 < shift < np.inf and 0 < depth_wide * depth_high <= MOST_PIXELS),
+        f"{path}: expected counts per metre and a size of depth, got {shift} and {depth_wide}x{depth_high}",
+        remedy=_AGAIN,
+    )
     K_color, T_color, K_depth, T_depth = np.array(matrices, dtype=np.float64).reshape(4, 4, 4)
     return _Sens(
         color=K_color,
@@ -210,7 +210,7 @@ ENTRIES = (
     Layout(
         name="ScanNet sensor file",
         order=11,
-        matches=marked(f"*{SUFFIX}"),
+        matches=find_marks(f"*{SUFFIX}"),
         read=read_sens,
         suffix=SUFFIX,
         docs="""

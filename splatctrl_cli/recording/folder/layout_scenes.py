@@ -20,11 +20,12 @@ SensReader.
 """
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
@@ -35,21 +36,22 @@ from splatctrl_cli.recording.folder.folder_description import (
 )
 from splatctrl_cli.recording.folder.layout import (
     Layout,
-    Pairs,
-    by_description,
-    by_numbers,
-    described,
-    given_lens,
+    ask_description,
+    describe,
+    find_marks,
     images_of,
-    marked,
+    lens_option,
+    list_views,
+    move_poses,
+    number_key,
     own_depth_camera,
-    paired_by_name,
+    pair_names,
     pinhole,
+    pose_or_none,
     read_json,
     read_K,
-    read_pose,
 )
-from splatctrl_cli.recording.folder.poses import read_trajectory_log, rigid
+from splatctrl_cli.recording.folder.poses import read_matrix_file, read_trajectory_log, rigid
 from splatctrl_cli.recording.source_options import SourceOptions
 
 DEPTH_LENS = (585.0, 585.0, 320.0, 240.0)
@@ -77,19 +79,23 @@ def read_frames(folder: Path, options: SourceOptions) -> Description:
     sequence = next(s for s in _SEQUENCES if next(folder.glob(f"{s}frame-*.pose.txt"), None) is not None)
     colors = _files(folder, f"{sequence}frame-*.color.*", ".color")
     depths = _files(folder, f"{sequence}frame-*.depth.*", ".depth")
-    pairs = paired_by_name(folder, colors, depths, lambda name: read_pose(folder / f"{name}.pose.txt"))
-    first = pairs.views[0]
+    poses = (folder / f"{name}.pose.txt" for name in colors)
+    matrices = {
+        name: pose_or_none(read_matrix_file(file)) for name, file in zip(colors, poses, strict=True) if file.is_file()
+    }
+    pairs = pair_names(folder, colors, depths, matrices.get)
+    first = pairs.listed[0]
     places = (colors[first.name].parent, folder, folder.parent)
     if any((place / name).is_file() for place in places for name in ("_info.txt", "info.txt")):
-        return by_description("12-Scenes", "twelve_scenes.toml")(folder, options)
+        return ask_description("12-Scenes", "twelve_scenes.toml")(folder, options)
     published = (place / "camera-intrinsics.txt" for place in (folder, folder.parent))
     values = next((read_K(file) for file in published if file.is_file()), DEPTH_LENS)
     depth_camera = None
-    if is_7_scenes := given_lens(options, first.color) is None and values == DEPTH_LENS:
+    if is_7_scenes := lens_option(options, first.color) is None and values == DEPTH_LENS:
         values, lens = COLOR_LENS, pinhole(COLOR_LENS, first.color)
         depth_camera = own_depth_camera(lens, pinhole(DEPTH_LENS, depths[first.name]), T_COLOR_DEPTH)
-        pairs = pairs.moved(lambda T: T @ invert_transform(T_COLOR_DEPTH))
-    return described(
+        pairs = move_poses(pairs, lambda T: T @ invert_transform(T_COLOR_DEPTH))
+    return describe(
         pairs,
         folder,
         options,
@@ -102,7 +108,7 @@ def read_frames(folder: Path, options: SourceOptions) -> Description:
 
 
 def _files(folder: Path, pattern: str, kind: str) -> dict[str, Path]:
-    paths = sorted(folder.glob(pattern), key=lambda p: by_numbers(p.relative_to(folder).as_posix()))
+    paths = sorted(folder.glob(pattern), key=lambda p: number_key(p.relative_to(folder).as_posix()))
     return {path.relative_to(folder).as_posix().partition(kind)[0]: path for path in paths}
 
 
@@ -127,20 +133,17 @@ def read_redwood(folder: Path, options: SourceOptions) -> Description:
     pairs = _pairs(list(colors), list(depths))
     poses = read_trajectory_log(trajectory)
     is_by_place = len(poses) == len(pairs)
-    return described(
-        Pairs(
-            path=trajectory,
-            views=[
-                ListedView(
-                    name=color,
-                    color=colors[color],
-                    depth=depths[depth],
-                    matrix=poses.get(str(place) if is_by_place else str(_number(color))),
-                )
-                for place, (color, depth) in enumerate(pairs)
-            ],
-            unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)),
-        ),
+    views = [
+        ListedView(
+            name=color,
+            color=colors[color],
+            depth=depths[depth],
+            matrix=poses.get(str(place) if is_by_place else str(_number(color))),
+        )
+        for place, (color, depth) in enumerate(pairs)
+    ]
+    return describe(
+        list_views(trajectory, views, len(colors), len(depths)),
         folder,
         options,
         poses=PosesTable(format="trajectory-log", file=trajectory.relative_to(folder).as_posix()),
@@ -151,10 +154,8 @@ def read_redwood(folder: Path, options: SourceOptions) -> Description:
 def _pairs(colors: list[str], depths: list[str]) -> list[tuple[str, str]]:
     """Pair equal names; else all in order; else equal first numbers."""
     same = [(name, name) for name in colors if name in depths]
-    if same:
-        return same
-    if len(colors) == len(depths):
-        return list(zip(colors, depths, strict=True))
+    if same or len(colors) == len(depths):
+        return same or list(zip(colors, depths, strict=True))
     by_number = {_number(name): name for name in depths}
     return [(name, by_number[_number(name)]) for name in colors if _number(name) in by_number]
 
@@ -168,16 +169,17 @@ def _redwood_lens(folder: Path) -> CameraTable:
     for file in (parent / name for parent in (folder, folder.parent) for name in INTRINSICS):
         if file.is_file():
             content = read_json(file)
-            try:
+            with refuse_faults(
+                partial("{}: expected width, height and intrinsic_matrix (9 numbers), got no {}".format, file),
+                KeyError,
+                TypeError,
+                ValueError,
+                remedy="write it with Open3D, or give --intrinsics camera=FX,FY,CX,CY",
+            ):
                 fx, _, _, _, fy, _, cx, cy, _ = (float(value) for value in content["intrinsic_matrix"])  # by columns
                 return CameraTable(
                     width=int(content["width"]), height=int(content["height"]), fx=fx, fy=fy, cx=cx, cy=cy
                 )
-            except (KeyError, TypeError, ValueError) as error:
-                raise InputError(
-                    f"{file}: expected width, height and intrinsic_matrix (9 numbers), got no {error}",
-                    remedy="write it with Open3D, or give --intrinsics camera=FX,FY,CX,CY",
-                ) from None
     raise InputError(
         f"{folder}: no {INTRINSICS[0]} in it or above it",
         remedy="give --intrinsics camera=FX,FY,CX,CY (Redwood's default: 525,525,319.5,239.5)",
@@ -188,7 +190,7 @@ ENTRIES = (
     Layout(
         name="7-Scenes",
         order=3,
-        matches=marked(*(f"{sequence}frame-*.pose.txt" for sequence in _SEQUENCES)),
+        matches=find_marks(*(f"{sequence}frame-*.pose.txt" for sequence in _SEQUENCES)),
         read=read_frames,
         docs="""
 7-Scenes | `frame-*.pose.txt`, also in `seq-*/` | of the depth camera | 1 mm, 65535 = none, registered to colour |
@@ -203,7 +205,7 @@ ENTRIES = (
     Layout(
         name="Open3D scene",
         order=9,
-        matches=marked(*(f"{color}/ depth/ {path}" for color in COLOR_FOLDERS for path in TRAJECTORIES)),
+        matches=find_marks(*(f"{color}/ depth/ {path}" for color in COLOR_FOLDERS for path in TRAJECTORIES)),
         read=read_redwood,
         docs="""
 Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.log` (`*_trajectory.log`,
@@ -214,8 +216,8 @@ Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.
     Layout(
         name="ScanNet export",
         order=2,
-        matches=marked(*(f"color/ depth/ pose/ {lens}" for lens in ("intrinsic/", "intrinsics_color.txt"))),
-        read=by_description("ScanNet export", "scannet.toml"),
+        matches=find_marks(*(f"color/ depth/ pose/ {lens}" for lens in ("intrinsic/", "intrinsics_color.txt"))),
+        read=ask_description("ScanNet export", "scannet.toml"),
         docs="""
 ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | by a
     [description](#datasets-by-description)
@@ -224,8 +226,8 @@ ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color
     Layout(
         name="ICL-NUIM",
         order=5,
-        matches=marked("rgb/ depth/ *.gt.freiburg"),
-        read=by_description("ICL-NUIM", "icl_nuim.toml"),
+        matches=find_marks("rgb/ depth/ *.gt.freiburg"),
+        read=ask_description("ICL-NUIM", "icl_nuim.toml"),
         docs="""
 ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description](#datasets-by-description)
 """,
@@ -233,8 +235,8 @@ ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description
     Layout(
         name="Replica",
         order=6,
-        matches=marked("traj.txt results/frame*", "traj_w_c.txt rgb/rgb_*"),
-        read=by_description("Replica", "replica_nice_slam.toml", "replica_semantic_nerf.toml"),
+        matches=find_marks("traj.txt results/frame*", "traj_w_c.txt rgb/rgb_*"),
+        read=ask_description("Replica", "replica_nice_slam.toml", "replica_semantic_nerf.toml"),
         docs="""
 Replica of NICE-SLAM or Semantic-NeRF | `traj.txt`, `results/frame*`; `traj_w_c.txt`, `rgb/rgb_*` | by a
     [description](#datasets-by-description)

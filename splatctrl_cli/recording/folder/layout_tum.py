@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     DepthTable,
@@ -31,20 +31,20 @@ from splatctrl_cli.recording.folder.folder_description import (
 )
 from splatctrl_cli.recording.folder.layout import (
     Layout,
-    described,
+    describe,
+    find_marks,
     images_of,
-    marked,
-    paired_by_stamp,
+    move_poses,
+    pair_stamps,
     pinhole,
     pose_or_none,
     read_K,
 )
-from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, rigid, stamp_of_text, tum_rows
+from splatctrl_cli.recording.folder.poses import read_numbers, rigid, stamp_of_text, trajectory, tum_rows
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 SCALE = 1.0 / 5000.0  # [m] per count
-
 
 SERIES: Mapping[str, tuple[tuple[float, float, float, float], tuple[float, ...]]] = {
     # pattern in the name: fx, fy, cx, cy; k1, k2, p1, p2, k3
@@ -57,12 +57,9 @@ SERIES: Mapping[str, tuple[tuple[float, float, float, float], tuple[float, ...]]
     ),
 }
 
-
 _BONN_T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
-
 _BONN_SCALE = 1.0593  # of the rotation below, as published
-
 
 _BONN_T_M = np.array(
     [
@@ -73,7 +70,6 @@ _BONN_T_M = np.array(
     ]
 )
 
-
 _BONN_NOTE = (
     "Bonn: poses are moved from the markers to the camera as its page says, without the scale of 1.059 in that"
     " transform; depth is as published (--depth-scale 2.1186e-4 scales it by as much)"
@@ -82,15 +78,15 @@ _BONN_NOTE = (
 
 def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
     """Describe pairs within the tolerance, with interpolated poses."""
-    colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
+    colors, depths = list_files(folder / "rgb.txt"), list_files(folder / "depth.txt")
     series = _series(folder)
     file = folder / "groundtruth.txt"
     rows = tum_rows(file) if file.is_file() else {}
-    trajectory, num_lost = Trajectory(rows), sum(T is None for T in rows.values())
+    num_lost = sum(T is None for T in rows.values())
     lost = (f"{file.name}: {num_lost} of {len(rows)} lines are no pose (nan)",) if num_lost else ()
-    pairs = paired_by_stamp(folder / "rgb.txt", colors, depths, trajectory.at, options)
-    return described(
-        pairs.moved(marker_to_camera) if series == "bonn" else pairs,
+    pairs = pair_stamps(folder / "rgb.txt", colors, depths, trajectory(rows), options)
+    return describe(
+        move_poses(pairs, marker_to_camera) if series == "bonn" else pairs,
         folder,
         options,
         poses=PosesTable(format="tum", file=file.name),
@@ -101,7 +97,7 @@ def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
     )
 
 
-def listed(path: Path) -> list[tuple[int, Path]]:
+def list_files(path: Path) -> list[tuple[int, Path]]:
     """Stamp [ns] and file of lines ``stamp path``."""
     found = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
@@ -115,7 +111,6 @@ def listed(path: Path) -> list[tuple[int, Path]]:
 
 
 def _series(folder: Path) -> str:
-    """The series, of `SERIES`, in the folder's name, or its lists' heads."""
     names = [folder.resolve().name]
     for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
         if (folder / file).is_file():
@@ -129,11 +124,11 @@ def _lens(folder: Path, series: str, image: ImageFile) -> CameraTable:
     calibration = folder / "calibration.txt"
     if calibration.is_file():
         values = read_numbers(calibration)
-        if len(values) != 4:
-            raise InputError(
-                f"{calibration}: expected fx fy cx cy, got {len(values)} numbers",
-                remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
-            )
+        refuse_if(
+            len(values) != 4,
+            f"{calibration}: expected fx fy cx cy, got {len(values)} numbers",
+            remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+        )
         return pinhole(values, image)
     if series:
         lens, distortion = SERIES[series]
@@ -156,8 +151,8 @@ def read_sun3d(folder: Path, options: SourceOptions) -> Description:
     extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
     poses = _poses(extrinsics[-1]) if extrinsics else []
     at = {stamp_ns: pose_or_none(poses[index]) for index, (stamp_ns, _) in enumerate(colors) if index < len(poses)}
-    return described(
-        paired_by_stamp(folder, colors, depths, at.get, options),
+    return describe(
+        pair_stamps(folder, colors, depths, at.get, options),
         folder,
         options,
         poses=PosesTable(format="matrix-rows", file="extrinsics/*.txt"),
@@ -174,8 +169,9 @@ def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
 
 def _poses(path: Path) -> list[Float64]:
     values = read_numbers(path)
-    if len(values) % 12:
-        raise InputError(f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again")
+    refuse_if(
+        len(values) % 12, f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again"
+    )
     rows = np.array(values).reshape(-1, 3, 4)
     return list(np.concatenate([rows, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))], axis=1))
 
@@ -184,7 +180,7 @@ ENTRIES = (
     Layout(
         name="TUM RGB-D",
         order=0,
-        matches=marked("rgb.txt depth.txt"),
+        matches=find_marks("rgb.txt depth.txt"),
         read=read_tum_folder,
         docs="""
 TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated | 1/5000 m, paired within 20 ms | by freiburg1,
@@ -199,7 +195,7 @@ ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
     Layout(
         name="SUN3D",
         order=8,
-        matches=marked("image/ depth/ extrinsics/ intrinsics.txt"),
+        matches=find_marks("image/ depth/ extrinsics/ intrinsics.txt"),
         read=read_sun3d,
         docs="""
 SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,

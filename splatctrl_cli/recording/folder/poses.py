@@ -11,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import POSE_TOLERANCE_NS
 from splatctrl_cli.config.ranges import MAX_PLACE
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.geometry import invert_transform, pose_at, quat_from_rotation, transform_from
 from splatctrl_cli.recording.log.registration import TfTree
 from splatctrl_cli.records import Float64
@@ -30,11 +30,9 @@ _CORRECT = "correct the file, or [poses] where a .toml names it"
 def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
     """T_world_camera (4, 4), optical, of a file's matrix. Raises InputError if not rigid."""
     T = rigid(matrix, where)
-    if convention == "world_to_camera":
-        T = invert_transform(T)
-    if axes == "left-handed":
-        return MIRROR @ T @ MIRROR
-    return T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
+    T = invert_transform(T) if convention == "world_to_camera" else T
+    T = T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
+    return MIRROR @ T @ MIRROR if axes == "left-handed" else T
 
 
 def rigid(matrix: Float64, where: str) -> Float64:
@@ -43,14 +41,15 @@ def rigid(matrix: Float64, where: str) -> Float64:
     Raises InputError for scale, shear, mirror or NaN.
     """
     is_finite = matrix.shape == (4, 4) and bool((np.abs(matrix) < MAX_PLACE).all())
-    if not is_finite or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW:
-        raise InputError(
-            f"{where}: expected a rigid transform (4x4), got one with scale, shear or NaN",
-            remedy="correct the matrix",
-        )
+    refuse_if(
+        not is_finite or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW,
+        f"{where}: expected a rigid transform (4x4), got one with scale, shear or NaN",
+        remedy="correct the matrix",
+    )
     U, _, Vt = np.linalg.svd(matrix[:3, :3])
-    if np.linalg.det(U @ Vt) < 0:
-        raise InputError(f"{where}: expected a rotation, got a mirror image", remedy="check [poses] axes")
+    refuse_if(
+        np.linalg.det(U @ Vt) < 0, f"{where}: expected a rotation, got a mirror image", remedy="check [poses] axes"
+    )
     return pose_at(matrix[:3, 3], U @ Vt)
 
 
@@ -72,8 +71,11 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
     for index in range(0, len(lines), 5):
         where = f"{path}: pose {index // 5}"
         head = lines[index].split()
-        if len(head) != 3 or not head[0].isdigit():
-            raise InputError(f"{where}: expected three integers, got {lines[index]!r}", remedy=_CORRECT)
+        refuse_if(
+            len(head) != 3 or not head[0].isdigit(),
+            f"{where}: expected three integers, got {lines[index]!r}",
+            remedy=_CORRECT,
+        )
         poses[str(int(head[0]))] = _matrix(lines[index + 1 : index + 5], where)
     return poses
 
@@ -82,15 +84,14 @@ def tum_rows(path: Path) -> dict[str, Float64 | None]:
     """Read ``stamp tx ty tz qx qy qz qw`` by stamp [s]; None for NaN."""
     poses: dict[str, Float64 | None] = {}
     for where, words, values in read_rows(path):
-        if len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any():
-            poses[words[0]] = None
-            continue
-        is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_PLACE).all())
-        if not is_pose or not any(values[4:]):
-            raise InputError(
-                f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}", remedy=_CORRECT
-            )
-        poses[words[0]] = transform_from(values[1:4], values[4:8])
+        is_lost = len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any()
+        is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_PLACE).all()) and any(values[4:])
+        refuse_if(
+            not is_lost and not is_pose,
+            f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}",
+            remedy=_CORRECT,
+        )
+        poses[words[0]] = None if is_lost else transform_from(values[1:4], values[4:8])
     return poses
 
 
@@ -98,10 +99,11 @@ def read_matrix_lines(path: Path) -> dict[str, Float64]:
     """A 4x4 or 3x4 (KITTI) matrix per line, by number from 0."""
     poses: dict[str, Float64] = {}
     for where, _, values in read_rows(path):
-        if len(values) not in {12, 16}:
-            raise InputError(
-                f"{where}: expected the 16 or 12 numbers of a matrix, got {len(values)}", remedy=_CORRECT
-            )
+        refuse_if(
+            len(values) not in {12, 16},
+            f"{where}: expected the 16 or 12 numbers of a matrix, got {len(values)}",
+            remedy=_CORRECT,
+        )
         poses[str(len(poses))] = np.array([*values, 0.0, 0.0, 0.0, 1.0][:16]).reshape(4, 4)
     return poses
 
@@ -120,8 +122,9 @@ def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
         content = json.loads(path.read_text(encoding="utf-8"))
         matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
     for name, matrix in matrices.items():
-        if matrix.shape != (4, 4):
-            raise InputError(f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy=_CORRECT)
+        refuse_if(
+            matrix.shape != (4, 4), f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy=_CORRECT
+        )
     return content, matrices
 
 
@@ -131,35 +134,32 @@ def read_matrix_file(path: Path) -> Float64:
 
 
 def read_numbers(path: Path) -> list[float]:
-    """All numbers of a text file, in order."""
     return [value for line in _lines(path) if not line.startswith("#") for value in _numbers(line.split(), str(path))]
 
 
-class Trajectory:
-    """A camera's poses by stamp [s, as text], interpolated like tf, never across None."""
+def trajectory(poses: Mapping[str, Float64 | None]) -> Callable[[int], Float64 | None]:
+    """A camera's T_world_camera (4, 4) at any stamp [ns], from poses by stamp [s, as text]; None where unknown.
 
-    def __init__(self, poses: Mapping[str, Float64 | None]) -> None:
-        self._tree = TfTree()
-        known, lost = [], []
-        for text, T in poses.items():
-            stamp_ns = stamp_of_text(text)
-            if stamp_ns is not None and T is not None:
-                known.append(stamp_ns)
-                self._tree.add("world", "camera", stamp_ns, T[:3, 3], quat_from_rotation(T[:3, :3]), static=False)
-            elif stamp_ns is not None:
-                lost.append(stamp_ns)
-        self._known, self._lost = np.array(sorted(known), dtype=np.int64), np.array(sorted(lost), dtype=np.int64)
+    Poses are interpolated like tf, never across None.
+    """
+    tree, known, lost = TfTree(), list[int](), list[int]()
+    for text, T in poses.items():
+        stamp_ns = stamp_of_text(text)
+        if stamp_ns is not None:
+            (lost if T is None else known).append(stamp_ns)
+        if stamp_ns is not None and T is not None:
+            tree.add("world", "camera", stamp_ns, T[:3, 3], quat_from_rotation(T[:3, :3]), static=False)
+    known_ns, lost_ns = np.array(sorted(known), dtype=np.int64), np.array(sorted(lost), dtype=np.int64)
 
-    def at(self, stamp_ns: int) -> Float64 | None:
-        """T_world_camera (4, 4); None where the trajectory does not reach."""
-        after = np.searchsorted(self._known, stamp_ns)
-        is_known = after < len(self._known) and self._known[after] == stamp_ns
-        before = self._known[after : after + 1] if is_known else self._known[max(after - 1, 0) : after]
-        later = self._known[after : after + 1]
-        first, last = (part[0] if len(part) else stamp_ns for part in (before, later))
-        if ((self._lost >= first) & (self._lost <= last)).any():
-            return None
-        return self._tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
+    def pose_at_stamp(stamp_ns: int) -> Float64 | None:
+        after = np.searchsorted(known_ns, stamp_ns)
+        is_known = after < len(known_ns) and known_ns[after] == stamp_ns
+        before = known_ns[after : after + 1] if is_known else known_ns[max(after - 1, 0) : after]
+        first, last = (part[0] if len(part) else stamp_ns for part in (before, known_ns[after : after + 1]))
+        is_lost = ((lost_ns >= first) & (lost_ns <= last)).any()
+        return None if is_lost else tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
+
+    return pose_at_stamp
 
 
 def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
@@ -180,23 +180,21 @@ READERS: dict[str, Callable[[Path], dict[str, Float64]]] = {
 
 
 def _lines(path: Path) -> list[str]:
-    try:
+    with (
+        refuse_faults(lambda error: f"{path}: {error.strerror}", OSError, remedy="check [poses] file and root"),
+        refuse_faults(lambda _: f"{path}: not a text file", UnicodeDecodeError, remedy="check [poses] file"),
+    ):
         return [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}", remedy="check [poses] file and root") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file", remedy="check [poses] file") from None
 
 
 def _matrix(lines: list[str], where: str) -> Float64:
     rows = [_numbers(line.split(), where) for line in lines]
-    if len(rows) != 4 or any(len(row) != 4 for row in rows):
-        raise InputError(f"{where}: expected a 4x4 matrix", remedy=_CORRECT)
+    refuse_if(
+        len(rows) != 4 or any(len(row) != 4 for row in rows), f"{where}: expected a 4x4 matrix", remedy=_CORRECT
+    )
     return np.array(rows)
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
-    try:
+    with refuse_faults(lambda _: f"{where}: expected numbers, got {' '.join(words)!r}", ValueError, remedy=_CORRECT):
         return [np.nan if _MSVC_NAN.fullmatch(word) else float(word) for word in words]
-    except ValueError:
-        raise InputError(f"{where}: expected numbers, got {' '.join(words)!r}", remedy=_CORRECT) from None

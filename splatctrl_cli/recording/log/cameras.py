@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.formats.image_file import JPEG
 from splatctrl_cli.libraries import is_installed
-from splatctrl_cli.recording.container.log_formats import told_formats
+from splatctrl_cli.recording.container.log_formats import read_formats
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import (
     CAMERA_INFO,
@@ -28,13 +28,14 @@ from splatctrl_cli.recording.log.decoder import (
     is_ros,
     stamp_ns,
 )
-from splatctrl_cli.recording.log.messages import DEPTH, is_other, word_of
+from splatctrl_cli.recording.log.messages import DEPTH, GRAY, OTHERS, word_of
 from splatctrl_cli.recording.log.registration import is_distorted, lens_model
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.recording.log.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video
-from splatctrl_cli.recording.source_options import CameraTopics, PoseTopic, SourceOptions
+from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.records import Float64
 
+_REGISTERED = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")  # in names of depth topics
 _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 
 
@@ -48,11 +49,10 @@ def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
 
 
 def _unlike(topic: TopicSurvey) -> str:
-    """The word in a name that contradicts the image kind."""
     image, parts = topic.image, _parts(topic.topic.name)
     if image.kind == "depth":
         word = word_of(parts) or word_of((image.frame_id,))
-        return word if is_other(word) else ""
+        return word if word in OTHERS else ""
     word = word_of(parts, is_device=False)
     return word if image.kind == "color" and word == DEPTH else ""
 
@@ -82,7 +82,7 @@ def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraT
         taken.update(c.topic.name for c in free)
         color = min(free, key=_color_rank)
         cameras.append(_camera(survey, namespace, color, groups[namespace]))
-    return _with_unique_names(cameras)
+    return _name_cameras(cameras)
 
 
 def _camera(
@@ -95,7 +95,7 @@ def _camera(
         [(depth, find_info(survey, depth, namespace)) for depth in depths],
         key=lambda item: (
             not is_registered(survey, color.topic.name, item[0].topic.name, info, item[1]),
-            not _says_registered(item[0].topic.name),
+            not any(word in item[0].topic.name for word in _REGISTERED),
             item[0].topic.type_name == COMPRESSED_IMAGE,
             item[0].topic.name,
         ),
@@ -134,8 +134,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
         info_folder = _parts(info.topic.name)[:-1]
         shared = len(common_prefix(info.topic.name, image.topic.name))
         is_near = shared > level or info_folder in {folder, folder[:level]}
-        is_same_view = view == (calibration.frame_id, calibration.width, calibration.height) and view[0] != ""
-        if is_near or is_same_view:
+        if is_near or (view == (calibration.frame_id, calibration.width, calibration.height) and view[0] != ""):
             found.append((-shared, len(info_folder), info.topic.name))
     return min(found)[2] if found else ""
 
@@ -143,12 +142,11 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
     """True if depth is on colour pixels: equal size, frame (or name), K and distortion."""
     color_image, depth_image = survey.topics[color].image, survey.topics[depth].image
-    if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
-        return False
+    is_other_size = (color_image.width, color_image.height) != (depth_image.width, depth_image.height)
     T_color_depth = survey.realsense.T_between(color, depth)
-    if T_color_depth is not None and not np.allclose(T_color_depth, np.eye(4), atol=1e-6):
-        return False
-    if frame_of(survey, color, depth) != depth_image.frame_id and not _says_registered(depth):
+    is_moved = T_color_depth is not None and not np.allclose(T_color_depth, np.eye(4), atol=1e-6)
+    is_other_frame = frame_of(survey, color, depth) != depth_image.frame_id
+    if is_other_size or is_moved or (is_other_frame and not any(word in depth for word in _REGISTERED)):
         return False
     calibration = survey.topics[info].calibration if info else None
     depth_calibration = survey.topics[depth_info].calibration if depth_info else None
@@ -181,14 +179,15 @@ def common_prefix(name: str, other: str) -> tuple[str, ...]:
     return tuple(a for a, _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def _says_registered(topic: str) -> bool:
-    return any(word in topic for word in ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb"))
-
-
 def _color_rank(topic: TopicSurvey) -> tuple[bool, bool, bool, bool, str]:
     name = topic.topic.name
-    is_infrared = any(part.startswith(("infra", "ir")) for part in _parts(name))
-    return (topic.image.is_gray, is_infrared, "rect" not in name, topic.topic.type_name == COMPRESSED_IMAGE, name)
+    return (
+        topic.image.encoding in GRAY,
+        any(part.startswith(("infra", "ir")) for part in _parts(name)),
+        "rect" not in name,
+        topic.topic.type_name == COMPRESSED_IMAGE,
+        name,
+    )
 
 
 def _parts(name: str) -> tuple[str, ...]:
@@ -196,13 +195,15 @@ def _parts(name: str) -> tuple[str, ...]:
     return parts[:-1] if len(parts) > 1 and parts[-1] in {"compressed", "compressedDepth"} else parts
 
 
-def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
+def _name_cameras(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
     """Name cameras by the namespace's last part if unique, else all of it.
 
     Names are folders: other characters than letters, digits, ``_``, ``-``, ``.`` become ``_``.
     """
-    short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
-    long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
+    short, long = (
+        [re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:80] or "camera" for name in names]
+        for names in ([c.name.rpartition("/")[2] for c in cameras], [c.name.replace("/", "_") for c in cameras])
+    )
     names = [name if short.count(name) == 1 else long[i] for i, name in enumerate(short)]
     named = [
         replace(camera, name=name if names.count(name) == 1 else f"{name}_{i}")
@@ -211,62 +212,66 @@ def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
     return tuple(sorted(named, key=lambda camera: camera.name))
 
 
-def _folder_name(name: str) -> str:
-    return re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:80] or "camera"
-
-
 def no_camera(log: RawLog, survey: Survey) -> InputError:
-    """The error for a log without matching colour and depth."""
-    colors = [t.topic.name for t in image_topics(survey, "color")]
-    depths = [t.topic.name for t in image_topics(survey, "depth")]
+    colors, depths = ([t.topic.name for t in image_topics(survey, kind)] for kind in ("color", "depth"))
     broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
-    rgbd = [t for t in survey.topics.values() if t.count and t.topic.type_name.rpartition("/")[2].startswith("RGBD")]
-    if rgbd and not (colors and depths):
-        return InputError(
-            f"{log.path}: colour and depth are in one message, which is not read: {rgbd[0].topic.type_name} on"
-            f" {rgbd[0].topic.name}",
-            remedy="record the camera's own topics instead: colour and aligned depth images, their camera_info, tf",
-        )
-    named = _named_unlike(survey)
-    if not depths and (colors or named):
-        chosen = "; if one of these is depth, give --camera NAME=COLOR,DEPTH" if "(named " in named else ""
-        unread = "".join(f"; {note}" for note in survey.damage.remarks if any(name in note for name in broken))
-        return InputError(
-            f"{log.path}: no depth topic{named}{unread}; colour topics there: {listed(colors)}",
-            remedy="record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)"
-            f"{chosen}",
-        )
-    videos = sorted(t.topic.name for t in survey.topics.values() if t.count and is_video(t.topic))
-    if videos and not colors:
-        return _unread_video(f"{log.path}: colour is video ({', '.join(videos)})", has_depth=bool(depths))
-    lost = next((note for note in survey.damage.notes if KEY_FRAME in note), "")
-    if lost and not colors:
-        return InputError(f"{log.path}: no image of the video can be decoded ({lost})", remedy=OFTENER)
-    if broken:
-        notes = survey.damage.all_notes
-        why = next((note for note in notes if "image" in note or broken[0] in note), "see `splatctrl info`")
-        return InputError(
-            f"{log.path}: no image of {listed(broken)} can be decoded ({why.removeprefix(f'{broken[0]}: ')})",
-            remedy="record raw images, JPEG or PNG; decode video to images first",
-        )
-    if depths and not colors:
-        return InputError(
-            f"{log.path}: no colour topic{named}; depth topics there: {listed(depths)}",
-            remedy="record the colour images",
-        )
     topics = [t.topic for t in survey.topics.values() if t.count]
-    kinds = sorted({_kind(topic) for topic in topics})
-    formats = told_formats(log.path) or {topic.encoding for topic in topics}
-    alien = sorted(formats - set(_ENCODINGS))
-    if alien and len(alien) == len(formats):
-        return InputError(
-            f"{log.path}: expected messages in {', '.join(_ENCODINGS)}, got {', '.join(alien)}: {listed(kinds)}",
-            remedy="convert the log, for example with `ros2 bag convert`",
-        )
-    return InputError(
-        f"{log.path}: no image topics; message types there: {listed(kinds)}",
-        remedy="expected sensor_msgs Image or CompressedImage",
+    rgbd = [f"{t.type_name} on {t.name}" for t in topics if t.type_name.rpartition("/")[2].startswith("RGBD")]
+    named, first = _named_unlike(survey), "".join(broken[:1])
+    chosen = "; if one of these is depth, give --camera NAME=COLOR,DEPTH" if "(named " in named else ""
+    unread = "".join(f"; {note}" for note in survey.damage.remarks if any(name in note for name in broken))
+    videos = ", ".join(sorted(topic.name for topic in topics if is_video(topic)))
+    lacks = "" if depths else "; and there is no depth topic"
+    codec, to_images = (
+        "which is neither H.264 nor H.265",
+        "`ros2 run image_transport republish` for ROS topics, else ffmpeg",
     )
+    lost = next((note for note in survey.damage.notes if KEY_FRAME in note), "")
+    why = next((note for note in survey.damage.all_notes if "image" in note or first in note), "see `splatctrl info`")
+    kinds = listed(sorted({_kind(topic) for topic in topics}))
+    formats = read_formats(log.path) or {topic.encoding for topic in topics}
+    alien = sorted(formats - set(_ENCODINGS))
+    reasons = [
+        (
+            rgbd and not (colors and depths),
+            f"colour and depth are in one message, which is not read: {''.join(rgbd[:1])}",
+            "record the camera's own topics instead: colour and aligned depth images, their camera_info, tf",
+        ),
+        (
+            not depths and (colors or named),
+            f"no depth topic{named}{unread}; colour topics there: {listed(colors)}",
+            f"record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without){chosen}",
+        ),
+        (
+            videos and not colors and not is_installed(LIBRARY),
+            f"colour is video ({videos}), for which the library {LIBRARY} is not installed{lacks}",
+            f"pip install 'splatctrl-cli[{EXTRA}]'",
+        ),
+        (
+            videos and not colors,
+            f"colour is video ({videos}), {codec}{lacks}",
+            f"decode it to images first: {to_images}",
+        ),
+        (lost and not colors, f"no image of the video can be decoded ({lost})", OFTENER),
+        (
+            broken,
+            f"no image of {listed(broken)} can be decoded ({why.removeprefix(f'{first}: ')})",
+            "record raw images, JPEG or PNG; decode video to images first",
+        ),
+        (
+            depths and not colors,
+            f"no colour topic{named}; depth topics there: {listed(depths)}",
+            "record the colour images",
+        ),
+        (
+            alien and len(alien) == len(formats),
+            f"expected messages in {', '.join(_ENCODINGS)}, got {', '.join(alien)}: {kinds}",
+            "convert the log, for example with `ros2 bag convert`",
+        ),
+        (True, f"no image topics; message types there: {kinds}", "expected sensor_msgs Image or CompressedImage"),
+    ]
+    what, remedy = next((what, remedy) for is_so, what, remedy in reasons if is_so)
+    return InputError(f"{log.path}: {what}", remedy=remedy)
 
 
 def _named_unlike(survey: Survey) -> str:
@@ -281,19 +286,6 @@ def _named_unlike(survey: Survey) -> str:
     return f"; neither depth nor colour: {listed(found)}" if found else ""
 
 
-def _unread_video(what: str, *, has_depth: bool) -> InputError:
-    lacks = "" if has_depth else "; and there is no depth topic"
-    if not is_installed(LIBRARY):
-        return InputError(
-            f"{what}, for which the library {LIBRARY} is not installed{lacks}",
-            remedy=f"pip install 'splatctrl-cli[{EXTRA}]'",
-        )
-    return InputError(
-        f"{what}, which is neither H.264 nor H.265{lacks}",
-        remedy="decode it to images first: `ros2 run image_transport republish` for ROS topics, else ffmpeg",
-    )
-
-
 def listed(names: Sequence[str]) -> str:
     """Up to eight names, then how many more."""
     shown = ", ".join(names[:8]) or "none"
@@ -301,7 +293,6 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _kind(topic: Topic) -> str:
-    """The message type, with an encoding that is not ROS."""
     name = topic.schema or topic.type_name
     return name if is_ros(topic) and name else f"{name} ({topic.encoding})".strip()
 
@@ -330,10 +321,10 @@ def join_pose_topics(
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}
-    children = {
-        given.topic: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()
-    } or _odometries(log, survey, options, set(frames.values()))
-    for topic, child in children.items():
+    for topic, child in (
+        {given[0]: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()}
+        or _odometries(log, survey, options, set(frames.values()))
+    ).items():
         _add(log, survey, topic, child, only_first=only_first)
 
 
@@ -341,32 +332,32 @@ def pose_topics(survey: Survey) -> list[str]:
     return [topic.topic.name for topic in survey.of_type(*POSE_TYPES)]
 
 
-def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame: str) -> str:
-    """The posed frame. Raises InputError if it does not place the camera."""
-    where = f"{log.path}: --camera-pose {camera}={given.topic}"
-    if given.topic not in pose_topics(survey):
-        raise InputError(
-            f"{where}: no poses on that topic",
-            remedy=f"expected {', '.join(name.rpartition('/')[2] for name in POSE_TYPES)}; pose topics there:"
-            f" {', '.join(pose_topics(survey)) or 'none'}",
-        )
-    _, first_child, *_ = next(_poses(log, survey, given.topic, Damage()), ("", ""))
-    child = given.frame or first_child or frame
+def _child_of(log: RawLog, survey: Survey, camera: str, given: tuple[str, str], frame: str) -> str:
+    topic, posed = given
+    where = f"{log.path}: --camera-pose {camera}={topic}"
+    refuse_if(
+        topic not in pose_topics(survey),
+        f"{where}: no poses on that topic",
+        remedy=f"expected {', '.join(name.rpartition('/')[2] for name in POSE_TYPES)}; pose topics there:"
+        f" {', '.join(pose_topics(survey)) or 'none'}",
+    )
+    _, first_child, *_ = next(_poses(log, survey, topic, Damage()), ("", ""))
+    child = posed or first_child or frame
     tf = survey.tf
-    if child != frame and not tf.connects(child, frame):
-        raise InputError(
-            f"{where}: poses frame {child!r}, which tf does not join to the camera's frame {frame!r}",
-            remedy=f"record /tf_static, or give --camera-pose {camera}={given.topic}@{frame} if it poses the camera",
-        )
-    if tf.root_of(child) != child:
-        raise InputError(
-            f"{where}: tf has frame {child!r} in {tf.root_of(child)!r} already", remedy="leave the option out"
-        )
+    refuse_if(
+        child != frame and not tf.connects(child, frame),
+        f"{where}: poses frame {child!r}, which tf does not join to the camera's frame {frame!r}",
+        remedy=f"record /tf_static, or give --camera-pose {camera}={topic}@{frame} if it poses the camera",
+    )
+    refuse_if(
+        tf.root_of(child) != child,
+        f"{where}: tf has frame {child!r} in {tf.root_of(child)!r} already",
+        remedy="leave the option out",
+    )
     return child
 
 
 def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set[str]) -> dict[str, str]:
-    """Frames by the odometry that alone places them."""
     known = set(survey.tf.frames)
     found: dict[str, str] = {}
     for topic in survey.of_type(ODOMETRY):
@@ -383,11 +374,11 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
             )
     for child in sorted(set(found.values())):
         topics = sorted(name for name, posed in found.items() if posed == child)
-        if len(topics) > 1:
-            raise InputError(
-                f"{log.path}: {len(topics)} odometries place frame {child!r}: {', '.join(topics)}",
-                remedy=f"choose one with --camera-pose NAME={topics[0]}",
-            )
+        refuse_if(
+            len(topics) > 1,
+            f"{log.path}: {len(topics)} odometries place frame {child!r}: {', '.join(topics)}",
+            remedy=f"choose one with --camera-pose NAME={topics[0]}",
+        )
     for name, child in found.items():
         survey.tf.note(f"poses of frame {child!r} are those of {name}: tf does not say where it is")
     return found
@@ -396,8 +387,9 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
 def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: bool) -> None:
     if survey.tf.root_of(child) != child:
         return  # added before
-    poses = _poses(log, survey, topic, survey.damage)
-    for parent, _, stamp, position, quat_xyzw in islice(poses, 1 if only_first else None):
+    for parent, _, stamp, position, quat_xyzw in islice(
+        _poses(log, survey, topic, survey.damage), 1 if only_first else None
+    ):
         try:
             survey.tf.add(parent, child, stamp, position, quat_xyzw, static=False, holds=only_first)
         except ValueError as error:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.geometry import invert_transform, transform_from
 from splatctrl_cli.recording.container.foxglove import DEFINITIONS, TEXT, as_ros, read_foxglove
 from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
@@ -55,12 +55,10 @@ class UnreadFormError(UndecodableMessageError):
 
 
 def is_ros(topic: Topic) -> bool:
-    """True for ROS encodings, or messages that stand for ROS."""
     return topic.encoding in {"cdr", "ros1", VIDEO} or is_foxglove(topic)
 
 
 def is_foxglove(topic: Topic) -> bool:
-    """True for protobuf or JSON that stands for ROS."""
     return topic.schema != "" and topic.encoding in {"protobuf", "json"}
 
 
@@ -75,18 +73,28 @@ class MessageDecoder:
         """Decode to an object with fields. Raises UndecodableMessageError."""
         topic = message.topic
         if topic.encoding == VIDEO:
-            return _unpack_image(message.data)
+            _, seconds, nanoseconds, height, width, length = _IMAGE_HEAD.unpack_from(message.data)
+            start, stamp = _IMAGE_HEAD.size + length, SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+            return SimpleNamespace(
+                header=SimpleNamespace(stamp=stamp, frame_id=message.data[_IMAGE_HEAD.size : start].decode()),
+                height=height,
+                width=width,
+                encoding="rgb8",
+                is_bigendian=0,
+                step=3 * width,
+                data=np.frombuffer(message.data, np.uint8, offset=start),
+            )
         store = None if is_foxglove(topic) else self._store(topic)
-        try:
+        with refuse_faults(
+            f"{topic.name}: a {topic.schema or topic.type_name} that does not decode",
+            Exception,
+            error=UndecodableMessageError,
+        ):  # generated code over foreign bytes: there is no list of what it raises
             if store is None:
                 return read_foxglove(topic.schema, topic.encoding, topic.definition, message.data)
             read = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
             decoded = read(message.data[:-4] if has_unit(message) else message.data, topic.schema or topic.type_name)
             return as_ros(topic.schema, decoded) if topic.schema else decoded
-        except Exception as error:  # generated code over foreign bytes: there is no list of what it raises
-            raise UndecodableMessageError(
-                f"{topic.name}: a {topic.schema or topic.type_name} that does not decode: {error}"
-            ) from None
 
     def _store(self, topic: Topic) -> Any:
         if topic not in self._stores and topic not in self._refused:
@@ -113,10 +121,9 @@ def header_stamp_ns(message: RawMessage) -> int:
         return stamp_ns(MessageDecoder().decode(message).header)
     start = 0 if message.topic.schema and message.topic.encoding == "ros1" else 4  # foxglove_msgs have no `seq`
     is_little = message.topic.encoding == "ros1" or message.data[1:2] in {b"\x01", b"\x03", b"\x07", b"\x09"}
-    try:
+    damage = f"{message.topic.name}: a message of {len(message.data)} bytes"
+    with refuse_faults(lambda _: damage, struct.error, error=UndecodableMessageError):
         seconds, nanoseconds = struct.unpack_from("<iI" if is_little else ">iI", message.data, start)
-    except struct.error:
-        raise UndecodableMessageError(f"{message.topic.name}: a message of {len(message.data)} bytes") from None
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
@@ -125,20 +132,6 @@ def pack_image(header: Any, pixels: NDArray[np.uint8]) -> bytes:
     frame, (height, width) = header.frame_id.strip("/").encode(), pixels.shape[:2]
     head = _IMAGE_HEAD.pack(b"\0\1\0\0", header.stamp.sec, header.stamp.nanosec, height, width, len(frame))
     return bytes(head + frame + pixels.tobytes())
-
-
-def _unpack_image(data: bytes) -> Any:
-    _, seconds, nanoseconds, height, width, length = _IMAGE_HEAD.unpack_from(data)
-    start, stamp = _IMAGE_HEAD.size + length, SimpleNamespace(sec=seconds, nanosec=nanoseconds)
-    return SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp, frame_id=data[_IMAGE_HEAD.size : start].decode()),
-        height=height,
-        width=width,
-        encoding="rgb8",
-        is_bigendian=0,
-        step=3 * width,
-        data=np.frombuffer(data, np.uint8, offset=start),
-    )
 
 
 def stamp_ns(header: Any) -> int:
@@ -150,11 +143,13 @@ def _type_store(topic: Topic) -> Any:
         return _foxglove_store()
     if not topic.definition:
         return get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
-    if len(topic.definition) > _MOST_TEXT:  # it would take much memory or time to compile
-        raise ValueError(f"{len(topic.definition)} characters, at most {_MOST_TEXT} are read")
+    refuse_if(
+        len(topic.definition) > _MOST_TEXT,
+        f"{len(topic.definition)} characters, at most {_MOST_TEXT} are read",
+        error=ValueError,
+    )  # it would take much memory or time to compile
     largest = max((int("".join(sizes)[:12]) for sizes in _ARRAY.findall(topic.definition)), default=0)
-    if largest > _MOST_ITEMS:
-        raise ValueError(f"an array of {largest} items, at most {_MOST_ITEMS} are read")
+    refuse_if(largest > _MOST_ITEMS, f"an array of {largest} items, at most {_MOST_ITEMS} are read", error=ValueError)
     return _store_of(topic.definition, topic.definition_format, topic.schema or topic.type_name)
 
 
@@ -186,8 +181,11 @@ def _check_fields(store: Any) -> None:
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}
         for key, description in standard[name][1]:
-            if there.get(key) != _kind(description):
-                raise ValueError(f"{name} lacks the field {key} of the standard")
+            refuse_if(
+                there.get(key) != _kind(description),
+                f"{name} lacks the field {key} of the standard",
+                error=ValueError,
+            )
 
 
 @lru_cache(maxsize=1)
@@ -201,9 +199,7 @@ def _foxglove_store() -> Any:
 def _kind(description: Any) -> object:
     """A field's type without array, sequence and string lengths."""
     kind, detail = description
-    if kind == Nodetype.NAME:
-        return detail
-    return detail[0] if kind == Nodetype.BASE else [_kind(detail[0])]
+    return detail if kind == Nodetype.NAME else detail[0] if kind == Nodetype.BASE else [_kind(detail[0])]
 
 
 TRANSFORM, OPTION = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32"
@@ -228,8 +224,11 @@ class RealSense:
             t, r = message.translation, message.rotation
             quat_xyzw = np.array([r.x, r.y, r.z, r.w], dtype=np.float64)
             position = np.array([t.x, t.y, t.z], dtype=np.float64)
-            if not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quat_xyzw) < 2.0):
-                raise ValueError(f"{topic}: not a rigid transform")
+            refuse_if(
+                not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quat_xyzw) < 2.0),
+                f"{topic}: not a rigid transform",
+                error=ValueError,
+            )
             self.extrinsics.setdefault(extrinsics[1], {})[extrinsics[2]] = transform_from(position, quat_xyzw)
         elif units:
             self.depth_units[units[1]] = _unit(message.data, topic)
@@ -264,14 +263,12 @@ class RealSense:
 
 
 def has_unit(message: RawMessage) -> bool:
-    """True if a depth unit follows an SDK image."""
     topic = message.topic
     is_image = topic.encoding == "ros1" and topic.type_name == "sensor_msgs/msg/Image"
     return is_image and message.data[_AT : _AT + len(_FRAME_1)] == _FRAME_1 and device_of(topic.name) != ""
 
 
 def device_of(topic: str) -> str:
-    """An SDK topic's device, or ""."""
     match = _STREAM.match(topic)
     return match[1] if match else ""
 
@@ -279,8 +276,7 @@ def device_of(topic: str) -> str:
 def _unit(value: float, topic: str) -> float:
     """Metres per count; 0.001 was written as a float32."""
     unit = float(f"{float(value):.6g}")
-    if not 0 < unit < 1:
-        raise ValueError(f"{topic}: expected metres per count, got {unit}")
+    refuse_if(not 0 < unit < 1, f"{topic}: expected metres per count, got {unit}", error=ValueError)
     return unit
 
 

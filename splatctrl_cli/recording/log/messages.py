@@ -16,10 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.errors import refuse_faults, refuse_if, require
 from splatctrl_cli.formats.image_file import JPEG, PNG, decode_file, image_head
 from splatctrl_cli.recording.log.decoder import IMAGE, UndecodableMessageError, UnreadFormError, stamp_ns
 from splatctrl_cli.records import MILLIMETRE, Float32, UInt8
 
+GRAY = frozenset({"mono8", "8UC1"})  # colour images of one channel
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 BAYER = {  # OpenCV names a pattern by the second row's second and third pixel
     "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
@@ -109,11 +111,6 @@ class ImageMessage:
             return "depth"
         return "color" if self.encoding in COLOR_CONVERSIONS else "other"
 
-    @property
-    def is_gray(self) -> bool:
-        """True for a one-channel colour image."""
-        return self.encoding in {"mono8", "8UC1"}
-
     def unit(self, scale: float | None) -> float:
         """Metres per unit: `scale`, else 1 mm for counts, 1 m for floats (REP 118)."""
         return scale if scale is not None else MILLIMETRE if self.is_counts else 1.0
@@ -130,7 +127,7 @@ def read_image(message: Any, type_name: str, *, lazily: bool = False) -> ImageMe
     packed = _packed(message.format, bytes(message.data))
     if lazily and (found := _plain(packed)) is not None:
         encoding, size, color = found
-        return _image(message, encoding, size, partial(_decoded, packed, color=color), packed.file)
+        return _image(message, encoding, size, partial(_decode, packed, color=color), packed.file)
     pixels, encoding, compressed = _compressed_depth(packed) if packed.is_depth else _compressed_pixels(packed)
     return _image(message, encoding, pixels.shape, lambda: pixels, compressed, packed.remark)
 
@@ -166,7 +163,6 @@ class _Packed(NamedTuple):
 
     @property
     def recorded(self) -> str:
-        """Encoding before compression, if stated."""
         return self.form.partition(";")[0].strip()
 
     @property
@@ -182,16 +178,28 @@ def _packed(form: str, data: bytes) -> _Packed:
     says_depth, head, file = "compressedDepth" in form, data[:_DEPTH_HEAD], data[_DEPTH_HEAD:]
     plain, behind = _Packed(form, data), _Packed(form, file, True, head)
     if plain.recorded in DEPTH_ENCODINGS or says_depth:
-        if data.startswith(JPEG) or (says_depth and file.startswith(JPEG)):
-            raise UnreadFormError(f"depth in a JPEG ({form}): JPEG loses depth: record PNG")
-        if plain.is_rvl and not says_depth:
-            raise UnreadFormError(f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl")
+        refuse_if(
+            data.startswith(JPEG) or (says_depth and file.startswith(JPEG)),
+            f"depth in a JPEG ({form}): JPEG loses depth: record PNG",
+            error=UnreadFormError,
+        )
+        refuse_if(
+            plain.is_rvl and not says_depth,
+            f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl",
+            error=UnreadFormError,
+        )
     if says_depth and data.startswith(PNG):
-        if plain.recorded == "32FC1":
-            raise UnreadFormError(f"compressed depth ({form}): 32FC1 without the 12 bytes that say what a count is")
+        refuse_if(
+            plain.recorded == "32FC1",
+            f"compressed depth ({form}): 32FC1 without the 12 bytes that say what a count is",
+            error=UnreadFormError,
+        )
         return _Packed(form, data, True, remark=f"compressed depth ({form}): its PNG begins at byte 0, not 12")
-    if says_depth and not plain.is_rvl and not file.startswith(PNG) and _is_rvl(file):
-        raise UnreadFormError(f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl")
+    refuse_if(
+        says_depth and not plain.is_rvl and not file.startswith(PNG) and _is_rvl(file),
+        f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl",
+        error=UnreadFormError,
+    )
     if not says_depth and file.startswith(PNG):
         return behind._replace(remark=f"compressed image ({form}): a PNG behind 12 bytes, read as compressedDepth")
     return behind if says_depth else plain
@@ -218,12 +226,10 @@ def _plain(packed: _Packed) -> tuple[str, tuple[int, int], bool] | None:
     return ("mono8" if head.channels == 1 else "rgb8", size, head.channels != 1)
 
 
-def _decoded(packed: _Packed, *, color: bool) -> NDArray[Any]:
-    pixels = decode_file(packed.file, color=color)
-    if pixels is None:
-        what = f"compressed image ({packed.form}): {len(packed.file)} bytes that are not an image file"
-        raise (UndecodableMessageError if packed.file.startswith(_FILES) else UnreadFormError)(what)
-    return pixels
+def _decode(packed: _Packed, *, color: bool) -> NDArray[Any]:
+    what = f"compressed image ({packed.form}): {len(packed.file)} bytes that are not an image file"
+    error = UndecodableMessageError if packed.file.startswith(_FILES) else UnreadFormError
+    return require(decode_file(packed.file, color=color), what, error=error)
 
 
 def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
@@ -245,22 +251,27 @@ def raw_pixels(message: Any) -> NDArray[Any]:
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     name = f"image {width}x{height} {message.encoding}"
-    if message.encoding not in _LAYOUT and width * height > 1 << 31:
-        raise UndecodableMessageError(f"{name}: too large for an image")
+    refuse_if(
+        message.encoding not in _LAYOUT and width * height > 1 << 31,
+        f"{name}: too large for an image",
+        error=UndecodableMessageError,
+    )
     if message.encoding not in _LAYOUT:
         return np.zeros((height, width, 0), dtype=np.uint8)  # kind "other": described, never used
     if message.encoding == _NV24:
         return _nv24(message, name)
     channels, code = _LAYOUT[message.encoding]
     is_planar = message.encoding in _PLANAR
-    if is_planar and (width % 2 or height % 2):
-        raise UndecodableMessageError(f"{name}: expected even sizes")
+    refuse_if(is_planar and (width % 2 or height % 2), f"{name}: expected even sizes", error=UndecodableMessageError)
     num_rows = height * 3 // 2 if is_planar else height
     dtype = np.dtype((">" if message.is_bigendian else "<") + code)
     row = width * channels * dtype.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
-    if width == 0 or height == 0 or step < row or data.size < step * (num_rows - 1) + row:
-        raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
+    refuse_if(
+        width == 0 or height == 0 or step < row or data.size < step * (num_rows - 1) + row,
+        f"{name}: {data.size} bytes with a row step of {step} do not hold it",
+        error=UndecodableMessageError,
+    )
     step = row if num_rows == 1 else step  # a single row may announce any step: nothing follows it
     padded = np.zeros(step * num_rows, dtype=np.uint8)
     padded[: min(data.size, padded.size)] = data[: padded.size]
@@ -275,8 +286,11 @@ def _nv24(message: Any, name: str) -> UInt8:
     """RGB (H, W, 3), BT.601 limited range, as OpenCV's nv12."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
-    if not 0 < width * height * 3 == data.size or step not in {width, 2 * width, 3 * width}:
-        raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
+    refuse_if(
+        not 0 < width * height * 3 == data.size or step not in {width, 2 * width, 3 * width},
+        f"{name}: {data.size} bytes with a row step of {step} do not hold it",
+        error=UndecodableMessageError,
+    )
     y = data[: width * height].reshape(height, width).astype(np.float32)
     u, v = np.moveaxis(data[width * height :].reshape(height, width, 2).astype(np.float32) - 128.0, 2, 0)
     luma = 1.164 * (y - 16.0)
@@ -324,8 +338,8 @@ def metres(counts: NDArray[Any], scale: float) -> Float32:
 def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]:
     form, data, recorded = packed.form, packed.file, packed.recorded
     if data.startswith(JPEG) and (head := image_head(data)) is not None and head.channels == 3:
-        return _decoded(packed, color=True), "rgb8", data
-    pixels = _decoded(packed, color=False)
+        return _decode(packed, color=True), "rgb8", data
+    pixels = _decode(packed, color=False)
     if pixels.ndim == 2 and recorded in _MOSAICS and pixels.dtype == (np.uint8 if recorded in BAYER else np.uint16):
         return pixels, recorded, None  # a mosaic in a file: its bytes are not a colour image
     if pixels.ndim == 2 and pixels.dtype == np.uint16:
@@ -333,11 +347,12 @@ def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None
     if pixels.ndim == 2 and pixels.dtype == np.float32:  # TIFF, as compressed_image_transport stores 32FC1
         return pixels, "32FC1", None
     if pixels.ndim == 3 and (pixels.dtype != np.uint8 or pixels.shape[2] != 3):
-        return _decoded(packed, color=True), "rgb8", data
-    if pixels.dtype != np.uint8:
-        raise UndecodableMessageError(
-            f"compressed image ({form}): pixels of {pixels.dtype}, neither colour nor depth"
-        )
+        return _decode(packed, color=True), "rgb8", data
+    refuse_if(
+        pixels.dtype != np.uint8,
+        f"compressed image ({form}): pixels of {pixels.dtype}, neither colour nor depth",
+        error=UndecodableMessageError,
+    )
     return pixels, "mono8" if pixels.ndim == 2 else "bgr8", data
 
 
@@ -360,13 +375,14 @@ def _compressed_depth(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]
 
 
 def _rvl_counts(data: bytes) -> NDArray[np.uint16]:
-    try:
+    with refuse_faults("compressed depth", ValueError, struct.error, error=UndecodableMessageError):
         width, height = struct.unpack_from("<ii", data)
-        if not (width > 0 and height > 0 and width * height <= _MOST_PIXELS):
-            raise ValueError(f"RVL: an image of {width}x{height}")
+        refuse_if(
+            not (width > 0 and height > 0 and width * height <= _MOST_PIXELS),
+            f"RVL: an image of {width}x{height}",
+            error=ValueError,
+        )
         return decode_rvl(data[8:], width * height).reshape(height, width)
-    except (ValueError, struct.error) as error:
-        raise UndecodableMessageError(f"compressed depth: {error}") from None
 
 
 def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
@@ -391,8 +407,11 @@ def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
     image = np.zeros(num_pixels, dtype=np.uint16)
     coded = np.concatenate([numbers[first : first + length] for _, first, length in runs] or [numbers[:0]])
     depth = np.cumsum((coded >> 1) ^ -(coded & 1))
-    if depth.size and not (depth.min() >= 0 and depth.max() <= 65535):
-        raise ValueError("RVL: values outside 0 to 65535")
+    refuse_if(
+        depth.size and not (depth.min() >= 0 and depth.max() <= 65535),
+        "RVL: values outside 0 to 65535",
+        error=ValueError,
+    )
     start = 0
     for first_pixel, _, length in runs:
         image[first_pixel : first_pixel + length] = depth[start : start + length]
@@ -408,14 +427,13 @@ def _numbers(data: bytes) -> NDArray[np.int64]:
         return np.zeros(0, dtype=np.int64)
     starts = np.concatenate([[0], ends[:-1] + 1])
     place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
-    if place.max() > 10:  # a number of more than 33 bits
-        raise ValueError("RVL: a number of more than 33 bits")
+    refuse_if(place.max() > 10, "RVL: a number of more than 33 bits", error=ValueError)
     return np.asarray(np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << (3 * place), starts), dtype=np.int64)
 
 
 DEPTH = "depth"
 _COLORS = frozenset({"color", "colour", "rgb", "bgr"})
-_OTHERS = frozenset(
+OTHERS = frozenset(
     {
         *("ir", "infra", "infrared", "nir", "nearir", "swir", "lwir", "thermal", "aux", "mono", "gray", "grey"),
         *(
@@ -433,7 +451,7 @@ _OTHERS = frozenset(
         *("mask", "label", "labels", "segmentation", "semantic", "instance"),
     }
 )
-_WORDS = _OTHERS | _COLORS | {DEPTH}
+_WORDS = OTHERS | _COLORS | {DEPTH}
 _CAMERAS = frozenset({"camera", "cam"})  # words of parts that name a device, which may give more than depth
 
 
@@ -450,8 +468,3 @@ def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
         if found and (is_device or _CAMERAS.isdisjoint(words)):
             return DEPTH if found[-1].startswith(DEPTH) else found[-1]
     return ""
-
-
-def is_other(word: str) -> bool:
-    """True if 16-bit images so named are not depth."""
-    return word in _OTHERS

@@ -18,7 +18,7 @@ from splatctrl_cli.config.fixed import (
     TF_STILL_ROTATION,
     WIDEST_RAY,
 )
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.files.spilled_rows import RowFile
 from splatctrl_cli.geometry import (
     back_project,
@@ -28,7 +28,7 @@ from splatctrl_cli.geometry import (
     transform_points,
 )
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS
-from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics
 
 _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
@@ -110,8 +110,11 @@ class TfTree:
         not rigid (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
-        if not (np.isfinite(position).all() and 0.5 < float(np.linalg.norm(quat_xyzw)) < 2.0):
-            raise ValueError(f"transform {parent} -> {child} is not a rigid transform")
+        refuse_if(
+            not (np.isfinite(position).all() and 0.5 < float(np.linalg.norm(quat_xyzw)) < 2.0),
+            f"transform {parent} -> {child} is not a rigid transform",
+            error=ValueError,
+        )
         if child not in self._edges and child in self._ancestors(parent):
             self.note(f"tf: {parent} -> {child} would close a loop, as {child} is above {parent}; it is left out")
             return
@@ -134,7 +137,6 @@ class TfTree:
             self.note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
 
     def note(self, note: str) -> None:
-        """Note a remark once."""
         if note not in self.notes:
             self.notes.append(note)
 
@@ -148,7 +150,6 @@ class TfTree:
         return tuple(frame for frame in self.frames if frame not in self._edges)
 
     def root_of(self, frame: str) -> str:
-        """The topmost ancestor, perhaps itself."""
         return self._ancestors(frame)[-1]
 
     def span_ns(self, frame: str) -> tuple[int, int] | None:
@@ -157,7 +158,6 @@ class TfTree:
         return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None
 
     def connects(self, target: str, source: str) -> bool:
-        """True if edges join them."""
         return self.root_of(target.strip("/")) == self.root_of(source.strip("/"))
 
     def lookup(self, target: str, source: str, stamp_ns: int, tolerance_ns: int = 0) -> Float64 | None:
@@ -190,6 +190,7 @@ class TfTree:
 
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+_SEPARATORS = re.compile("[^a-z0-9]")
 _SAME_MODELS = {  # lower case, letters and digits alone: what others call them
     **dict.fromkeys(("plumbbob", "brownconrady", "radtan", "opencv"), "plumb_bob"),
     **dict.fromkeys(("rationalpolynomial", "rational"), "rational_polynomial"),
@@ -202,136 +203,108 @@ _PINHOLES = ("", "none", "pinhole", "perspective", "rectilinear", "inversebrownc
 
 def lens_model(name: str) -> str:
     """One of `DISTORTION_MODELS` for a driver's name, else unchanged."""
-    return _SAME_MODELS.get(_letters(name), name)
+    return _SAME_MODELS.get(_SEPARATORS.sub("", name.lower()), name)
 
 
 def is_distorted(model: str, coefficients: Float64) -> bool:
     """False for a pinhole; equidistant and unknown models always distort."""
-    is_radial = lens_model(model) in DISTORTION_MODELS[:2] or _letters(model) in _PINHOLES
+    is_radial = lens_model(model) in DISTORTION_MODELS[:2] or _SEPARATORS.sub("", model.lower()) in _PINHOLES
     return not is_radial or bool(np.any(np.abs(coefficients) > 1e-9))
 
 
-def _letters(name: str) -> str:
-    return re.sub("[^a-z0-9]", "", name.lower())
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lens:
+    """Corrections of a camera's images.
 
-
-@dataclass(frozen=True, kw_only=True)
-class DepthToColor:
-    """A warp of depth into another camera; undistortion: the depth lens's."""
-
-    depth_intrinsics: Intrinsics
-    color_intrinsics: Intrinsics
-    T_color_depth: Float64
-    undistortion: "Undistortion | None" = None
-
-    def warp(self, depth: Float32) -> Float32:
-        """Warp depth (H', W') [m] into the colour camera, (H, W) [m], 0 = none.
-
-        Each depth pixel covers its square's image, so finer colour pixels get no holes; the nearest wins.
-        """
-        target = self.color_intrinsics
-        depth = depth if self.undistortion is None else self.undistortion.nearest(depth)
-        x, y, z = transform_points(self.T_color_depth, back_project(self.depth_intrinsics, depth)[depth > 0]).T
-        front = z > 0
-        z = z[front]
-        u = target.fx * x[front] / z + target.cx
-        v = target.fy * y[front] / z + target.cy
-        half_u = 0.5 * max(1.0, target.fx / self.depth_intrinsics.fx)
-        half_v = 0.5 * max(1.0, target.fy / self.depth_intrinsics.fy)
-        first_u, first_v = np.ceil(u - half_u), np.ceil(v - half_v)
-        nearest, depths = np.full(target.height * target.width, np.inf, dtype=np.float32), z.astype(np.float32)
-        for dv in range(int(np.floor(2 * half_v)) + 1):
-            row = first_v + dv
-            is_row = (row < v + half_v) & (row >= 0) & (row < target.height)
-            for du in range(int(np.floor(2 * half_u)) + 1):
-                column = first_u + du
-                lands = is_row & (column < u + half_u) & (column >= 0) & (column < target.width)
-                pixels = (row[lands] * target.width + column[lands]).astype(np.int64)
-                np.minimum.at(nearest, pixels, depths[lands])
-        nearest[np.isinf(nearest)] = 0.0
-        return nearest.reshape(target.height, target.width)
-
-
-class Undistortion:
-    """A remap that removes lens distortion.
-
-    intrinsics: of the result. R (3, 3): the lens's axes to the result's. valid: (H, W), False where the lens saw
-    nothing, None if it saw all; there colour is black, depth and labels 0.
+    intrinsics: of the result. maps (H, W): column and row in the recorded image by pixel, None if images stay as
+    recorded. valid (H, W): False where the lens saw nothing, None if it saw all; there colour is black, depth and
+    labels 0. depth_lens, T_color_depth (4, 4): of depth's own camera, None for depth on colour's pixels.
     """
 
-    def __init__(
-        self,
-        intrinsics: Intrinsics,
-        model: str,
-        coefficients: Float64,
-        *,
-        lens: Intrinsics | None = None,
-        R: Float64 | None = None,
-    ) -> None:
-        R = np.eye(3) if R is None else R
-        counts = (4,) if model == "equidistant" else NUM_COEFFICIENTS
-        if len(coefficients) not in counts and not (len(coefficients) > 4 and not np.any(coefficients[4:])):
-            expected = ", ".join(map(str, counts))
-            raise InputError(
-                f"distortion model {model}: expected {expected} coefficients, got {len(coefficients)}",
-                remedy="calibrate again, or fill up with zeros",
-            )
-        self.intrinsics = intrinsics
-        self._map_u, self._map_v = _maps(lens or intrinsics, model, coefficients, R, intrinsics)
-        is_seen = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
-        is_seen &= (self._map_v >= 0) & (self._map_v <= intrinsics.height - 1)
-        x, y, z = np.moveaxis(back_project(intrinsics, np.ones((intrinsics.height, intrinsics.width))) @ R, 2, 0)
-        radii = np.where(
-            z > 0, np.hypot(x, y) / np.maximum(z, 1e-9), np.inf
-        )  # (H, W) from the axis, at a depth of one
-        r, bent = _bent(model, coefficients)
-        folds = np.flatnonzero(np.diff(bent) <= 0)  # beyond the first, the lens would show things twice
-        is_seen &= radii < (r[folds[0]] if folds.size else np.inf)
-        if is_seen.mean() < REGISTERED_SHARE:
-            raise InputError(
-                f"distortion {model} {np.round(coefficients, 6).tolist()}: the camera saw {is_seen.mean():.0%} of the"
-                f" pinhole's image, expected at least {REGISTERED_SHARE:.0%}",
-                remedy="correct the calibration, or undistort the images first",
-            )
-        self.valid = None if is_seen.all() else is_seen
-        self._map_u[~is_seen] = -10.0  # folded back into the image, or outside of it
-
-    def color(self, image: UInt8) -> UInt8:
-        """Undistort (H, W, 3), interpolated."""
-        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_LINEAR), dtype=np.uint8)
-
-    def nearest(self, image: NDArray[_Pixel]) -> NDArray[_Pixel]:
-        """Undistort labels or depth (H, W), nearest pixel."""
-        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=image.dtype)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lens:
-    """Image corrections; intrinsics: of the result."""
-
     intrinsics: Intrinsics
-    undistortion: Undistortion | None = None
-    depth_to_color: DepthToColor | None = None
+    maps: tuple[Float32, Float32] | None = None
+    valid: Bool | None = None
+    depth_lens: "Lens | None" = None
+    T_color_depth: Float64 | None = None
 
-    def color(self, image: UInt8) -> UInt8:
-        """Undistort (H, W, 3)."""
-        return image if self.undistortion is None else self.undistortion.color(image)
-
-    def labels(self, image: UInt8) -> UInt8:
-        """Undistort (H, W)."""
-        return image if self.undistortion is None else self.undistortion.nearest(image)
+    def remap(self, image: NDArray[_Pixel], interpolation: int = cv2.INTER_NEAREST) -> NDArray[_Pixel]:
+        """Undistort colour (H, W, 3), labels or depth (H, W)."""
+        if self.maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *self.maps, interpolation), dtype=image.dtype)
 
     def depth(self, image: Float32) -> Float32:
         """Map recorded depth [m] to colour's pixels (H, W)."""
-        if self.depth_to_color is not None:
-            return self.depth_to_color.warp(image)
-        return image if self.undistortion is None else self.undistortion.nearest(image)
+        if self.depth_lens is None or self.T_color_depth is None:
+            return self.remap(image)
+        return warp_depth(
+            self.depth_lens.remap(image), self.depth_lens.intrinsics, self.intrinsics, self.T_color_depth
+        )
+
+
+def warp_depth(depth: Float32, own: Intrinsics, target: Intrinsics, T_color_depth: Float64) -> Float32:
+    """Warp depth (H', W') [m] of camera `own` into the colour camera `target`, (H, W) [m], 0 = none.
+
+    Each depth pixel covers its square's image, so finer colour pixels get no holes; the nearest wins.
+    """
+    x, y, z = transform_points(T_color_depth, back_project(own, depth)[depth > 0]).T
+    front = z > 0
+    z = z[front]
+    u = target.fx * x[front] / z + target.cx
+    v = target.fy * y[front] / z + target.cy
+    half_u, half_v = 0.5 * max(1.0, target.fx / own.fx), 0.5 * max(1.0, target.fy / own.fy)
+    first_u, first_v = np.ceil(u - half_u), np.ceil(v - half_v)
+    nearest, depths = np.full(target.height * target.width, np.inf, dtype=np.float32), z.astype(np.float32)
+    for dv in range(int(np.floor(2 * half_v)) + 1):
+        row = first_v + dv
+        is_row = (row < v + half_v) & (row >= 0) & (row < target.height)
+        for du in range(int(np.floor(2 * half_u)) + 1):
+            column = first_u + du
+            lands = is_row & (column < u + half_u) & (column >= 0) & (column < target.width)
+            np.minimum.at(nearest, (row[lands] * target.width + column[lands]).astype(np.int64), depths[lands])
+    nearest[np.isinf(nearest)] = 0.0
+    return nearest.reshape(target.height, target.width)
+
+
+def undistort_lens(
+    result: Intrinsics,
+    model: str,
+    coefficients: Float64,
+    *,
+    recorded: Intrinsics | None = None,
+    R: Float64 | None = None,
+) -> Lens:
+    """A lens without its distortion, shown with intrinsics `result`. Raises InputError for an impossible lens.
+
+    recorded: of the distorted image, by default the result's. R (3, 3): the lens's axes to the result's.
+    """
+    R = np.eye(3) if R is None else R
+    counts = (4,) if model == "equidistant" else NUM_COEFFICIENTS
+    refuse_if(
+        len(coefficients) not in counts and not (len(coefficients) > 4 and not np.any(coefficients[4:])),
+        f"distortion model {model}: expected {', '.join(map(str, counts))} coefficients, got {len(coefficients)}",
+        remedy="calibrate again, or fill up with zeros",
+    )
+    map_u, map_v = _maps(recorded or result, model, coefficients, R, result)
+    is_seen = (map_u >= 0) & (map_u <= result.width - 1) & (map_v >= 0) & (map_v <= result.height - 1)
+    x, y, z = np.moveaxis(back_project(result, np.ones((result.height, result.width))) @ R, 2, 0)
+    radii = np.where(z > 0, np.hypot(x, y) / np.maximum(z, 1e-9), np.inf)  # (H, W) from the axis, at a depth of one
+    r, bent = _bent(model, coefficients)
+    folds = np.flatnonzero(np.diff(bent) <= 0)  # beyond the first, the lens would show things twice
+    is_seen &= radii < (r[folds[0]] if folds.size else np.inf)
+    refuse_if(
+        is_seen.mean() < REGISTERED_SHARE,
+        f"distortion {model} {np.round(coefficients, 6).tolist()}: the camera saw {is_seen.mean():.0%} of the"
+        f" pinhole's image, expected at least {REGISTERED_SHARE:.0%}",
+        remedy="correct the calibration, or undistort the images first",
+    )
+    map_u[~is_seen] = -10.0  # folded back into the image, or outside of it
+    return Lens(intrinsics=result, maps=(map_u, map_v), valid=None if is_seen.all() else is_seen)
 
 
 def _maps(
     lens: Intrinsics, model: str, coefficients: Float64, R: Float64, result: Intrinsics
 ) -> tuple[Float32, Float32]:
-    """Column and row in the distorted image, by result pixel."""
     K, P = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], dtype=np.float64) for k in (lens, result))
     size = (result.width, result.height)
     if model == "equidistant":
@@ -349,30 +322,31 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
     if model == "equidistant":
         a = np.arctan(r)
         return r, a * (1 + k[0] * a**2 + k[1] * a**4 + k[2] * a**6 + k[3] * a**8)
-    bent = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
-    return r, np.asarray(bent)
+    return r, np.asarray(
+        r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
+    )
 
 
-def undistortion_of(lens: Intrinsics, model: str, coefficients: Float64) -> Undistortion | None:
-    """A lens's undistortion, None for a pinhole. Raises InputError for an impossible lens.
+def correct_lens(lens: Intrinsics, model: str, coefficients: Float64, valid: Bool | None = None) -> Lens:
+    """A lens's corrections: none for a pinhole, whose mask is `valid`. Raises InputError for an impossible lens.
 
     It keeps focal lengths; an equidistant lens's are shortened to show all on the image's axes, up to `WIDEST_RAY`.
     """
     if not is_distorted(model, coefficients):
-        return None
+        return Lens(intrinsics=lens, valid=valid)
     model = lens_model(model)
-    if model not in DISTORTION_MODELS:
-        raise InputError(
-            f"distortion model {model!r} is unknown",
-            remedy="rectify the images first, or give --intrinsics NAME=FX,FY,CX,CY if they are;"
-            f" known models: {', '.join(DISTORTION_MODELS)}",
-        )
+    refuse_if(
+        model not in DISTORTION_MODELS,
+        f"distortion model {model!r} is unknown",
+        remedy="rectify the images first, or give --intrinsics NAME=FX,FY,CX,CY if they are;"
+        f" known models: {', '.join(DISTORTION_MODELS)}",
+    )
     if model != "equidistant" or len(coefficients) < 4:
-        return Undistortion(lens, model, coefficients)
+        return undistort_lens(lens, model, coefficients)
     r, bent = _bent(model, coefficients)
     edges = np.array([lens.cx / lens.fx, lens.cy / lens.fy])
     edges = np.append(edges, [(lens.width - 1) / lens.fx - edges[0], (lens.height - 1) / lens.fy - edges[1]])
     grows = slice(1 + int(np.argmax(bent)))
     seen = np.minimum(np.maximum(np.interp(edges, bent[grows], r[grows]), 1e-9), WIDEST_RAY)
     share = min(1.0, float((edges / seen).min()))
-    return Undistortion(replace(lens, fx=share * lens.fx, fy=share * lens.fy), model, coefficients, lens=lens)
+    return undistort_lens(replace(lens, fx=share * lens.fx, fy=share * lens.fy), model, coefficients, recorded=lens)

@@ -9,7 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.config.fixed import IMAGES_FEWEST_BACK
+from splatctrl_cli.errors import InputError, refuse_if, require
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.container.raw_log import RawLog
 from splatctrl_cli.recording.log.cameras import (
@@ -24,29 +25,28 @@ from splatctrl_cli.recording.log.cameras import (
     pose_topics,
 )
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from splatctrl_cli.recording.log.messages import GRAY
 from splatctrl_cli.recording.log.registration import (
     DISTORTION_MODELS,
-    DepthToColor,
     Lens,
     TfTree,
-    Undistortion,
+    correct_lens,
     is_distorted,
     lens_model,
-    undistortion_of,
+    undistort_lens,
 )
 from splatctrl_cli.recording.log.survey import Calibration, Survey
 from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions, refuse_unknown_cameras
-from splatctrl_cli.records import Bool, Float64, Intrinsics
+from splatctrl_cli.records import Float64, Intrinsics
 
 _RECTIFIED = frozenset({"rect", "rectified", "undistorted"})  # words in the names of topics
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Camera(Lens):
     """An RGB-D camera of a log.
 
-    valid (H, W): False where the lens did not see the pixel. fixed_pose: the user's T_world_camera. human_topic: its
-    masks. depth_scale [m per count]: the user's or the log's.
+    fixed_pose: the user's T_world_camera. human_topic: its masks. depth_scale [m per count]: the user's or the log's.
     """
 
     name: str
@@ -54,7 +54,6 @@ class Camera(Lens):
     depth_topic: str
     frame_id: str
     world_frame: str
-    valid: Bool | None = None
     fixed_pose: Float64 | None = None
     depth_scale: float | None = None
     human_topic: str = ""
@@ -73,8 +72,9 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
         raise no_camera(log, survey)
     known = {camera.name: camera for camera in found}
     names = tuple(known) if options.cameras is None else options.cameras
-    asked = (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics)
-    refuse_unknown_cameras(log.path, asked, known)
+    refuse_unknown_cameras(
+        log.path, (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics), known
+    )
     join_pose_topics(log, survey, options, [known[name] for name in names])
     check_mask_topics(log.path, survey, options.human_topics, tuple(known))
     try:
@@ -85,11 +85,11 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
             raise
         raise InputError(error.message, remedy=f"{error.remedy}; or give --cameras {','.join(usable)}") from None
     worlds = {camera.world_frame for camera in cameras if camera.fixed_pose is None}
-    if len(worlds) > 1:
-        raise InputError(
-            f"{log.path}: the cameras are in separate tf trees, with roots {', '.join(sorted(worlds))}",
-            remedy="record the transform that joins them, or choose with --cameras",
-        )
+    refuse_if(
+        len(worlds) > 1,
+        f"{log.path}: the cameras are in separate tf trees, with roots {', '.join(sorted(worlds))}",
+        remedy="record the transform that joins them, or choose with --cameras",
+    )
     return cameras
 
 
@@ -125,11 +125,9 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
 
 
 def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
-    """Smallest difference of a colour and a depth stamp."""
     color, depth = np.sort(np.array(color_ns)), np.sort(np.array(depth_ns))
     after = np.clip(np.searchsorted(depth, color), 0, len(depth) - 1)
-    before = np.clip(after - 1, 0, None)
-    return int(np.minimum(np.abs(depth[after] - color), np.abs(depth[before] - color)).min())
+    return int(np.minimum(np.abs(depth[after] - color), np.abs(depth[np.clip(after - 1, 0, None)] - color)).min())
 
 
 def intrinsics_of(calibration: Calibration) -> Intrinsics:
@@ -145,7 +143,7 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
     )
 
 
-def _rectified(calibration: Calibration) -> Calibration:
+def _rectify(calibration: Calibration) -> Calibration:
     """The rectified camera: P if set, without distortion; valid if the lens is known."""
     pinhole = replace(
         calibration,
@@ -158,9 +156,8 @@ def _rectified(calibration: Calibration) -> Calibration:
         return pinhole
     lens, R = intrinsics_of(calibration), calibration.rotation if np.any(calibration.rotation) else None
     with suppress(InputError):  # of a lens that cannot be, nothing says what it saw
-        return replace(
-            pinhole, valid=Undistortion(intrinsics_of(pinhole), model, calibration.distortion, lens=lens, R=R).valid
-        )
+        seen = undistort_lens(intrinsics_of(pinhole), model, calibration.distortion, recorded=lens, R=R)
+        return replace(pinhole, valid=seen.valid)
     return pinhole
 
 
@@ -200,35 +197,30 @@ class _Builder:
         topics = self._topics
         self._check_depth()
         self._check_clock()
-        calibration = self._calibration(topics.info, topics.color)
-        undistortion = self._undistortion(calibration, topics.info)
-        intrinsics = intrinsics_of(calibration) if undistortion is None else undistortion.intrinsics
+        lens = self._lens(self._calibration(topics.info, topics.color), topics.info)
+        lens = lens if self._is_registered else self._with_depth(lens)
         fixed = self._options.camera_poses.get(topics.name)
         return Camera(
+            **vars(lens),
             name=topics.name,
             color_topic=topics.color,
             depth_topic=topics.depth,
             frame_id=self._frame_id,
             world_frame=self._check_world(),
-            intrinsics=intrinsics,
-            undistortion=undistortion,
-            valid=calibration.valid if undistortion is None else undistortion.valid,
-            depth_to_color=None if self._is_registered else self._registration(intrinsics),
             fixed_pose=None if fixed is None else transform_from(fixed[:3], fixed[3:]),
             depth_scale=self._depth_scale,
             human_topic=self._options.human_topics.get(topics.name, ""),
         )
 
     def problems(self) -> list[str]:
-        """List all problems; empty if `build` succeeds."""
         found = []
-        intrinsics = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
+        any_lens = Lens(intrinsics=Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1))
         steps: list[Callable[[], object]] = [
             self._check_depth,
             self._check_clock,
             lambda: self._calibration(self._topics.info, self._topics.color),
             self._check_world,
-            lambda: None if self._is_registered else self._registration(intrinsics),
+            lambda: None if self._is_registered else self._with_depth(any_lens),
             self.build,
         ]
         for step in steps:
@@ -252,34 +244,37 @@ class _Builder:
         given = self._options.intrinsics.get(self._topics.name)
         if given is not None and image_topic == self._topics.color:
             return self._given(given, image_topic)
-        if calibration is None:
-            there = [t.topic.name for t in self._survey.of_type(CAMERA_INFO)]
-            raise InputError(
-                f"{self._where}: topic {image_topic} has no usable CameraInfo",
-                remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {listed(there)};"
-                f" or give --intrinsics {self._topics.name}=FX,FY,CX,CY",
-            )
+        there = [t.topic.name for t in self._survey.of_type(CAMERA_INFO)]
+        calibration = require(
+            calibration,
+            f"{self._where}: topic {image_topic} has no usable CameraInfo",
+            remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {listed(there)};"
+            f" or give --intrinsics {self._topics.name}=FX,FY,CX,CY",
+        )
         image = self._survey.topics[image_topic].image
         size, expected = (image.width, image.height), (calibration.width, calibration.height)
         if expected == (0, 0) and not calibration.cut:
             expected = size
         by_hand = f", or give --intrinsics {self._topics.name}=FX,FY,CX,CY of the recorded images"
         remedy = f"name the right CameraInfo with --camera{by_hand if calibration.cut else ''}"
-        if not calibration.is_possible:
-            what = f"{info} says {calibration.cut}, which it is not inside of, for images of {size[0]}x{size[1]}"
-            raise InputError(f"{self._where}: topic {image_topic}: {what}", remedy=remedy)
-        if size != expected:
-            cut = f" ({calibration.cut})" if calibration.cut else ""
-            raise InputError(
-                f"{self._where}: topic {image_topic}: expected {expected[0]}x{expected[1]} images as {info}"
-                f" says{cut}, got {size[0]}x{size[1]}",
-                remedy=remedy,
-            )
+        refuse_if(
+            not calibration.is_possible,
+            f"{self._where}: topic {image_topic}: {info} says {calibration.cut}, which it is not inside of, for"
+            f" images of {size[0]}x{size[1]}",
+            remedy=remedy,
+        )
+        cut = f" ({calibration.cut})" if calibration.cut else ""
+        refuse_if(
+            size != expected,
+            f"{self._where}: topic {image_topic}: expected {expected[0]}x{expected[1]} images as {info} says{cut},"
+            f" got {size[0]}x{size[1]}",
+            remedy=remedy,
+        )
         sized = replace(calibration, width=size[0], height=size[1])
         lens = image_lens(self._survey, image_topic, sized)
         if lens == "contradicted":
             raise self._contradicted(sized, info, image_topic)
-        return _rectified(sized) if lens == "rectified" else sized
+        return _rectify(sized) if lens == "rectified" else sized
 
     def _contradicted(self, calibration: Calibration, info: str, image_topic: str) -> InputError:
         k = intrinsics_of(calibration)
@@ -307,65 +302,66 @@ class _Builder:
     def _check_depth(self) -> None:
         topics = self._topics
         image = self._survey.topics[topics.depth].image
-        if image.kind != "depth":
-            raise InputError(
-                f"{self._where}: topic {topics.depth}: expected depth images, got {image.encoding}",
-                remedy="name a topic of depth images with --camera",
-            )
-        if topics.rivals:
-            raise InputError(
-                f"{self._where}: {', '.join(topics.rivals)} could each be its depth, and no name says which",
-                remedy=f"give --camera {topics.name}={topics.color},DEPTH with the one that is depth",
-            )
+        refuse_if(
+            image.kind != "depth",
+            f"{self._where}: topic {topics.depth}: expected depth images, got {image.encoding}",
+            remedy="name a topic of depth images with --camera",
+        )
+        refuse_if(
+            topics.rivals,
+            f"{self._where}: {', '.join(topics.rivals)} could each be its depth, and no name says which",
+            remedy=f"give --camera {topics.name}={topics.color},DEPTH with the one that is depth",
+        )
 
     def _check_clock(self) -> None:
         """Raise InputError if a clock went back: stamps are then ambiguous."""
         for name in (self._topics.color, self._topics.depth):
             clock = self._survey.topics[name].clock
-            if clock.went_back:
-                raise InputError(
-                    f"{self._where}: topic {name}: the clock of its headers goes back by {clock.back_ns / 1e9:.3f} s"
-                    f" at {clock.back_log_ns / 1e9:.3f} s of the log (a bag in a loop, a simulation that was reset),"
-                    f" {clock.num_back} images in all",
-                    remedy="give --stamps log to take the times of logging, or cut the log there",
-                )
+            refuse_if(
+                clock.num_back >= IMAGES_FEWEST_BACK,
+                f"{self._where}: topic {name}: the clock of its headers goes back by {clock.back_ns / 1e9:.3f} s"
+                f" at {clock.back_log_ns / 1e9:.3f} s of the log (a bag in a loop, a simulation that was reset),"
+                f" {clock.num_back} images in all",
+                remedy="give --stamps log to take the times of logging, or cut the log there",
+            )
 
     def _check_world(self) -> str:
-        """The world frame, if tf joins the camera to it."""
         tf, frame_id = self._survey.tf, self._frame_id
         if self._topics.name in self._options.camera_poses:
             return self._options.world_frame or "world"
         world = self._options.world_frame or tf.root_of(frame_id)
-        if world not in tf.frames and tf.frames and self._options.world_frame:
-            raise InputError(
-                f"{self._where}: tf has no frame {world!r}", remedy=f"--world-frame: use one of {listed(tf.frames)}"
-            )
-        if frame_id not in tf.frames or not tf.connects(world, frame_id):
-            target = f" in {world!r}" if world != frame_id else ""
-            topics = pose_topics(self._survey)
-            instead = f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
-            raise InputError(
-                f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
-                f" frames tf knows: {listed(tf.frames)}",
-                remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw"
-                f"{instead}",
-            )
+        refuse_if(
+            world not in tf.frames and tf.frames and self._options.world_frame,
+            f"{self._where}: tf has no frame {world!r}",
+            remedy=f"--world-frame: use one of {listed(tf.frames)}",
+        )
+        target = f" in {world!r}" if world != frame_id else ""
+        topics = pose_topics(self._survey)
+        instead = f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
+        refuse_if(
+            frame_id not in tf.frames or not tf.connects(world, frame_id),
+            f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
+            f" frames tf knows: {listed(tf.frames)}",
+            remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw{instead}",
+        )
         return world
 
-    def _undistortion(self, calibration: Calibration, info: str) -> Undistortion | None:
+    def _lens(self, calibration: Calibration, info: str) -> Lens:
+        k, model, bent = intrinsics_of(calibration), calibration.distortion_model, calibration.distortion
         try:
-            return undistortion_of(intrinsics_of(calibration), calibration.distortion_model, calibration.distortion)
+            return correct_lens(k, model, bent, calibration.valid)
         except InputError as error:
             raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
 
-    def _registration(self, color: Intrinsics) -> DepthToColor:
+    def _with_depth(self, lens: Lens) -> Lens:
         topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
         depth_image = self._survey.topics[topics.depth].image
         size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"
         what = f"{self._where}: depth {size} of {topics.depth} is not registered to colour of {topics.color}"
         remedy = "record depth aligned to colour"
-        if not topics.depth_info:
-            raise InputError(f"{what}, and {topics.depth} has no CameraInfo", remedy=f"record it, or {remedy}")
+        refuse_if(
+            not topics.depth_info, f"{what}, and {topics.depth} has no CameraInfo", remedy=f"record it, or {remedy}"
+        )
         calibration = self._calibration(topics.depth_info, topics.depth)
         frame = depth_image.frame_id
         T_color_depth = self._survey.realsense.T_between(topics.color, topics.depth)
@@ -381,27 +377,20 @@ class _Builder:
                 calibration.sensor_K, color_info.sensor_K, rtol=0.01
             )
             T_color_depth = np.eye(4) if is_one_sensor else None
-        if T_color_depth is None and frame == color_frame:
-            raise InputError(
-                f"{what}: their CameraInfo differ but both say frame {frame!r}",
-                remedy=f"{remedy}, or correct the frames",
-            )
-        if T_color_depth is None:
-            span = tf.span_ns(frame) or tf.span_ns(color_frame) or (0, 0)
-            T_color_depth = tf.lookup(color_frame, frame, span[0])
-        if T_color_depth is None:
-            raise InputError(
-                f"{what}, and tf does not join their frames {frame!r} and {color_frame!r};"
-                f" frames tf knows: {listed(tf.frames)}",
-                remedy=f"record /tf_static, or {remedy}",
-            )
-        undistortion = self._undistortion(calibration, topics.depth_info)
-        return DepthToColor(
-            depth_intrinsics=intrinsics_of(calibration) if undistortion is None else undistortion.intrinsics,
-            color_intrinsics=color,
-            T_color_depth=T_color_depth,
-            undistortion=undistortion,
+        refuse_if(
+            T_color_depth is None and frame == color_frame,
+            f"{what}: their CameraInfo differ but both say frame {frame!r}",
+            remedy=f"{remedy}, or correct the frames",
         )
+        if T_color_depth is None:
+            T_color_depth = tf.lookup(color_frame, frame, (tf.span_ns(frame) or tf.span_ns(color_frame) or (0, 0))[0])
+        T_color_depth = require(
+            T_color_depth,
+            f"{what}, and tf does not join their frames {frame!r} and {color_frame!r};"
+            f" frames tf knows: {listed(tf.frames)}",
+            remedy=f"record /tf_static, or {remedy}",
+        )
+        return replace(lens, depth_lens=self._lens(calibration, topics.depth_info), T_color_depth=T_color_depth)
 
 
 def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
@@ -409,16 +398,16 @@ def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
     for given in options.camera_topics:
         for topic, kind in ((given.color, "colour"), (given.depth, "depth")):
             images = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is not None]
-            if topic not in images:
-                raise InputError(
-                    f"{log.path}: --camera {given.name}: no {kind} images on topic {topic}",
-                    remedy=f"image topics there: {listed(images)}",
-                )
-        if given.info and given.info not in [t.topic.name for t in survey.of_type(CAMERA_INFO)]:
-            raise InputError(
-                f"{log.path}: --camera {given.name}: no CameraInfo on topic {given.info}",
-                remedy="leave INFO out to have it found",
+            refuse_if(
+                topic not in images,
+                f"{log.path}: --camera {given.name}: no {kind} images on topic {topic}",
+                remedy=f"image topics there: {listed(images)}",
             )
+        refuse_if(
+            given.info and given.info not in [t.topic.name for t in survey.of_type(CAMERA_INFO)],
+            f"{log.path}: --camera {given.name}: no CameraInfo on topic {given.info}",
+            remedy="leave INFO out to have it found",
+        )
         color, depth = survey.topics[given.color], survey.topics[given.depth]
         cameras.append(
             CameraTopics(
@@ -437,16 +426,16 @@ def check_mask_topics(path: Path, survey: Survey, topics: Mapping[str, str], cam
     grey = [
         topic.topic.name
         for topic in survey.of_type(IMAGE, COMPRESSED_IMAGE)
-        if topic.first_image is not None and topic.first_image.is_gray
+        if topic.first_image is not None and topic.first_image.encoding in GRAY
     ]
     for camera, topic in topics.items():
-        if camera not in cameras:
-            raise InputError(
-                f"{path}: --human-topic {camera}={topic}: no camera {camera!r}",
-                remedy=f"use one of: {', '.join(cameras)}",
-            )
-        if topic not in grey:
-            raise InputError(
-                f"{path}: --human-topic {camera}={topic}: no mono8 or 8UC1 images on that topic",
-                remedy=f"grey topics there: {', '.join(grey) or 'none'}",
-            )
+        refuse_if(
+            camera not in cameras,
+            f"{path}: --human-topic {camera}={topic}: no camera {camera!r}",
+            remedy=f"use one of: {', '.join(cameras)}",
+        )
+        refuse_if(
+            topic not in grey,
+            f"{path}: --human-topic {camera}={topic}: no mono8 or 8UC1 images on that topic",
+            remedy=f"grey topics there: {', '.join(grey) or 'none'}",
+        )

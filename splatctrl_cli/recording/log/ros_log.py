@@ -10,11 +10,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.spilled_rows import RowFile, scratch_folder
+from splatctrl_cli.formats.image_file import PNG
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.recording.log.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.recording.log.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
@@ -29,8 +31,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     decoded,
     human_mask,
     is_kept,
-    is_png,
-    with_joints,
+    merge_joints,
 )
 from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, paired, survey
 from splatctrl_cli.recording.source_options import SourceOptions, still_note
@@ -52,7 +53,6 @@ class Planned:
 
     @property
     def keys(self) -> list[tuple[str, int]]:
-        """Topic and number of each image."""
         camera = self.camera
         keys = [(camera.color_topic, self.color_index), (camera.depth_topic, self.depth_index)]
         return keys if self.human_index is None else [*keys, (camera.human_topic, self.human_index)]
@@ -68,9 +68,6 @@ class FramePlan:
 
     def __len__(self) -> int:
         return self._columns.shape[1]
-
-    def __iter__(self) -> Iterator[Planned]:
-        return (self[number] for number in range(len(self)))
 
     def __getitem__(self, number: int) -> Planned:
         stamp, camera, color, depth, human, row = self._columns[:, number].tolist()
@@ -97,7 +94,6 @@ class FramePlan:
         is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
         human = np.array([masks.get(index, NO_MASK) for index in color[is_known].tolist()], dtype=np.int64)
         num = int(is_known.sum())
-        rows = first + np.arange(num)
         fresh = np.stack(
             [
                 stamp_ns[is_known],
@@ -105,7 +101,7 @@ class FramePlan:
                 color[is_known],
                 depth[is_known],
                 human,
-                rows,
+                first + np.arange(num),
             ]
         )
         columns = np.concatenate([self._columns, fresh], axis=1)
@@ -156,7 +152,6 @@ class HeldMessages:
         self._messages[key] = message
 
     def get(self, key: Key) -> RawMessage:
-        """A message, which stays."""
         message, place = self._messages[key], self._places.get(key)
         if place is None:
             return message
@@ -164,7 +159,6 @@ class HeldMessages:
         return replace(message, data=self._file.read(place[1]))
 
     def pop(self, key: Key) -> RawMessage:
-        """Remove and return a message."""
         found = self.get(key)
         self._num_bytes -= len(self._messages.pop(key).data)
         self._places.pop(key, None)
@@ -212,13 +206,16 @@ class RosLogSource(FrameSource):
         self._log = log
         self._options = options
         found = survey(log, by_log_time=options.stamps == "log")
-        if not found.num_messages and found.damage.count:
-            raise InputError(
-                f"{log.path}: nothing usable before the damage ({found.damage.notes[0]})",
-                remedy="copy the file again",
-            )
-        if not found.num_messages:
-            raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
+        refuse_if(
+            not found.num_messages and found.damage.count,
+            f"{log.path}: nothing usable before the damage ({''.join(found.damage.notes[:1])})",
+            remedy="copy the file again",
+        )
+        refuse_if(
+            not found.num_messages,
+            f"{log.path}: the log holds no messages",
+            remedy="record it again, or give another file",
+        )
         try:
             self._rig = build_cameras(log, found, options)
         except InputError as error:
@@ -238,7 +235,7 @@ class RosLogSource(FrameSource):
         self.joint_topics = JointTopics(
             topics=found.of_type(*STATE_TYPES), loss=loss, first_note=first_note, chosen=options.joint_topic
         )
-        self._loss = with_joints(self._loss, loss, first_note)
+        self._loss = merge_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
         self._passes = [Damage()]  # incomplete where a pass ends early
 
@@ -257,15 +254,13 @@ class RosLogSource(FrameSource):
         return decoded(by_stamp(self.states, self._frames(lazily=False)))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
+        plans = map(self._plan.__getitem__, range(len(self._plan)))
+        return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in plans)
 
     def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
         """T_world_camera (4, 4) at a time [ns]; None if tf does not know it."""
         found = next(c for c in self._rig if c.name == camera)
         return found.pose_at(self._tf, stamp_ns, round(self._options.pose_tolerance_s * SECOND_NS))
-
-    def digests(self) -> dict[str, str]:
-        return dict(self._digests)
 
     @cached_property
     def _digests(self) -> dict[str, str]:
@@ -296,13 +291,12 @@ class RosLogSource(FrameSource):
         return plan
 
     def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
-        """Numbers and stamps without repeats; counts repeated and missing images."""
         stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
-        if len(stamps) > 1 and not stamps.any():
-            raise InputError(
-                f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
-                remedy="give --stamps log to take the times of logging",
-            )
+        refuse_if(
+            len(stamps) > 1 and not stamps.any(),
+            f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
+            remedy="give --stamps log to take the times of logging",
+        )
         kept = first_of_each(stamps)
         num_gaps, num_images, period_ns = dropped(stamps)
         self._loss.duplicate_images += len(stamps) - len(kept)
@@ -322,16 +316,15 @@ class RosLogSource(FrameSource):
         masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
         poses = (camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
         num = plan.add(camera, stamp_ns, color, depth, masks, poses)
-        if not num:
-            raise InputError(
-                f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
-                f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
-                remedy="check the clocks of the recording, or give --camera-pose",
-            )
+        refuse_if(
+            not num,
+            f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
+            f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
+            remedy="check the clocks of the recording, or give --camera-pose",
+        )
         self._loss.without_pose += len(color) - num
 
     def _frames(self, *, lazily: bool = True) -> Iterator[StoredFrame]:
-        """Yield frames; lazily: unchanged image files are decoded on demand."""
         lost, decoder, checked = Damage(), MessageDecoder(), set[str]()
         self._passes.append(lost)
         for planned, messages in planned_images(self._log, self._plan, lost, HeldMessages()):
@@ -343,7 +336,7 @@ class RosLogSource(FrameSource):
                 lost.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
                 continue
             where = f"{self._log.path}: topic {camera.human_topic}"
-            human = [camera.labels(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]
+            human = [camera.remap(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]
             if depth.compressed is None:
                 lost.num_invalid += num_invalid(depth.pixels)
             stored = _stored_frame(planned, color, depth, human[0] if human else None, messages)
@@ -361,44 +354,36 @@ def _images(
 
     Raises UndecodableMessageError.
     """
-    kept = (False,) * 3 if is_whole else (*_keeps_files(camera), False)
+    is_lazy = camera.maps is None and not is_whole
     images = [
         read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
-        for message, lazily in zip(messages, kept, strict=False)
+        for message, lazily in zip(messages, (is_lazy, is_lazy and camera.depth_lens is None, False), strict=False)
     ]
-    depth = camera.depth_to_color
-    expected = (camera.intrinsics, camera.intrinsics if depth is None else depth.depth_intrinsics)
-    for image, k in zip(images, expected, strict=False):
-        if (image.width, image.height) != (k.width, k.height):
-            raise UndecodableMessageError(
-                f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}"
-            )
+    for image, k in zip(images, (camera.intrinsics, (camera.depth_lens or camera).intrinsics), strict=False):
+        refuse_if(
+            (image.width, image.height) != (k.width, k.height),
+            f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}",
+            error=UndecodableMessageError,
+        )
     return images
-
-
-def _keeps_files(camera: Camera) -> tuple[bool, bool]:
-    """True for colour and depth whose files a capture keeps."""
-    is_plain = camera.undistortion is None
-    return is_plain, is_plain and camera.depth_to_color is None
 
 
 def _stored_frame(
     planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, messages: Sequence[RawMessage]
 ) -> StoredFrame:
     camera = planned.camera
-    is_counts = depth.is_counts and camera.depth_to_color is None
-    keeps_color, keeps_depth = _keeps_files(camera)
+    is_counts = depth.is_counts and camera.depth_lens is None
     return StoredFrame(
         stamp_ns=planned.stamp_ns,
         camera=camera.name,
         intrinsics=camera.intrinsics,
         T_world_camera=planned.T_world_camera,
-        read_color=lambda: camera.color(color_of(color)),
+        read_color=lambda: camera.remap(color_of(color), cv2.INTER_LINEAR),
         read_depth=lambda: camera.depth(depth_of(depth, camera.depth_scale)),
         human=human,
         valid=camera.valid,
-        color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
-        depth_file=depth.compressed if keeps_depth and depth.is_counts and is_png(depth.compressed) else None,
+        color_file=color.compressed if camera.maps is None and is_kept(color.compressed) else None,
+        depth_file=depth.compressed if camera.maps is None and is_counts and is_kept(depth.compressed, PNG) else None,
         depth_unit=depth.unit(camera.depth_scale) if is_counts else None,
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
         places=tuple(replace(message, data=b"") for message in messages),
@@ -415,7 +400,6 @@ def _times(found: Survey, camera: Camera) -> str:
 def _mask_by_color(
     survey: Survey, color_topic: str, mask_topic: str, tolerance_ns: int, camera: str, loss: LossReport
 ) -> dict[int, int]:
-    """Mask number by colour number, closest stamps paired; missing ones are noted."""
     if not mask_topic:
         return {}
     color_ns, mask_ns = survey.topics[color_topic].stamps_ns, survey.topics[mask_topic].stamps_ns

@@ -7,8 +7,8 @@ from typing import Any, Self, overload
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, blocks_of, of_columns, ranges, selected
+from splatctrl_cli.errors import refuse_if
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, blocks_of, ranges, select
 from splatctrl_cli.records import Float64, Index, JointState, Posture, Stamps
 
 OF_JOINTS = ("position", "velocity", "commanded_velocity")
@@ -72,8 +72,9 @@ class StateColumns(Sequence[JointState]):
 
     def states(self, first: int, last: int) -> list[JointState]:
         """States from `first` up to, but not with, `last`."""
-        optional = (self.commanded_velocity, self.T_base_ee, self.T_world_ee)
-        commanded, base, world = (_optional(values, first, last) for values in optional)
+        commanded, base, world = (
+            _optional(values, first, last) for values in (self.commanded_velocity, self.T_base_ee, self.T_world_ee)
+        )
         position, velocity = self.position[first:last], self.velocity[first:last]
         return [
             JointState(
@@ -89,10 +90,10 @@ class StateColumns(Sequence[JointState]):
 
     def select(self, index: Index) -> Self:
         """States of an index (K,), in its order."""
-        return self._changed(lambda table, _: selected(table, index), COLUMNS, stamp_ns=self.stamp_ns[index])
+        return self._changed(lambda table, _: select(table, index), COLUMNS, stamp_ns=self.stamp_ns[index])
 
     def of_joints(self, order: Index) -> Self:
-        return self._changed(lambda table, _: of_columns(table, order), OF_JOINTS)
+        return self._changed(lambda table, _: select(table, columns=order), OF_JOINTS)
 
     def of_log(self, order: Index, factor: Float64, offset: Float64) -> Self:
         """Joints (J,): ``position[order] * factor + offset``; velocities without offset."""
@@ -127,8 +128,7 @@ class ColumnWriter:
         self._shapes = shapes
         self._files = {name: RowFile(shapes[name], of_column) for name, of_column in blocks.items()}
         self._num, *others = {len(file) for file in self._files.values()} or {0}  # states that are in the files
-        if others:
-            raise ValueError(f"{', '.join(self._files)}: columns of several lengths")
+        refuse_if(others, f"{', '.join(self._files)}: columns of several lengths", error=ValueError)
         self._waiting: list[Mapping[str, Float64 | None]] = []
 
     def __len__(self) -> int:
@@ -139,8 +139,8 @@ class ColumnWriter:
         if len(self._waiting) == BLOCK:
             self._flush()
 
-    def tables(self) -> dict[str, Rows]:
-        """Columns so far, but those without any value."""
+    def columns(self) -> dict[str, Rows]:
+        """Columns (T, ...) so far, but those without any value; NaN where a state has none."""
         self._flush()
         return {name: Rows(self._files[name]) for name in self._shapes if name in self._files}
 
@@ -158,8 +158,6 @@ class ColumnWriter:
 
 
 class StateCollector:
-    """A collector of states."""
-
     def __init__(self, num_joints: int) -> None:
         self._num_joints = num_joints
         self._stamps = array("q")
@@ -168,16 +166,16 @@ class StateCollector:
 
     def add(self, state: JointState) -> None:
         """Add a state. Raises InputError for another number of joints."""
-        if np.shape(state.position) != (self._num_joints,):
-            raise InputError(
-                f"joint state {len(self._stamps)}: expected {self._num_joints} joints, got {np.size(state.position)}"
-            )
+        refuse_if(
+            np.shape(state.position) != (self._num_joints,),
+            f"joint state {len(self._stamps)}: expected {self._num_joints} joints, got {np.size(state.position)}",
+        )
         self._stamps.append(state.stamp_ns)
         self._columns.add({name: getattr(state, name) for name in COLUMNS})
 
     def columns(self) -> StateColumns:
         nothing = np.zeros((0, self._num_joints))
-        found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.tables()}
+        found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.columns()}
         return StateColumns(stamp_ns=np.array(self._stamps, dtype=np.int64), **found)
 
 

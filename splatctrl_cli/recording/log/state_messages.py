@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.files.spilled_rows import Rows
+from splatctrl_cli.errors import refuse_if, require
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.log.decoder import JOINT_STATE, UndecodableMessageError, stamp_ns
 from splatctrl_cli.recording.log.state_columns import ColumnWriter
@@ -98,16 +98,18 @@ def _franka(message: Any, log_time_ns: int) -> RawJoints:
 def _controller(message: Any, log_time_ns: int) -> RawJoints:
     """Filled `feedback` and `reference`, else the older `actual` and `desired` (control_msgs)."""
     names = tuple(str(name) for name in message.joint_names)
-    actual = _filled(message, ("feedback", "actual"), len(names))
-    wanted = _filled(message, ("reference", "desired"), len(names))
-    if actual is None:
-        raise UndecodableMessageError(f"a controller state of {len(names)} joints without positions")
+    actual, wanted = (
+        _find_filled(message, fields, len(names)) for fields in (("feedback", "actual"), ("reference", "desired"))
+    )
+    actual = require(
+        actual, f"a controller state of {len(names)} joints without positions", error=UndecodableMessageError
+    )
     commanded = _NONE if wanted is None else _array(wanted.velocities)
     position, velocity = _array(actual.positions), _array(actual.velocities)
     return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
 
 
-def _filled(message: Any, fields: tuple[str, ...], num_joints: int) -> Any:
+def _find_filled(message: Any, fields: tuple[str, ...], num_joints: int) -> Any:
     there = [getattr(message, name) for name in fields if name in message.__dataclass_fields__]
     return next((point for point in there if len(point.positions) == num_joints), None)
 
@@ -122,9 +124,11 @@ def _checked(
     log_time_ns: int,
     T_base_ee: Float64 | None,
 ) -> RawJoints:
-    if len(position) != len(names):
-        raise UndecodableMessageError(f"{what} with {len(names)} names and {len(position)} positions")
-    is_odd = len(velocity) not in (0, len(names))
+    refuse_if(
+        len(position) != len(names),
+        f"{what} with {len(names)} names and {len(position)} positions",
+        error=UndecodableMessageError,
+    )
     return RawJoints(
         stamp_ns=stamp_ns(message.header),
         names=names,
@@ -133,7 +137,9 @@ def _checked(
         log_time_ns=log_time_ns,
         commanded_velocity=commanded if len(commanded) == len(names) else _NONE,
         T_base_ee=T_base_ee,
-        note=f"{len(names)} names with {len(velocity)} velocities, which are not used" if is_odd else "",
+        note=""
+        if len(velocity) in {0, len(names)}
+        else f"{len(names)} names with {len(velocity)} velocities, which are not used",
     )
 
 
@@ -144,8 +150,11 @@ def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
     states = []
     for point in message.points:
         since, position, velocity = point.time_from_start, _array(point.positions), _array(point.velocities)
-        if len(position) != len(names):
-            raise UndecodableMessageError(f"a trajectory of {len(names)} joints with {len(position)} positions")
+        refuse_if(
+            len(position) != len(names),
+            f"a trajectory of {len(names)} joints with {len(position)} positions",
+            error=UndecodableMessageError,
+        )
         after_ns = int(since.sec) * 1_000_000_000 + int(since.nanosec)
         states.append(
             RawJoints(
@@ -168,7 +177,7 @@ COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
 _NO_STAMPS = np.zeros(0, dtype=np.int64)
 
 
-class JointStream:
+class JointStream(ColumnWriter):
     """States with equal joints, in the first one's order."""
 
     def __init__(
@@ -182,14 +191,12 @@ class JointStream:
         self.names = names
         self._stamps, self._log_times = array("q", stamp_ns.tolist()), array("q", log_time_ns.tolist())
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
-        self._columns = ColumnWriter(
-            {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}, columns or {}
+        super().__init__({name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}, columns or {})
+        refuse_if(
+            columns and len(self) != len(self._stamps),
+            f"columns of other lengths than {len(self._stamps)}",
+            error=ValueError,
         )
-        if columns and len(self._columns) != len(self):
-            raise ValueError(f"columns of other lengths than {len(self)}")
-
-    def __len__(self) -> int:
-        return len(self._stamps)
 
     @property
     def stamp_ns(self) -> Stamps:
@@ -199,19 +206,12 @@ class JointStream:
     def log_time_ns(self) -> Stamps:
         return np.array(self._log_times, dtype=np.int64)
 
-    def columns(self) -> dict[str, Rows]:
-        """position, velocity, commanded_velocity (T, J), T_base_ee (T, 4, 4).
-
-        NaN where a state has none, absent if none has one.
-        """
-        return self._columns.tables()
-
-    def add(self, state: RawJoints) -> None:
+    def add_state(self, state: RawJoints) -> None:
         """Add a state. Raises OverflowError for a time beyond 64 bits."""
         times = array("q", (state.stamp_ns, state.log_time_ns))  # both, before either is kept
         self._stamps.append(times[0])
         self._log_times.append(times[1])
-        self._columns.add({name: self._row(state, name) for name in COLUMNS})
+        self.add({name: self._row(state, name) for name in COLUMNS})
 
     def _row(self, state: RawJoints, name: str) -> Float64 | None:
         value: Float64 | None = getattr(state, name)
@@ -246,7 +246,7 @@ class JointLog:
             if state.names:
                 key = frozenset(state.names)
                 stream = self._streams[key] if key in self._streams else JointStream(state.names)
-                stream.add(state)
+                stream.add_state(state)
                 self._streams[key] = stream
             if self.first_names is None:
                 self.first_names = state.names

@@ -20,12 +20,12 @@ from splatctrl_cli.config.fixed import (
     TURNS_LEAST,
     TURNS_SHARE,
 )
-from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError
+from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, refuse_if
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, ranges
 from splatctrl_cli.recording.log.decoder import JOINT_STATE
 from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.recording.log.state_messages import STANDARD_TYPES, STATE_TYPES, TRAJECTORY, JointStream
-from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, unwrapped
+from splatctrl_cli.recording.log.state_track import RawTrack, clean_states, unwrap
 from splatctrl_cli.recording.log.survey import Survey, TopicSurvey
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, Index, LossReport, Stamps
@@ -59,7 +59,7 @@ def joint_records(
         loss.notes.append(wrong.message)
     loss.notes += [f"{t.topic.name}: {note} ({num} states)" for t in topics for note, num in t.joints.notes.items()]
     raw = track_of_topic(main_topic(topics, loss), loss) if wanted is None else track_of_joints(topics, wanted, loss)
-    states = cleaned(raw, loss)
+    states = clean_states(raw, loss)
     return (raw.names, states) if len(states) else ((), NO_STATES)
 
 
@@ -75,11 +75,11 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
             loss.notes.append(f"{topic.topic.name}: the log has no definition of {kind}: its states are not read")
     if options.joint_topic is not None:
         chosen = [t for t in found if t.topic.name == options.joint_topic]
-        if not chosen:
-            raise InputError(
-                f"joint topic {options.joint_topic}: not a topic of the log with joint states",
-                remedy=f"use one of: {', '.join(t.topic.name for t in found) or 'none there'}",
-            )
+        refuse_if(
+            not chosen,
+            f"joint topic {options.joint_topic}: not a topic of the log with joint states",
+            remedy=f"use one of: {', '.join(t.topic.name for t in found) or 'none there'}",
+        )
         return chosen
     return [t for t in found if t.topic.type_name != TRAJECTORY] or found
 
@@ -117,7 +117,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Other joints are
     interpolated. States outside their times, or in gaps over `STATES_BRIDGED` with motion, are left out with a note.
     """
-    streams = _renamed(_streams(topics), wanted, loss)
+    streams = _rename_joints(_streams(topics), wanted, loss)
     base = _base(streams, wanted)
     track = _raw(base, base.names, loss)
     missing = [name for name in wanted if name not in base.names]
@@ -127,7 +127,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
         added = tuple(name for name in missing if name in best.names)
         if not added:
             break
-        track = _filled(track, _raw(best, added, loss), loss)
+        track = _fill_joints(track, _raw(best, added, loss), loss)
         missing = [name for name in missing if name not in added]
         used.append(best.where)
     others = sorted({t.topic.name for t in topics} - set(used))
@@ -175,7 +175,7 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
     if wanted is None:
         base = max(streams, key=lambda s: (s.where == main_topic(topics, LossReport()).topic.name, len(s.names)))
     else:
-        streams = _renamed(streams, wanted, LossReport())
+        streams = _rename_joints(streams, wanted, LossReport())
         base = _base(streams, wanted)
     names = base.names if wanted is None else tuple(name for name in base.names if name in wanted)
     for other in streams:
@@ -190,11 +190,12 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
                 remedy=f"give --joint-topic {base.where} or --joint-topic {other.where}",
             )
     num = _num_turns(base, names)
-    if num >= max(TURNS_FEWEST, TURNS_SHARE * len(base.states)):
-        raise NotEvaluableError(
-            f"{base.where}: two publishers take turns: {num} of {len(base.states)} states jump away and back at once",
-            remedy="let one node publish the topic (ros2 topic info -v names them), and record again",
-        )
+    refuse_if(
+        num >= max(TURNS_FEWEST, TURNS_SHARE * len(base.states)),
+        f"{base.where}: two publishers take turns: {num} of {len(base.states)} states jump away and back at once",
+        remedy="let one node publish the topic (ros2 topic info -v names them), and record again",
+        error=NotEvaluableError,
+    )
 
 
 def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
@@ -231,11 +232,10 @@ def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
     return num
 
 
-def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
-    """Rename unknown joints to the robot's if only a prefix differs."""
+def _rename_joints(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
     found = dict.fromkeys(name for stream in streams for name in stream.names)
     unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
-    names = with_prefix(unknown, missing)
+    names = match_prefix(unknown, missing)
     if not names:
         return streams
     name, meant = next(iter(names.items()))
@@ -243,7 +243,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
     return [replace(s, names=tuple(names.get(name, name) for name in s.names)) for s in streams]
 
 
-def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
+def match_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
     """Map a log's joint names to the robot's by the best prefix, else empty."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(found):
@@ -267,8 +267,7 @@ def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
     ).of_names(names)
 
 
-def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
-    """Add the joints of `other`, interpolated; states without them are left out."""
+def _fill_joints(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     order = np.argsort(other.stamp_ns, kind="stable")
     at = other.stamp_ns[order]
     stamps = track.stamp_ns
@@ -276,18 +275,17 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     if len(at) == 1:
         at, order = np.repeat(at, 2), np.repeat(order, 2)
     before = after - 1
-    position = unwrapped(other.select(order), loss).position
+    position = unwrap(other.select(order), loss).position
     gap = (at[after] - at[before]) * 1e-9
-    is_still = _is_still(position, before, after)
-    keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= STATES_BRIDGED) | is_still)
+    keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= STATES_BRIDGED) | _is_still(position, before, after))
     share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]
 
     names = ", ".join(other.names)
-    if not keep.any():
-        raise InputError(
-            f"{track.where} and {other.where}: mixed clocks: at no state of {track.where} is {names} known",
-            remedy="give another --joint-topic, or record both by one clock",
-        )
+    refuse_if(
+        not keep.any(),
+        f"{track.where} and {other.where}: mixed clocks: at no state of {track.where} is {names} known",
+        remedy="give another --joint-topic, or record both by one clock",
+    )
     loss.notes.append(f"{track.where}: {names} of {other.where} are interpolated at its {len(stamps)} states")
     if not keep.all():
         lost = f"{int((~keep).sum())} of {len(stamps)} states left out"
@@ -325,11 +323,11 @@ def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossRepor
     if is_unset.all():
         loss.notes.append(f"{where}: no state has a stamp; the times of logging are used")
         return log_ns
-    if is_unset.any() and stamp_ns[~is_unset].min() > CLOCK_MIXED * 1e9:  # a simulation may begin at 0
-        raise InputError(
-            f"{where}: mixed clocks: {int(is_unset.sum())} of {len(stamp_ns)} states have no stamp",
-            remedy="leave them out of the log, or give another --joint-topic",
-        )
+    refuse_if(
+        is_unset.any() and stamp_ns[~is_unset].min() > CLOCK_MIXED * 1e9,
+        f"{where}: mixed clocks: {int(is_unset.sum())} of {len(stamp_ns)} states have no stamp",
+        remedy="leave them out of the log, or give another --joint-topic",
+    )  # a simulation may begin at 0
     late = np.asarray((log_ns - stamp_ns) * 1e-9, dtype=np.float64)
     _check_steps(late, where, loss)
     median = float(np.median(late))
@@ -350,8 +348,7 @@ def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossRepor
 def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
     n = CLOCK_NEIGHBOURS
     if len(late) < 2 * n:
-        if np.ptp(late) > CLOCK_MIXED:
-            raise _mixed(where, float(np.ptp(late)), int(np.argmax(np.abs(np.diff(late)))) + 1)
+        _refuse_mixed(float(np.ptp(late)), int(np.argmax(np.abs(np.diff(late, append=late[-1:])))) + 1, where)
         return
     near = np.lib.stride_tricks.sliding_window_view(late, n)
     windows = np.concatenate([np.median(near[first:last], axis=1) for first, last in ranges(len(near))])
@@ -361,13 +358,13 @@ def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
         return
     at = int(np.argmax(change))
     state = at + 1 + int(np.argmax(np.abs(np.diff(late[at : at + 2 * n]))))
-    if step > CLOCK_MIXED:
-        raise _mixed(where, step, state)
+    _refuse_mixed(step, state, where)
     loss.notes.append(f"{where}: stamps step by {step:.3f} s against the time of logging at state {state}")
 
 
-def _mixed(where: str, step: float, state: int) -> InputError:
-    return InputError(
+def _refuse_mixed(step: float, state: int, where: str) -> None:
+    refuse_if(
+        step > CLOCK_MIXED,
         f"{where}: mixed clocks: stamps jump by {step:.1f} s against the time of logging at state {state}",
         remedy="cut the log there, or give another --joint-topic",
     )

@@ -22,8 +22,9 @@ def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
     steps = np.diff(stamp_ns)
     if not len(steps):
         return np.zeros(0, dtype=np.intp)
-    longest = max(fixed.STATES_GAP_PERIODS * float(np.median(steps)), fixed.STATES_GAP_SECONDS * 1e9)
-    return np.flatnonzero(steps > longest)
+    return np.flatnonzero(
+        steps > max(fixed.STATES_GAP_PERIODS * float(np.median(steps)), fixed.STATES_GAP_SECONDS * 1e9)
+    )
 
 
 def smoothed_seconds(stamp_ns: Stamps) -> Float64:
@@ -66,7 +67,6 @@ class _Sums:
         return self._start + self._sums.shape[1] - 1
 
     def add(self, k: Float64, r: Float64) -> None:
-        """Add values (T,)."""
         rows = [np.cumsum(np.concatenate([s[-1:], v])) for s, v in zip(self._sums, (k, r, k**2, k * r), strict=True)]
         self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
 
@@ -75,7 +75,6 @@ class _Sums:
         return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
 
     def forget(self, before: int) -> None:
-        """Drop sums no later state needs."""
         if before > self._start:
             self._sums, self._start = self._sums[:, before - self._start :].copy(), before
 
@@ -99,7 +98,7 @@ def _numbers(seconds: Float64, period: float) -> Float64:
     return numbers
 
 
-def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
+def differentiate(stamp_ns: Stamps, position: Float64) -> Float64:
     """Velocities (T, J) [1/s] of positions (T, J) at rising stamps (T,) [ns].
 
     The slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for uneven steps), on
@@ -109,7 +108,7 @@ def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
 
 
 def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
-    """Yield `differentiated` by block: first state, velocities (K, J)."""
+    """Yield `differentiate` by block: first state, velocities (K, J)."""
     for start, end in pairwise([0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]):
         if end - start == 1:
             yield start, np.zeros((1, *position.shape[1:]))
@@ -142,32 +141,33 @@ class RawTrack(StateColumns):
     names: tuple[str, ...]
 
     def of_names(self, names: Sequence[str]) -> "RawTrack":
-        """Columns of these joints, in order."""
         order = np.array([self.names.index(name) for name in names], dtype=np.int64)
         return replace(self.of_joints(order), names=tuple(names))
 
 
-def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
+def clean_states(raw: RawTrack, loss: LossReport) -> StateColumns:
     """Sort states by stamp, each stamp once, each with velocities; changes are noted in `loss`.
 
     States with a position that is not finite are damage, and left out. Velocities that are absent, NaN, or always
     zero for a moving joint become position differences.
     """
-    ordered = unwrapped(_in_order(_finite(raw, loss), loss), loss)
+    ordered = unwrap(_sort(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)
     if len(gaps):
         longest = float(np.max(np.diff(ordered.stamp_ns)[gaps])) * 1e-9
         loss.state_gaps += len(gaps)
         loss.notes.append(f"{raw.where}: {len(gaps)} gaps between states, the longest {longest:.3f} s")
     num = len(ordered.stamp_ns)
-    velocity = _with_velocity(ordered, loss) if num else ordered.velocity
-    num_without = num - _num_posed(ordered)
+    velocity = _add_velocity(ordered, loss) if num else ordered.velocity
+    poses = [table for table in (ordered.T_base_ee, ordered.T_world_ee) if table is not None]
+    blocks = [[np.isfinite(T[first:last]).all(axis=(1, 2)) for T in poses] for first, last in ranges(len(ordered))]
+    num_without = num - sum(int(np.any(block, axis=0).sum()) for block in blocks)
     if 0 < num_without < num:
         loss.notes.append(f"{raw.where}: {num_without} of {num} states have no valid end-effector pose")
     return replace(ordered, velocity=velocity)
 
 
-def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
+def unwrap(raw: RawTrack, loss: LossReport) -> RawTrack:
     """Remove whole turns between states in time order, such as pi to -pi."""
     position, file = raw.position, RowFile(raw.position.shape[1:])
     turns: Float64 = np.zeros(position.shape[1])
@@ -191,15 +191,10 @@ def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
     return replace(raw, position=Rows(file))
 
 
-def _num_posed(raw: RawTrack) -> int:
-    poses = [table for table in (raw.T_base_ee, raw.T_world_ee) if table is not None]
-    blocks = [[np.isfinite(T[first:last]).all(axis=(1, 2)) for T in poses] for first, last in ranges(len(raw))]
-    return sum(int(np.any(block, axis=0).sum()) for block in blocks)
-
-
 def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:
-    blocks = (np.isfinite(block).all(axis=1) for block in blocks_of(raw.position))
-    is_finite = np.concatenate([np.zeros(0, np.bool_), *blocks])
+    is_finite = np.concatenate(
+        [np.zeros(0, np.bool_), *(np.isfinite(block).all(axis=1) for block in blocks_of(raw.position))]
+    )
     num_broken = int((~is_finite).sum())
     if not num_broken:
         return raw
@@ -208,7 +203,7 @@ def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:
     return raw.select(np.flatnonzero(is_finite))
 
 
-def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
+def _sort(raw: RawTrack, loss: LossReport) -> RawTrack:
     num_back = int((np.diff(raw.stamp_ns) < 0).sum())
     if num_back:
         loss.unsorted_states += num_back
@@ -229,11 +224,12 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
     return raw.select(np.flatnonzero(~is_again))
 
 
-def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
+def _add_velocity(raw: RawTrack, loss: LossReport) -> Table:
     num_taken, is_zero, why = _missing_velocities(raw)
     if not num_taken:
-        thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED))
-        _compare_units(thinned, loss)
+        _compare_units(
+            raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED)), loss
+        )
         return raw.velocity
     loss.differentiated_velocities += num_taken
     loss.notes.append(f"{raw.where}: {why}; they are differences of the positions")
@@ -270,7 +266,7 @@ def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
 
 def _compare_units(raw: RawTrack, loss: LossReport) -> None:
     position, velocity = raw.position[: len(raw.stamp_ns)], raw.velocity[: len(raw.stamp_ns)]
-    slopes: Float64 = differentiated(raw.stamp_ns, position)
+    slopes: Float64 = differentiate(raw.stamp_ns, position)
     is_fast = np.abs(slopes) > fixed.STATES_SPEED
     if is_fast.sum() < 10:
         return

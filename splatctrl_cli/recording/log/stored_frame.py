@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_DEPTH
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.spilled_rows import Table, blocks_of, ranges
 from splatctrl_cli.formats.arrays import npy_head, npy_of
 from splatctrl_cli.formats.image_file import JPEG, PNG
@@ -56,14 +56,10 @@ class JointTopics:
     chosen: str | None = None
 
 
-def with_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
-    """Merge the joints' report, its notes at index `at`."""
-    return loss.plus(joints, [*loss.notes[:at], *joints.notes, *loss.notes[at:]])
-
-
-def without_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
-    """Undo `with_joints`."""
-    return loss.plus(joints, [*loss.notes[:at], *loss.notes[at + len(joints.notes) :]], sign=-1)
+def merge_joints(loss: LossReport, joints: LossReport, at: int, *, sign: int = 1) -> LossReport:
+    """Add the joints' report to `loss`, its notes at index `at`; with sign -1, take it out."""
+    added, after = (joints.notes, at) if sign > 0 else ([], at + len(joints.notes))
+    return loss.plus(joints, [*loss.notes[:at], *added, *loss.notes[after:]], sign=sign)
 
 
 def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
@@ -155,15 +151,24 @@ def npy_bytes(depth: Float32) -> bytes:
 def _blocks(path: Path) -> Iterator[Float64]:
     with path.open("rb") as stream:
         shape, is_by_columns, dtype = npy_head(stream)
-        if dtype != np.dtype("<f8") or is_by_columns or not shape:
-            raise ValueError(f"{path.name}: expected rows of float64, got {dtype} {shape}")
-        if 8 * prod(shape) != path.stat().st_size - stream.tell():
-            raise ValueError(f"{path.name}: does not hold the {shape[0]} rows that it announces")
+        refuse_if(
+            dtype != np.dtype("<f8") or is_by_columns or not shape,
+            f"{path.name}: expected rows of float64, got {dtype} {shape}",
+            error=ValueError,
+        )
+        refuse_if(
+            8 * prod(shape) != path.stat().st_size - stream.tell(),
+            f"{path.name}: does not hold the {shape[0]} rows that it announces",
+            error=ValueError,
+        )
         for first, last in ranges(shape[0]):
             size = (last - first) * prod(shape[1:])
             values = np.frombuffer(stream.read(8 * size), dtype)  # no map: a file that shrinks would kill the program
-            if values.size != size:
-                raise ValueError(f"{path.name}: ends after {first + values.size} of {shape[0]} rows")
+            refuse_if(
+                values.size != size,
+                f"{path.name}: ends after {first + values.size} of {shape[0]} rows",
+                error=ValueError,
+            )
             yield values.reshape(last - first, *shape[1:])
 
 
@@ -241,10 +246,13 @@ class FrameSource:
 
     def digests(self) -> dict[str, str]:
         """sha256 of every input file, by name."""
+        return dict(self._digests)
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
         raise NotImplementedError
 
     def records(self) -> Iterator[Record]:
-        """Yield joint states and decoded frames."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
@@ -259,13 +267,9 @@ class FrameSource:
         return iter(())
 
 
-def is_kept(data: bytes | None) -> bool:
-    """True for JPEG or PNG, which captures keep."""
-    return data is not None and data.startswith((JPEG, PNG))
-
-
-def is_png(data: bytes | None) -> bool:
-    return data is not None and data.startswith(PNG)
+def is_kept(data: bytes | None, *kinds: bytes) -> bool:
+    """True for a JPEG or PNG, which captures keep, or for one of `kinds`."""
+    return data is not None and data.startswith(kinds or (JPEG, PNG))
 
 
 def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
@@ -274,14 +278,14 @@ def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
 
 def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
     """(H, W) uint8, 1 where not 0. Raises InputError unless 8-bit grey of that size."""
-    if pixels.dtype != np.uint8 or pixels.shape != (camera.height, camera.width):
-        size = "x".join(map(str, reversed(pixels.shape[:2])))
-        channels = pixels.shape[2] if pixels.ndim == 3 else 1
-        raise InputError(
-            f"{where}: expected an 8-bit grey mask of {camera.width}x{camera.height}, as the colour images,"
-            f" got {size} of {channels} channel(s), {pixels.dtype}",
-            remedy="write 0 where there is no person, anything else where there is one",
-        )
+    size = "x".join(map(str, reversed(pixels.shape[:2])))
+    channels = pixels.shape[2] if pixels.ndim == 3 else 1
+    refuse_if(
+        pixels.dtype != np.uint8 or pixels.shape != (camera.height, camera.width),
+        f"{where}: expected an 8-bit grey mask of {camera.width}x{camera.height}, as the colour images,"
+        f" got {size} of {channels} channel(s), {pixels.dtype}",
+        remedy="write 0 where there is no person, anything else where there is one",
+    )
     return np.asarray(pixels != 0, np.uint8)
 
 

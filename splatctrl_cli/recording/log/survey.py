@@ -1,7 +1,7 @@
 """A first pass over a log: topics, stamps, frames, calibrations, joints, first images and ``robot_description``."""
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_FEWEST_BACK, IMAGES_GAP, IMAGES_STEADY
+from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_GAP, IMAGES_STEADY
 from splatctrl_cli.recording.container.mcap_file import ChunkIndex
-from splatctrl_cli.recording.container.mcap_log import LogIndex, McapLog
+from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import (
     CAMERA_INFO,
@@ -64,7 +64,7 @@ def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.
 
 @dataclass(kw_only=True)
 class StampClock:
-    """A detector of header clocks that go back: a bag in a loop, a reset.
+    """A detector of header clocks that go back: a bag in a loop, a reset; single stamps may err.
 
     num_back: stamps over a second behind an earlier one; back_ns: the first one's distance, at log time back_log_ns.
     """
@@ -76,18 +76,12 @@ class StampClock:
     _latest_log_ns: int = 0
 
     def see(self, stamp_ns: int, log_time_ns: int) -> None:
-        """Take the next message in order."""
         if self._latest_ns is None or stamp_ns > self._latest_ns:
             self._latest_ns, self._latest_log_ns = stamp_ns, log_time_ns
         elif self._latest_ns - stamp_ns > IMAGES_BACK_NS and log_time_ns > self._latest_log_ns:
             if not self.num_back:
                 self.back_ns, self.back_log_ns = self._latest_ns - stamp_ns, log_time_ns
             self.num_back += 1
-
-    @property
-    def went_back(self) -> bool:
-        """True after several such stamps; single ones may err."""
-        return self.num_back >= IMAGES_FEWEST_BACK
 
 
 def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
@@ -291,7 +285,6 @@ def _calibration(message: Any) -> Calibration | None:
 
 
 def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
-    """Joint states; log time shifts all of a message."""
     states = read_states(decoded, message.topic.type_name, message.log_time_ns)
     if not result.by_log_time:
         return states
@@ -305,17 +298,21 @@ def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
     inner, video = (log.inner, log) if isinstance(log, VideoLog) else (log, None)
     if size < LARGE or not isinstance(inner, McapLog):
         return survey(log), ()
-    index = inner.index()
-    found = _sampled(inner, index, video)
-    return found, (
-        *index.notes,
+    counts, span_ns, chunks, notes = inner.index()
+    return _sample(inner, counts, span_ns, _first_chunks(counts, chunks), video), (
+        *notes,
         f"{size} bytes: described by index and first messages; neither checksums nor the rest were read",
     )
 
 
-def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
+def _sample(
+    log: McapLog,
+    counts: Mapping[int, int],
+    span_ns: tuple[int, int],
+    chunks: Sequence[ChunkIndex],
+    video: VideoLog | None,
+) -> Survey:
     found, decoder = Survey(), MessageDecoder()
-    chunks = _first_chunks(index)
     messages = log.messages_of(chunks, found.damage) if chunks else islice(log.messages(Damage()), 2000)
     messages = messages if video is None else video.decoded(messages, Damage())  # others lie between these chunks
     for message in messages:
@@ -324,20 +321,20 @@ def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
         found.topics.setdefault(topic.name, TopicSurvey(topic=topic))
     for entry in found.topics.values():
         entry.count = 0
-    for channel, count in index.counts.items():
-        counted = log.topic_of(channel)
+    for channel, count in counts.items():
+        counted = log.channels.get(channel)
         if counted is not None:
             entry = found.topics[counted.name]
             entry.count += count
-            entry.first_log_ns = entry.first_log_ns or index.first_ns
-            entry.last_log_ns = index.last_ns
+            entry.first_log_ns = entry.first_log_ns or span_ns[0]
+            entry.last_log_ns = span_ns[1]
     return found
 
 
-def _first_chunks(index: LogIndex) -> list[ChunkIndex]:
-    wanted = {chunk.chunk_start_offset: chunk for chunk in index.chunks[:4]}
-    for channel in sorted(index.counts):
-        first = next((c for c in index.chunks if channel in c.message_index_offsets), None)
+def _first_chunks(counts: Mapping[int, int], chunks: Sequence[ChunkIndex]) -> list[ChunkIndex]:
+    wanted = {chunk.chunk_start_offset: chunk for chunk in chunks[:4]}
+    for channel in sorted(counts):
+        first = next((c for c in chunks if channel in c.message_index_offsets), None)
         if first is not None:
             wanted[first.chunk_start_offset] = first
     chosen: list[ChunkIndex] = []
@@ -354,16 +351,8 @@ STRING, EVENT = "std_msgs/msg/String", "rcl_interfaces/msg/ParameterEvent"
 _TEXT = 4  # a parameter's type that is text (rcl_interfaces/ParameterType)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotDescription:
-    """A URDF and its topic or node."""
-
-    where: str
-    text: str
-
-
-def robot_descriptions(log: RawLog) -> list[RobotDescription]:
-    """A log's URDFs, each once, from first messages; reads only their topics."""
+def robot_descriptions(log: RawLog) -> list[tuple[str, str]]:
+    """Topic or node and text of a log's URDFs, each once, from first messages; reads only their topics."""
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     wanted = own or {t.name for t in topics if t.type_name == EVENT}
@@ -385,4 +374,4 @@ def robot_descriptions(log: RawLog) -> list[RobotDescription]:
         if own and own <= found.keys():
             break
     where = {text: name for name, text in reversed(found.items()) if text.strip()}
-    return [RobotDescription(where=name, text=text) for text, name in reversed(where.items())]
+    return [(name, text) for text, name in reversed(where.items())]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if, require
 from splatctrl_cli.libraries import is_installed, of_extra
 from splatctrl_cli.recording.container.log_formats import AZURE_KINECT, open_raw_log, refuse_foreign
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
@@ -56,8 +56,6 @@ class _Stream:
 
 
 class VideoLog(RawLog):
-    """A log with video as images."""
-
     def __init__(self, log: RawLog) -> None:
         self.inner = log
         self.path, self.files, self.container = log.path, log.files, log.container
@@ -69,7 +67,6 @@ class VideoLog(RawLog):
         return self.decoded(self.inner.messages(damage, names), damage)
 
     def decoded(self, messages: Iterable[RawMessage], damage: Damage) -> Iterator[RawMessage]:
-        """Decode some of the log's messages, in order."""
         streams: dict[str, _Stream | None] = {}
         decoder = MessageDecoder()
         for message in messages:
@@ -193,61 +190,54 @@ class VideoFileLog(RawLog):
     def __init__(self, path: Path) -> None:
         self.path = path
         beside = next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None)
-        if beside is None:
-            raise InputError(
-                f"{path}: no stamps beside it",
-                remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
-                + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
-            )
+        beside = require(
+            beside,
+            f"{path}: no stamps beside it",
+            remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
+            + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
+        )
         self._av = of_extra(LIBRARY, EXTRA, "video files")
-        self.files = (path, beside)
-        self._stamps = _read_stamps(beside)
-        self._topic = Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)
-
-    def topics(self) -> tuple[Topic, ...]:
-        return (self._topic,)
+        self.files, self._stamps = (path, beside), _read_stamps(beside)
+        self.channels = {0: Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)}
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield the images. Raises InputError if they and the stamps differ in number."""
-        if names is not None and self._topic.name not in names:
+        if names is not None and self.channels[0].name not in names:
             return
         num, found = 0, Damage()
         for frame in self._frames(found):
             if frame is not None and num < len(self._stamps):
-                yield self._message(frame, int(self._stamps[num]))
+                seconds, nanoseconds = divmod(int(self._stamps[num]), SECOND_NS)
+                header = SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id="")
+                yield RawMessage(
+                    topic=self.channels[0],
+                    log_time_ns=int(self._stamps[num]),
+                    data=pack_image(header, frame.to_ndarray(format="rgb24")),
+                    file=self.path.name,
+                )
             num += 1
         for note in found.notes:
             damage.add(note)
-        if num != len(self._stamps) and not found.count:
-            raise InputError(
-                f"{self.path}: {num} images, but {len(self._stamps)} stamps in {self.files[1].name}",
-                remedy="write a stamp for each image of the file",
-            )
+        refuse_if(
+            num != len(self._stamps) and not found.count,
+            f"{self.path}: {num} images, but {len(self._stamps)} stamps in {self.files[1].name}",
+            remedy="write a stamp for each image of the file",
+        )
 
     def _frames(self, damage: Damage) -> Iterator[Any]:
         try:
             with self._av.open(str(self.path)) as container:
-                if not container.streams.video:
-                    raise InputError(f"{self.path}: a file without video", remedy="give the colour camera's video")
+                refuse_if(
+                    not container.streams.video,
+                    f"{self.path}: a file without video",
+                    remedy="give the colour camera's video",
+                )
                 for frame in container.decode(video=0):
                     if frame.is_corrupt:
                         damage.add(f"{self.path.name}: an image at {frame.time} s is damaged")
                     yield None if frame.is_corrupt else frame
         except (self._av.FFmpegError, OSError) as error:
             damage.add(f"{self.path.name}: cannot be decoded further: {error}")
-
-    def _message(self, frame: Any, stamp_ns: int) -> RawMessage:
-        return RawMessage(
-            topic=self._topic,
-            log_time_ns=stamp_ns,
-            data=pack_image(
-                SimpleNamespace(
-                    stamp=SimpleNamespace(sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS), frame_id=""
-                ),
-                frame.to_ndarray(format="rgb24"),
-            ),
-            file=self.path.name,
-        )
 
 
 def _read_stamps(path: Path) -> Stamps:
@@ -259,17 +249,16 @@ def _read_stamps(path: Path) -> Stamps:
         lines, rows = lines[1:], rows[1:]
     elif rows and len(rows[0]) > 1:
         column = -1
-    if column < 0 or not rows:
-        raise InputError(
-            f"{path}: expected a stamp a line, or columns whose first line names one time or stamp",
-            remedy="write the images' times alone, in seconds",
-        )
-    values = []
-    for row, line in zip(rows, lines, strict=True):
-        value = _number(row[column]) if column < len(row) else None
-        if value is None:
-            raise InputError(f"{path}: expected a time, got {line[:80]!r}", remedy="correct the line")
-        values.append(value)
+    refuse_if(
+        column < 0 or not rows,
+        f"{path}: expected a stamp a line, or columns whose first line names one time or stamp",
+        remedy="write the images' times alone, in seconds",
+    )
+    found = [_number(row[column]) if column < len(row) else None for row in rows]
+    values = [value for value in found if value is not None]
+    if len(values) < len(rows):
+        line = lines[found.index(None)]
+        raise InputError(f"{path}: expected a time, got {line[:80]!r}", remedy="correct the line")
     digits = len(str(abs(int(values[0]))))
     unit_ns = next(unit for most, unit in _UNITS_NS if digits <= most)
     return np.array([round(value * unit_ns) for value in values], dtype=np.int64)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.recording.calibrated import calibrated
 from splatctrl_cli.recording.capture.capture import CaptureSource, is_capture
@@ -20,8 +20,8 @@ from splatctrl_cli.recording.folder.image_folder import has_views
 from splatctrl_cli.recording.log.decoder import MessageDecoder, UndecodableMessageError, is_ros, stamp_ns
 from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_columns import StateColumns
-from splatctrl_cli.recording.log.state_topics import joint_records, with_prefix
-from splatctrl_cli.recording.log.state_track import RawTrack, cleaned
+from splatctrl_cli.recording.log.state_topics import joint_records, match_prefix
+from splatctrl_cli.recording.log.state_track import RawTrack, clean_states
 from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.log.video import open_log
@@ -29,14 +29,13 @@ from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_table import (
     ARRAY_FILES,
+    INFO,
     TIME_UNITS_NS,
     columns_of,
     dataset_track,
-    described_track,
-    is_lerobot,
-    is_libfranka,
     libfranka_track,
     read_csv,
+    read_described_track,
 )
 from splatctrl_cli.records import Float64, LossReport, Stamps
 
@@ -48,8 +47,6 @@ _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 
 
 class StateSource(FrameSource):
-    """Joint states without frames."""
-
     def __init__(
         self, name: str, files: Sequence[Path], names: tuple[str, ...], states: StateColumns, loss: LossReport
     ) -> None:
@@ -72,33 +69,33 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
 
     Raises InputError if missing, or without usable states.
     """
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
     if path.suffix == ".csv":
         options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
         return _libfranka(path, joints)
     if path.suffix == ".toml" and has_table(path, "states"):
         options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
-        raw, file = described_track(path)
-        return _of_table(path, (path, file), raw, LossReport())
-    if path.suffix.lower() in ARRAY_FILES:
-        raise InputError(
-            f"{path}: a file of arrays, of which none is known to be joint states",
-            remedy="describe them in a .toml and give that (splatctrl help replay, Logs)",
-        )
-    if is_lerobot(path):
+        raw, file = read_described_track(path)
+        return _open_table(path, (path, file), raw, LossReport())
+    refuse_if(
+        path.suffix.lower() in ARRAY_FILES,
+        f"{path}: a file of arrays, of which none is known to be joint states",
+        remedy="describe them in a .toml and give that (splatctrl help replay, Logs)",
+    )
+    if (path / INFO).is_file() and (path / "data").is_dir():
         options.refuse(_NOT_FOR_TABLES, "a LeRobot dataset", path)
         raw, file = dataset_track(path)
-        return _of_table(path, (file,), raw, LossReport(notes=["times are seconds from the episode's begin"]))
+        return _open_table(path, (file,), raw, LossReport(notes=["times are seconds from the episode's begin"]))
     if is_capture(path):
         return calibrated(CaptureSource(path, options, joints), options)
     if path.suffix == ".toml" or has_views(path):
         return open_source(path, options)
-    return _of_log(path, open_log(path), options, joints)
+    return _open_log_states(path, open_log(path), options, joints)
 
 
-def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
-    """Open with frames if possible; else the states, with a note."""
+def _open_log_states(
+    path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]
+) -> FrameSource | StateSource:
     default = SourceOptions()
     try:
         return calibrated(RosLogSource(log, options, joints), options)
@@ -122,24 +119,17 @@ def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[st
 
 
 def _libfranka(path: Path, joints: Sequence[str]) -> StateSource:
-    table = read_csv(path)
-    if not is_libfranka(table):
-        raise InputError(
-            f"{path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
-            remedy="describe the columns in a .toml and give that (splatctrl help replay, Logs)",
-        )
-    raw = libfranka_track(table)
-    names = with_prefix(raw.names, joints)
+    raw = libfranka_track(read_csv(path))
+    names = match_prefix(raw.names, joints)
     loss = LossReport(notes=["times are those of the robot, in ms since it was switched on"])
     if len(names) == len(raw.names):
         raw = replace(raw, names=tuple(names[name] for name in raw.names))
-    return _of_table(path, (path,), raw, loss)
+    return _open_table(path, (path,), raw, loss)
 
 
-def _of_table(path: Path, files: Sequence[Path], raw: RawTrack, loss: LossReport) -> StateSource:
-    states = cleaned(raw, loss)
-    if not states:
-        raise InputError(f"{path}: expected joint states, got none that is finite", remedy="check the file")
+def _open_table(path: Path, files: Sequence[Path], raw: RawTrack, loss: LossReport) -> StateSource:
+    states = clean_states(raw, loss)
+    refuse_if(not states, f"{path}: expected joint states, got none that is finite", remedy="check the file")
     return StateSource(path.name, files, raw.names, states, loss)
 
 
@@ -183,10 +173,11 @@ def read_twists(path: Path, topic: str) -> LoggedTwists:
     """
     if path.suffix == ".toml":
         return _read_described(path, topic)
-    if not path.is_file() and not is_bag_folder(path):
-        raise InputError(
-            f"{path}: expected a log to take the twists {topic} from", remedy="give the log that it was made of"
-        )
+    refuse_if(
+        not path.is_file() and not is_bag_folder(path),
+        f"{path}: expected a log to take the twists {topic} from",
+        remedy="give the log that it was made of",
+    )
     return _read_logged(path, topic)
 
 
@@ -223,36 +214,39 @@ def _read_logged(path: Path, topic: str) -> LoggedTwists:
 
 
 def _read_described(path: Path, name: str) -> LoggedTwists:
-    if name != TABLE or not has_table(path, TABLE):
-        raise InputError(f"{path}: expected a table [{TABLE}], got {name}", remedy=f"{_SEE}, and name it so")
+    refuse_if(
+        name != TABLE or not has_table(path, TABLE),
+        f"{path}: expected a table [{TABLE}], got {name}",
+        remedy=f"{_SEE}, and name it so",
+    )
     table = read_table(TwistsTable, path, TABLE, beside=("states",))
-    if table.time_unit not in TIME_UNITS_NS or (len(table.linear), len(table.angular)) != (3, 3):
-        raise InputError(
-            f"{path}: {TABLE}: expected linear and angular of 3 columns and time_unit of {', '.join(TIME_UNITS_NS)}",
-            remedy=_SEE,
-        )
-    columns = columns_of(path, TABLE, table.file)
-    stamps, found = columns.read(
+    refuse_if(
+        table.time_unit not in TIME_UNITS_NS or (len(table.linear), len(table.angular)) != (3, 3),
+        f"{path}: {TABLE}: expected linear and angular of 3 columns and time_unit of {', '.join(TIME_UNITS_NS)}",
+        remedy=_SEE,
+    )
+    stamps, found = columns_of(path, TABLE, table.file).read(
         table.time, TIME_UNITS_NS[table.time_unit], {"twist": [*table.linear, *table.angular]}, table.epoch_ns
     )
     twists = found["twist"][: len(found["twist"])]
-    if twists.shape != (len(stamps), 6):
-        raise InputError(f"{path}: {TABLE}: expected 6 columns of {len(stamps)} rows, got {twists.shape[::-1]}")
+    refuse_if(
+        twists.shape != (len(stamps), 6),
+        f"{path}: {TABLE}: expected 6 columns of {len(stamps)} rows, got {twists.shape[::-1]}",
+    )
     return _checked(f"{path}: {TABLE}", stamps, twists, [table.frame] * len(stamps), [])
 
 
 def _checked(where: str, stamps: Stamps, twists: Float64, frames: list[str], notes: list[str]) -> LoggedTwists:
-    if len(set(frames)) > 1:
-        raise InputError(
-            f"{where}: expected twists in one frame, got {', '.join(sorted(set(frames)))}",
-            remedy="record one frame's only",
-        )
+    refuse_if(
+        len(set(frames)) > 1,
+        f"{where}: expected twists in one frame, got {', '.join(sorted(set(frames)))}",
+        remedy="record one frame's only",
+    )
     is_finite = np.isfinite(twists).all(axis=1)
     if not is_finite.all():
         notes.append(f"{int((~is_finite).sum())} twists with NaN or infinity: left out")
         stamps, twists = stamps[is_finite], twists[is_finite]
-    if not len(stamps):
-        raise InputError(f"{where}: expected twists, got none that is finite", remedy="check the recording")
+    refuse_if(not len(stamps), f"{where}: expected twists, got none that is finite", remedy="check the recording")
     order = np.argsort(stamps, kind="stable")
     stamps, twists = stamps[order], twists[order]
     is_last = np.append(np.diff(stamps) > 0, True)

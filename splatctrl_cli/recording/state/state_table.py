@@ -9,6 +9,7 @@ seconds from the episode's begin.
 import csv
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, absent, blocks_of, scaled
 from splatctrl_cli.formats.arrays import ArrayFile, Hdf5File, NpzFile, ParquetFile
 from splatctrl_cli.recording.folder.folder_description import read_table
@@ -25,6 +26,11 @@ from splatctrl_cli.recording.folder.poses import stamp_of_text
 from splatctrl_cli.recording.log.state_messages import NAMELESS, pose_of_columns, pose_of_quat, rigid_or_none
 from splatctrl_cli.recording.log.state_track import RawTrack
 from splatctrl_cli.records import Float64, Stamps
+
+
+def _refuse_unreadable(path: Path) -> AbstractContextManager[None]:
+    faults = (OSError, UnicodeDecodeError, csv.Error)
+    return refuse_faults(f"{path}: cannot be read as CSV", *faults, remedy="check the file")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +44,11 @@ class CsvTable:
         """The first column so named; a number is unchanged. Raises InputError."""
         if isinstance(name, int):
             return name
-        if name not in self.names:
-            raise InputError(f"{self.path}: no column {name!r}", remedy=f"columns there: {', '.join(self.names)}")
+        refuse_if(
+            name not in self.names,
+            f"{self.path}: no column {name!r}",
+            remedy=f"columns there: {', '.join(self.names)}",
+        )
         return self.names.index(name)
 
     def read(
@@ -57,8 +66,7 @@ class CsvTable:
             stamps.extend(self._stamp(row, number, at, unit_ns) + epoch_ns for number, row in rows.items())
             for name, columns in chosen.items():
                 files[name].append(self._numbers(rows, columns))
-        if not stamps:
-            raise InputError(f"{self.path}: expected joint states, got none", remedy="record them again")
+        refuse_if(not stamps, f"{self.path}: expected joint states, got none", remedy="record them again")
         return np.array(stamps, dtype=np.int64), {name: Rows(file) for name, file in files.items()}
 
     def _blocks(self) -> Iterator[dict[int, list[str]]]:
@@ -68,10 +76,8 @@ class CsvTable:
             lines = ((reader.line_num, row) for row in reader if row)
             next(lines, None)
             while True:
-                try:
+                with _refuse_unreadable(self.path):
                     rows = dict(islice(lines, BLOCK))
-                except (OSError, UnicodeDecodeError, csv.Error) as error:
-                    raise _unreadable(self.path, error) from None
                 if not rows:
                     return
                 for number, row in rows.items():
@@ -108,23 +114,10 @@ class CsvTable:
 
 def read_csv(path: Path) -> CsvTable:
     """Open a CSV. Raises InputError without states."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = list(islice((line for line in csv.reader(stream) if line), 2))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise _unreadable(path, error) from None
-    if len(lines) < 2:
-        raise InputError(f"{path}: expected joint states, got none", remedy="record them again")
+    with _refuse_unreadable(path), path.open(newline="", encoding="utf-8-sig") as stream:
+        lines = list(islice((line for line in csv.reader(stream) if line), 2))
+    refuse_if(len(lines) < 2, f"{path}: expected joint states, got none", remedy="record them again")
     return CsvTable(path=path, names=[name.strip().lstrip("# ") for name in lines[0]])
-
-
-def _unreadable(path: Path, error: Exception) -> InputError:
-    return InputError(f"{path}: cannot be read as CSV: {error}", remedy="check the file")
-
-
-def is_libfranka(table: CsvTable) -> bool:
-    """True for the columns of franka::logToCSV."""
-    return table.names[0] in {"time", "duration"} and _first(table, "q", 0) is not None
 
 
 def libfranka_track(table: CsvTable) -> RawTrack:
@@ -134,13 +127,17 @@ def libfranka_track(table: CsvTable) -> RawTrack:
     prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second columns ``dq_d``
     (libfranka, src/log.cpp, src/logging/robot_state_log.cpp). O_T_EE is the end effector's pose by columns.
     """
+    refuse_if(
+        table.names[0] not in {"time", "duration"} or _first(table, "q", 0) is None,
+        f"{table.path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
+        remedy="describe the columns in a .toml and give that (splatctrl help replay, Logs)",
+    )
     num = len(NAMELESS)
-    position = _block(table, "q", num)
-    if position is None:
-        raise InputError(
-            f"{table.path}: expected columns q[0] to q[6], got fewer",
-            remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
-        )
+    position = require(
+        _block(table, "q", num),
+        f"{table.path}: expected columns q[0] to q[6], got fewer",
+        remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
+    )
     sent, desired = _sent(table, num), _block(table, "dq_d", num)
     wanted = {
         "position": position,
@@ -194,27 +191,28 @@ def _sent(table: CsvTable, num: int) -> list[int] | None:
 INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_index"
 
 
-def is_lerobot(path: Path) -> bool:
-    return (path / INFO).is_file() and (path / "data").is_dir()
-
-
 def lerobot_preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
     """An episode's keys of [states], by default the only one. Raises InputError."""
     info = read_json(folder / INFO)
-    try:
+    with refuse_faults(
+        lambda error: f"{folder / INFO}: expected total_episodes and the feature {POSITION}, got no usable {error}",
+        KeyError,
+        TypeError,
+        ValueError,
+        IndexError,
+        remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
+    ):
         feature, num = info["features"][POSITION], int(info["total_episodes"])
         size, said = int(feature["shape"][0]), feature.get("names")
         lists = said.values() if isinstance(said, dict) else [said or []]  # by kind, as {"motors": [...]}
         names = [
             str(name).removesuffix(".pos") for names in lists for name in names
         ]  # shoulder_pan.pos is shoulder_pan
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(
-            f"{folder / INFO}: expected total_episodes and the feature {POSITION}, got no usable {error}",
-            remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
-        ) from None
-    if episode is None and num != 1:
-        raise InputError(f"{folder}: {num} episodes", remedy="choose one in a .toml: [states] preset, file, episode")
+    refuse_if(
+        episode is None and num != 1,
+        f"{folder}: {num} episodes",
+        remedy="choose one in a .toml: [states] preset, file, episode",
+    )
     return {
         "time": "timestamp",
         "position": [POSITION],
@@ -228,10 +226,8 @@ def _file(folder: Path, episode: int) -> Path:
     files = sorted((folder / "data").glob("*/*.parquet"))
     of_one = [file for file in files if file.stem == f"episode_{episode:06d}"]
     shared = (file for file in files if file.stem.startswith("file") and len(ParquetFile(file, (EPISODE, episode))))
-    found = next(iter(of_one), None) or next(shared, None)
-    if found is None:
-        raise InputError(f"{folder}: no episode {episode}", remedy="copy the whole dataset, or give another episode")
-    return found
+    found, remedy = next(iter(of_one), None) or next(shared, None), "copy the whole dataset, or give another episode"
+    return require(found, f"{folder}: no episode {episode}", remedy=remedy)
 
 
 UNITS = {"rad": 1.0, "deg": float(np.pi / 180.0)}
@@ -269,9 +265,9 @@ class StatesTable:
     episode: int | None = None
 
 
-def described_track(path: Path) -> tuple[RawTrack, Path]:
+def read_described_track(path: Path) -> tuple[RawTrack, Path]:
     """Read described states, and their file. Raises InputError naming key or column."""
-    table = read_table(StatesTable, path, "states", beside=("twists",), fill=lambda given: with_preset(path, given))
+    table = read_table(StatesTable, path, "states", beside=("twists",), fill=lambda given: fill_preset(path, given))
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),
         "time_unit": tuple(TIME_UNITS_NS),
@@ -279,41 +275,41 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
         "pose_order": ("rows", "columns"),
     }
     for key, allowed in choices.items():
-        if getattr(table, key) not in allowed:
-            raise InputError(
-                f"{path}: states.{key}: expected one of {', '.join(allowed)}, got {getattr(table, key)!r}",
-                remedy=_SEE,
-            )
-    if not table.joints or len(set(table.joints)) < len(table.joints):
-        raise InputError(f"{path}: states.joints: expected names, each once, got {table.joints}", remedy=_SEE)
+        refuse_if(
+            getattr(table, key) not in allowed,
+            f"{path}: states.{key}: expected one of {', '.join(allowed)}, got {getattr(table, key)!r}",
+            remedy=_SEE,
+        )
+    refuse_if(
+        not table.joints or len(set(table.joints)) < len(table.joints),
+        f"{path}: states.joints: expected names, each once, got {table.joints}",
+        remedy=_SEE,
+    )
     if table.preset and table.episode is not None:
-        return _of_episode(table, table.episode, path)
+        return _track(table, ParquetFile(Path(table.file), (EPISODE, table.episode)), path), Path(table.file)
     return _track(table, columns_of(path, "states", table.file), path), path.parent / table.file
 
 
 def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
     """A LeRobot dataset's only episode, and its file. Raises InputError."""
     found = dict(lerobot_preset(folder, None))
-    if "joints" not in found:
-        raise InputError(
-            f"{folder / INFO}: {POSITION} has no name for each joint",
-            remedy="give a .toml: [states] preset, file, joints (splatctrl help replay, Logs)",
-        )
-    return _of_episode(StatesTable(**found), found["episode"], folder)
+    refuse_if(
+        "joints" not in found,
+        f"{folder / INFO}: {POSITION} has no name for each joint",
+        remedy="give a .toml: [states] preset, file, joints (splatctrl help replay, Logs)",
+    )
+    file = Path(found["file"])
+    return _track(StatesTable(**found), ParquetFile(file, (EPISODE, found["episode"])), folder), file
 
 
-def _of_episode(table: StatesTable, episode: int, path: Path) -> tuple[RawTrack, Path]:
-    file = Path(table.file)
-    return _track(table, ParquetFile(file, (EPISODE, episode)), path), file
-
-
-def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
+def fill_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
     """Fill [states] of TOML file `path` by its preset."""
     name = given.get("preset", "")
     if not name:
         return given
-    if name not in PRESETS:
-        raise InputError(f"{path}: states.preset: expected one of {', '.join(PRESETS)}, got {name!r}", remedy=_SEE)
+    refuse_if(
+        name not in PRESETS, f"{path}: states.preset: expected one of {', '.join(PRESETS)}, got {name!r}", remedy=_SEE
+    )
     found = PRESETS[name](path.parent / str(given.get("file", ".")), given.get("episode"))
     return {**found, **given, "file": found["file"]}
 
@@ -321,8 +317,9 @@ def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
 def columns_of(path: Path, table: str, name: str) -> CsvTable | ArrayFile:
     """Columns that a table of TOML file `path` names. Raises InputError."""
     file = path.parent / name
-    if not file.is_file():
-        raise InputError(f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml")
+    refuse_if(
+        not file.is_file(), f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml"
+    )
     kind = ARRAY_FILES.get(file.suffix.lower())
     return read_csv(file) if kind is None else kind(file)
 
@@ -338,11 +335,11 @@ def _track(table: StatesTable, columns: CsvTable | ArrayFile, path: Path) -> Raw
         table.epoch_ns,
     )
     for key, block in found.items():
-        if key != "pose" and block.shape != (len(stamps), num):
-            raise InputError(
-                f"{path}: states.{key}: expected {num} columns of {len(stamps)} states, got {block.shape[::-1]}",
-                remedy="one column per joint",
-            )
+        refuse_if(
+            key != "pose" and block.shape != (len(stamps), num),
+            f"{path}: states.{key}: expected {num} columns of {len(stamps)} states, got {block.shape[::-1]}",
+            remedy="one column per joint",
+        )
     position, velocity = scaled(found["position"], factor), found.get("velocity")
     commanded = found.get("commanded_velocity")
     poses = _poses(table, found.get("pose"), path, len(stamps))
@@ -361,11 +358,11 @@ def _track(table: StatesTable, columns: CsvTable | ArrayFile, path: Path) -> Raw
 def _poses(table: StatesTable, rows: Rows | None, path: Path, num_states: int) -> Rows | None:
     if rows is None:
         return None
-    if rows.shape[1] not in {7, 16} or len(rows) != num_states:
-        raise InputError(
-            f"{path}: states.pose: expected 7 or 16 columns of {num_states} states, got {rows.shape[::-1]}",
-            remedy=_SEE,
-        )
+    refuse_if(
+        rows.shape[1] not in {7, 16} or len(rows) != num_states,
+        f"{path}: states.pose: expected 7 or 16 columns of {num_states} states, got {rows.shape[::-1]}",
+        remedy=_SEE,
+    )
     if rows.shape[1] == 7:
         return poses_of(rows, lambda row: pose_of_quat(row[:3], row[3:]))
     if table.pose_order == "columns":

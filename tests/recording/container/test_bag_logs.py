@@ -124,8 +124,8 @@ def test_a_damaged_chunk_costs_itself_alone_and_a_cut_what_follows(
 ) -> None:
     bag = make_bag1(tmp_path / "x.bag", compression)
     records, data = list(Bag1Log(bag).records(Damage())), bag.read_bytes()
-    chunks = [record for record in records if record.kind == 5]
-    bag.write_bytes(change(data, data.index(chunks[1].body), records[-1].offset))
+    chunks = [record for record in records if record.opcode == 5]
+    bag.write_bytes(change(data, data.index(chunks[1].content), records[-1].offset))
     found, damage = read(bag)
     assert len(found) in num
     assert damage.notes[0] == f"x.bag: {note.format(chunks[1].offset, chunks[2].offset)}"

@@ -22,7 +22,14 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.recording.container.log_formats import CONTAINERS, FOREIGN, Foreign, open_raw_log, refuse_foreign
+from splatctrl_cli.recording.container.log_formats import (
+    CONTAINERS,
+    FOREIGN,
+    SUFFIXES,
+    Foreign,
+    open_raw_log,
+    refuse_foreign,
+)
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.recording.source import describe, open_source
@@ -176,16 +183,16 @@ def test_what_was_written_is_read_and_cut_anywhere_a_part_of_it(
     check()
 
 
-@pytest.mark.parametrize("kind", CONTAINERS, ids=lambda kind: kind.suffix)
-@pytest.mark.parametrize("suffix", ["", *(kind.suffix for kind in CONTAINERS)])
-def test_a_log_is_known_by_its_first_bytes(tmp_path: Path, kind: Any, suffix: str) -> None:
-    path = tmp_path / f"x{suffix}"
-    WRITERS[kind.suffix[1:] if kind.open is not McapLog else "mcap ZSTD"](path, [("/a", 5 * 10**9, b"data")])
-    assert type(open_raw_log(path)) is kind.open
+@pytest.mark.parametrize("kind", SUFFIXES)
+@pytest.mark.parametrize("suffix", ["", *SUFFIXES])
+def test_a_log_is_known_by_its_first_bytes(tmp_path: Path, kind: str, suffix: str) -> None:
+    path, (_, opener) = tmp_path / f"x{suffix}", CONTAINERS[kind]
+    WRITERS[kind[1:] if opener is not McapLog else "mcap ZSTD"](path, [("/a", 5 * 10**9, b"data")])
+    assert type(open_raw_log(path)) is opener
 
 
 @pytest.mark.parametrize("content", [b"hello, this is text", b""])
-@pytest.mark.parametrize("suffix", [kind.suffix for kind in CONTAINERS])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_what_is_no_log_is_refused_by_its_bytes(tmp_path: Path, suffix: str, content: bytes) -> None:
     said = (
         f"does not begin like a {suffix} file (first bytes b'hello, t')" if content else "the file is empty (0 bytes)"

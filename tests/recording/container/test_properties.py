@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import npy_of, read_arrays, savez
+from splatctrl_cli.formats.unpacking import BadBlockError
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.recording.container.mcap_file import BadRecordError, parse_record
+from splatctrl_cli.recording.container.mcap_file import parse_record
 from splatctrl_cli.recording.folder.poses import READERS
 from splatctrl_cli.recording.log.messages import decode_rvl
 from splatctrl_cli.recording.log.registration import TfTree
@@ -25,7 +26,7 @@ from tests.recording.log.test_decoder import encoded_rvl
 def test_bytes_that_are_no_record_of_an_mcap_are_refused_as_such(opcode: int, content: bytes) -> None:
     try:
         parse_record(opcode, content)
-    except BadRecordError as error:
+    except BadBlockError as error:
         assert "record" in str(error)
 
 

@@ -16,7 +16,7 @@ import pytest
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
 from splatctrl_cli.recording.folder.dtu import DtuView
-from splatctrl_cli.recording.folder.dtu_source import shrunk
+from splatctrl_cli.recording.folder.dtu_source import shrink_view
 from splatctrl_cli.recording.folder.poses import OPENGL_FROM_OPTICAL
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
@@ -340,7 +340,7 @@ def half_size(view: DtuView) -> DtuView:
     k = view.intrinsics
     mask = np.zeros((k.height // 2, k.width // 2), np.bool_)
     mask[20:-20, 30:-30] = True
-    return replace(shrunk(view, 2), mask=mask)
+    return replace(shrink_view(view, 2), mask=mask)
 
 
 def changed_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -14,7 +14,7 @@ from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, project
 from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
-from splatctrl_cli.recording.folder.dtu_source import DtuSource, shrunk, view_numbers
+from splatctrl_cli.recording.folder.dtu_source import DtuSource, shrink_view, view_numbers
 from splatctrl_cli.recording.folder.idr import decompose, projection, read_idr, write_idr
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Intrinsics
@@ -163,7 +163,7 @@ def test_cameras_and_depth_of_the_full_size_fit_images_made_smaller(scan: Path) 
         depth=FULL_DEPTH / np.float32(1000),
         intrinsics=Intrinsics(fx=2892.3, fy=2883.2, cx=823.2, cy=619.1, width=1600, height=1200),
     )
-    small = shrunk(at_full_size, 4)
+    small = shrink_view(at_full_size, 4)
     assert small.intrinsics == found.intrinsics
     np.testing.assert_array_equal(small.depth, found.depth)
 
@@ -329,7 +329,7 @@ def test_a_view_made_smaller_sees_the_same_points_at_the_same_places() -> None:
     color = np.zeros((48, 64, 3), np.uint8)
     color[8:12, 20:24] = 200
     full = replace(VIEWS[0], color=color, mask=color[:, :, 0] > 0)
-    small = shrunk(full, 4)
+    small = shrink_view(full, 4)
     assert small.color.shape == (12, 16, 3)
     assert small.color[2, 5, 0] == 200
     assert small.color.sum() == 3 * 200
@@ -338,7 +338,7 @@ def test_a_view_made_smaller_sees_the_same_points_at_the_same_places() -> None:
     point = np.column_stack([(center_of_patch - [K.cx, K.cy]) / [K.fx, K.fy], [1.0]])
     np.testing.assert_allclose(project(full.intrinsics, point), center_of_patch)
     np.testing.assert_allclose(project(small.intrinsics, point), [[5.0, 2.0]])
-    expect_refusal("--downscale 5: expected a whole factor of 64x48", shrunk, full, 5, error=UsageError)
+    expect_refusal("--downscale 5: expected a whole factor of 64x48", shrink_view, full, 5, error=UsageError)
 
 
 def test_a_protocol_makes_images_as_small_as_its_published_figures_are_of(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.geometry import invert_transform, quat_from_rotation, transform_from
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import RawMessage
-from splatctrl_cli.recording.log.registration import DepthToColor
+from splatctrl_cli.recording.log.registration import warp_depth
 from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -138,8 +138,7 @@ def test_the_edges_of_a_real_recording_meet_only_this_way_round(real_data: Path)
 
 def edge_score(frame: RgbdFrame, T_new_old: np.ndarray[Any, Any]) -> float:
 
-    warp = DepthToColor(depth_intrinsics=frame.intrinsics, color_intrinsics=frame.intrinsics, T_color_depth=T_new_old)
-    depth = warp.warp(frame.depth)
+    depth = warp_depth(frame.depth, frame.intrinsics, frame.intrinsics, T_new_old)
     window = np.ones((9, 9), np.uint8)
     edge = cv2.dilate(depth, window) - cv2.erode(np.where(depth > 0, depth, np.float32(99)), window) > 0.2
     grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)

@@ -3,12 +3,13 @@
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from pinocchio.rpy import rpyToMatrix
 
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.recording.log.registration import DepthToColor, Undistortion
+from splatctrl_cli.recording.log.registration import Lens, undistort_lens, warp_depth
 from splatctrl_cli.records import Intrinsics
 from tests.refused import expect_refusal
 
@@ -53,10 +54,12 @@ def test_the_nearest_of_two_surfaces_on_a_pixel_counts() -> None:
 def test_coefficients_that_no_model_has_or_that_show_hardly_anything_are_refused(
     model: str, coefficients: list[float], said: str
 ) -> None:
-    expect_refusal(said, Undistortion, SMALL, model, np.array(coefficients))
+    expect_refusal(said, undistort_lens, SMALL, model, np.array(coefficients))
     image = np.random.default_rng(1).integers(0, 256, (30, 40, 3)).astype(np.uint8)
-    assert np.array_equal(Undistortion(SMALL, "plumb_bob", np.zeros(5)).color(image), image), "none changes nothing"
-    barrel = Undistortion(SMALL, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0]))
+    assert np.array_equal(undistort_lens(SMALL, "plumb_bob", np.zeros(5)).remap(image, cv2.INTER_LINEAR), image), (
+        "none changes nothing"
+    )
+    barrel = undistort_lens(SMALL, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0]))
     assert barrel.valid is None, "shows every pixel of its own pinhole"
 
 
@@ -72,7 +75,7 @@ def test_a_distorted_point_lands_where_the_pinhole_puts_it(model: str) -> None:
     columns, rows = np.meshgrid(np.arange(400), np.arange(300))
     spot = np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 18.0)
     image = np.repeat((255 * spot).astype(np.uint8)[..., None], 3, axis=2)
-    flat = Undistortion(big, model, np.array([k1, 0, 0, 0])).color(image)[..., 0].astype(float)
+    flat = undistort_lens(big, model, np.array([k1, 0, 0, 0])).remap(image, cv2.INTER_LINEAR)[..., 0].astype(float)
     found = np.array([(flat * columns).sum(), (flat * rows).sum()]) / flat.sum()
     assert found == pytest.approx([400 * x + 199.5, 400 * y + 149.5], abs=0.5)
 
@@ -81,7 +84,7 @@ def test_a_turned_and_zoomed_result_shows_what_the_lens_saw_there() -> None:
     """As a stereo pair is rectified: the result's axes are turned from the lens's, its focal length is shorter."""
     R = rpyToMatrix(0.02, -0.1, 0.05)
     result = replace(LARGE, fx=0.8 * LARGE.fx, fy=0.8 * LARGE.fy)
-    seen = Undistortion(result, "plumb_bob", np.array([0.1, 0, 0, 0, 0]), lens=LARGE, R=R).valid
+    seen = undistort_lens(result, "plumb_bob", np.array([0.1, 0, 0, 0, 0]), recorded=LARGE, R=R).valid
     u, v = np.meshgrid(np.arange(64), np.arange(48))
     rays = np.stack([(u - result.cx) / result.fx, (v - result.cy) / result.fy, np.ones(u.shape)], axis=2)
     x, y, z = np.moveaxis(rays @ R, 2, 0)  # R leads from the lens's axes to the result's
@@ -103,7 +106,7 @@ def test_where_a_polynomial_turns_back_nothing_is_shown_twice(
     model: str, coefficients: list[float], turns_at: float
 ) -> None:
     wide = Intrinsics(fx=16, fy=16, cx=31.5, cy=23.5, width=64, height=48)
-    valid = Undistortion(wide, model, np.array(coefficients, dtype=float)).valid
+    valid = undistort_lens(wide, model, np.array(coefficients, dtype=float)).valid
     assert valid is not None
     u, v = np.meshgrid(np.arange(64), np.arange(48))
     radius = np.hypot((u - wide.cx) / wide.fx, (v - wide.cy) / wide.fy)
@@ -114,20 +117,19 @@ def test_where_a_polynomial_turns_back_nothing_is_shown_twice(
 def test_the_depth_cameras_own_lens_is_undone_before_its_depth_is_registered() -> None:
     """A distorted column of depth becomes straight."""
     k1 = 0.3
-    own = Undistortion(LARGE, "plumb_bob", np.array([k1, 0, 0, 0, 0]))
+    own = undistort_lens(LARGE, "plumb_bob", np.array([k1, 0, 0, 0, 0]))
     x = 0.25
     y = np.linspace(-0.3, 0.3, 400)
     factor = 1 + k1 * (x * x + y * y)
     bent = np.zeros((48, 64), np.float32)
     row, column = np.rint(LARGE.fy * y * factor + LARGE.cy), np.rint(LARGE.fx * x * factor + LARGE.cx)
     bent[row.astype(int), column.astype(int)] = 1.0
-    warp = DepthToColor(depth_intrinsics=LARGE, color_intrinsics=LARGE, T_color_depth=np.eye(4), undistortion=own)
-    found = np.nonzero(warp.warp(bent))[1]
+    warp = Lens(intrinsics=LARGE, depth_lens=own, T_color_depth=np.eye(4))
+    found = np.nonzero(warp.depth(bent))[1]
     assert np.abs(found - (LARGE.fx * x + LARGE.cx)).max() <= 1.0
 
 
 def warped(depth: np.ndarray[Any, Any], color: Intrinsics = SMALL, **shift: float) -> np.ndarray[Any, Any]:
     """Depth of the small camera in a colour camera that is moved along x and z [m]."""
     T_color_depth = pose_at([shift.get("x", 0.0), 0, shift.get("z", 0.0)])
-    warp = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=color, T_color_depth=T_color_depth)
-    return warp.warp(depth)
+    return warp_depth(depth, SMALL, color, T_color_depth)

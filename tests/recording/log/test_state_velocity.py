@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.recording.log.state_topics import checked_stamps
-from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, differentiated, gaps_of, smoothed_seconds
+from splatctrl_cli.recording.log.state_track import RawTrack, clean_states, differentiate, gaps_of, smoothed_seconds
 from splatctrl_cli.records import LossReport
 from tests.refused import expect_refusal
 
@@ -22,7 +22,7 @@ def test_the_derivative_of_a_parabola_is_exact_at_uneven_steps() -> None:
     stamps = START_NS + np.cumsum(rng.integers(4, 30, 60)) * MS
     t = (stamps - stamps[0]) * 1e-9
     position = np.stack([1 + 2 * t + 3 * t**2, -t], axis=1)
-    assert differentiated(stamps, position) == pytest.approx(np.stack([2 + 6 * t, -np.ones(60)], axis=1), abs=1e-6)
+    assert differentiate(stamps, position) == pytest.approx(np.stack([2 + 6 * t, -np.ones(60)], axis=1), abs=1e-6)
 
 
 def test_jitter_of_sending_is_smoothed_out_of_a_fixed_rate() -> None:
@@ -31,7 +31,7 @@ def test_jitter_of_sending_is_smoothed_out_of_a_fixed_rate() -> None:
     sent = true + rng.integers(-3 * MS, 3 * MS, 500)
     t = (true - true[0]) * 1e-9
     position, truth = np.sin(2 * t)[:, None], 2 * np.cos(2 * t)[:, None]
-    error = np.abs(differentiated(sent, position) - truth)
+    error = np.abs(differentiate(sent, position) - truth)
     raw = np.abs(np.gradient(position[:, 0], (sent - sent[0]) * 1e-9)[:, None] - truth)
     assert error.max() < 0.04
     assert np.median(error) < np.median(raw) / 10
@@ -42,7 +42,7 @@ def test_nothing_is_fitted_across_a_gap() -> None:
     stamps[10:] += 5_000 * MS
     position = np.where(np.arange(20) < 10, 0.0, 1.0)[:, None]
     assert list(gaps_of(stamps)) == [9]
-    assert differentiated(stamps, position) == pytest.approx(np.zeros((20, 1)), abs=1e-9)
+    assert differentiate(stamps, position) == pytest.approx(np.zeros((20, 1)), abs=1e-9)
 
 
 def track(position: np.ndarray[tuple[int, int], np.dtype[np.float64]], velocity: float | None) -> RawTrack:
@@ -58,7 +58,7 @@ def track(position: np.ndarray[tuple[int, int], np.dtype[np.float64]], velocity:
 def test_a_velocity_of_zero_is_believed_of_a_joint_that_stands_still_only() -> None:
     position = np.stack([np.arange(50) * 0.01, np.full(50, 0.3)], axis=1)
     loss = LossReport()
-    states = cleaned(track(position, 0.0), loss)
+    states = clean_states(track(position, 0.0), loss)
     assert states[20].velocity == pytest.approx([1.0, 0.0])
     assert loss.differentiated_velocities == 50
     assert loss.notes == [
@@ -69,9 +69,9 @@ def test_a_velocity_of_zero_is_believed_of_a_joint_that_stands_still_only() -> N
 def test_recorded_velocities_are_kept_and_other_units_are_said() -> None:
     position = np.stack([np.arange(50) * 0.01, np.arange(50) * 0.01], axis=1)
     loss = LossReport()
-    assert cleaned(track(position, 1.1), loss)[20].velocity == pytest.approx([1.1, 1.1])
+    assert clean_states(track(position, 1.1), loss)[20].velocity == pytest.approx([1.1, 1.1])
     assert (loss.notes, loss.differentiated_velocities) == ([], 0)
-    cleaned(track(position, float(np.degrees(1.0))), loss)
+    clean_states(track(position, float(np.degrees(1.0))), loss)
     assert "57.3 times the change of the positions" in loss.notes[0]
 
 

@@ -10,7 +10,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.geometry import quat_from_rotation, rotation_from_quat, transform_from
 from splatctrl_cli.recording.log.registration import TfTree
 from splatctrl_cli.recording.source import describe, open_source
-from splatctrl_cli.recording.source_options import PoseTopic, SourceOptions
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 from tests.recording.log.make_log import (
     FRAME_NS,
@@ -145,7 +145,7 @@ def positions(path: Path, options: SourceOptions | None = None) -> Float64:
 
 
 def by_topic(topic: str, frame: str = "", camera: str = "cam0") -> SourceOptions:
-    return SourceOptions(camera_pose_topics={camera: PoseTopic(topic=topic, frame=frame)})
+    return SourceOptions(camera_pose_topics={camera: (topic, frame)})
 
 
 @pytest.mark.parametrize(
