@@ -89,6 +89,11 @@ class RgbdFrame:
     human: UInt8 | None = None
     valid: Bool | None = None
 
+    @property
+    def in_view(self) -> Bool:
+        """`valid` (H, W), True everywhere if None."""
+        return np.ones(self.depth.shape, bool) if self.valid is None else self.valid
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointState:
@@ -184,20 +189,22 @@ class RecordSource(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Arrays with one row per item (N)."""
+    """Arrays with one row per item (N), the first field among them, and numbers that hold for all items."""
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
     def joined(self, *others: Self) -> Self:
-        """Return these items, then the others'."""
-        names = [column.name for column in fields(self)]
-        parts = {name: [getattr(one, name) for one in (self, *others)] for name in names}
-        return replace(self, **{name: np.concatenate(arrays) for name, arrays in parts.items()})
+        """Return these items, then the others', with these numbers."""
+        names = self._names()
+        return replace(self, **{n: np.concatenate([getattr(one, n) for one in (self, *others)]) for n in names})
 
-    def select(self, which: Bool | NDArray[np.integer]) -> Self:
-        """Items of a mask (N,) or an index (K,)."""
-        return replace(self, **{column.name: getattr(self, column.name)[which] for column in fields(self)})
+    def select(self, which: Bool | NDArray[np.integer] | slice) -> Self:
+        """Items of a mask (N,), an index (K,) or a slice."""
+        return replace(self, **{name: getattr(self, name)[which] for name in self._names()})
+
+    def _names(self) -> list[str]:
+        return [column.name for column in fields(self) if np.ndim(getattr(self, column.name))]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -255,7 +255,7 @@ class UnknownSpace:
             return blank(planes, is_unknown)
         if self._cubes is None:
             return planes
-        treated, num_changed = self._cubes.planes(first, last).joined(planes, bound_margin)
+        treated, num_changed = self._cubes.select(slice(first, last)).join(planes, bound_margin)
         self.num_changed += num_changed
         return treated
 

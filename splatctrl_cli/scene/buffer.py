@@ -14,7 +14,10 @@ CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
 
 @dataclass(frozen=True, kw_only=True)
 class Seeds(Columns):
-    """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1]."""
+    """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1].
+
+    Candidates for them have the size D/f [m] of their pixels as radii.
+    """
 
     centers: Float32
     radii: Float32

@@ -39,7 +39,9 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     arrays |= {"people/voxels": fitter.people.voxels, "people/stamps_ns": fitter.people.stamps_ns}
     for camera, edges in fitter.occupancy.edges.items():
         arrays[f"edges/{camera}"] = np.column_stack([edges.centers, edges.radii])
-    arrays["refined"] = _refined_array(fitter.refined)
+    filled = [getattr(fitter.refined.filled, name) for name in FILLED_NAMES]
+    removed = [fitter.refined.removed[reason] for reason in REASONS]
+    arrays["refined"] = np.array([fitter.refined.num_blocks, *filled, *removed], np.int64)
     arrays |= {f"objects/{camera}": pixels for camera, pixels in fitter.objects.items()}
     arrays |= {f"mounted/{camera}": mask for camera, mask in fitter.mounted.items()}
     if fitter.shell is not None:
@@ -77,7 +79,12 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
         for name, a in arrays.items()
         if name.startswith("edges/")
     }
-    fitter.refined = _refined(arrays["refined"])
+    num_blocks, added, relocated, unmet, *removed = (int(n) for n in arrays["refined"])
+    fitter.refined = Refined(
+        num_blocks=num_blocks,
+        filled=Filled(added=added, relocated=relocated, unmet=unmet),
+        removed=dict(zip(REASONS, removed, strict=True)),
+    )
     fitter.mounted, fitter.objects = (
         {name.removeprefix(kind): np.asarray(mask, bool) for name, mask in arrays.items() if name.startswith(kind)}
         for kind in ("mounted/", "objects/")
@@ -118,20 +125,6 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
 def workspace_of(arrays: Arrays) -> Box:
     lower, upper = np.asarray(arrays["workspace"], np.float64)
     return Box(lower=lower, upper=upper)
-
-
-def _refined_array(refined: Refined) -> NDArray[np.generic]:
-    filled = [getattr(refined.filled, name) for name in FILLED_NAMES]
-    return np.array([refined.num_blocks, *filled, *(refined.removed[reason] for reason in REASONS)], np.int64)
-
-
-def _refined(array: NDArray[np.generic]) -> Refined:
-    num_blocks, added, relocated, unmet, *removed = (int(n) for n in array)
-    return Refined(
-        num_blocks=num_blocks,
-        filled=Filled(added=added, relocated=relocated, unmet=unmet),
-        removed=dict(zip(REASONS, removed, strict=True)),
-    )
 
 
 def _frame_arrays(frame: RgbdFrame) -> dict[str, NDArray[np.generic]]:

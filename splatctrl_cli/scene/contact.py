@@ -14,7 +14,7 @@ from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.labels import Seen, shown_kinds
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.seeding import Each, gap_seeds, world_points_at
+from splatctrl_cli.scene.seeding import Each, gap_seeds, world_points
 from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
@@ -40,7 +40,7 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
     shown, reach = mask.robot_depth, pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
     chosen &= frame.depth > nearest_within(shown, is_robot, reach) - fixed.CONTACT_REACH  # a quick superset
     chosen &= frame.depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS
-    chosen[chosen] = is_in_contact(world_points_at(frame, chosen), robot)
+    chosen[chosen] = is_in_contact(world_points(frame, chosen), robot)
     return chosen
 
 
@@ -53,7 +53,7 @@ def count_carried(
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     poses = dict(zip(surface.links, T_world_link, strict=True))
-    points = world_points_at(frame, mask.kinds == PixelKind.ROBOT)
+    points = world_points(frame, mask.kinds == PixelKind.ROBOT)
     is_own = bare.distance(bare.poses(poses), points) < fixed.CONTACT_REACH / 2
     for link in dict.fromkeys(link for link, _ in declared.carried_at(time_s)):
         declared.is_carried(link, transform_points(invert_transform(poses[link]), points[~is_own]), time_s)

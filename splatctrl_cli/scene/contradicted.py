@@ -21,7 +21,7 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
-from splatctrl_cli.scene.depth_holes import shadowed
+from splatctrl_cli.scene.depth_holes import points_on_rays, shadowed
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
 
@@ -52,34 +52,21 @@ class Contradicted:
         is_through = self._spread(self.through > 0, frame.depth.shape)
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
-    def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Points (K, 3) [m], world, half a voxel apart on its rays up to `until` or `through`.
+    def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Iterator[Float64]:
+        """`points_on_rays` of its blocks up to `until` or `through`.
 
         is_blank: from blocks without depth, or with it.
         """
         end = np.maximum(self.until, self.through)
         v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
-        depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
         middle = self.side // 2
-        rays = back_project_pixels(frame.intrinsics, self.side * u + middle, self.side * v + middle, np.ones(len(u)))
-        is_before = depths < end[v, u][:, None]
-        return transform_points(frame.T_world_camera, (rays[:, None] * depths[:, None])[is_before])
+        return points_on_rays(frame, self.side * v + middle, self.side * u + middle, end[v, u], config)
 
     def _spread(self, blocks: Bool, shape: tuple[int, ...]) -> Bool:
         out = np.zeros(shape, bool)
         pixels = np.kron(blocks, np.ones((self.side, self.side), bool))
         out[: pixels.shape[0], : pixels.shape[1]] = pixels
         return out
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Surface:
-    """Object points (K, 3) [m], world, away from depth edges, with block indices (K,) and depth (K,) [m]."""
-
-    points: Float64
-    v: Index
-    u: Index
-    depth: Float32
 
 
 def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
@@ -90,25 +77,24 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
     robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Where others' rays cross at least
     `SEEN_THROUGH_PIXELS` adjacent blocks, these prove no space free.
     """
-    surfaces = [_surface(*one) for one in seen]
-    through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
+    views = [_BlockView.of(*one) for one in seen]
+    through = [np.zeros_like(view.surely) for view in views]
     until = []
-    for index, (frame, mask) in enumerate(seen):
-        rays, depths = _Rays.of(frame, mask), np.zeros_like(through[index])
-        for number, surface in enumerate(surfaces):
-            if number != index:
-                is_passed = rays.run_through(surface, depths)
-                through[number][surface.v[is_passed], surface.u[is_passed]] = surface.depth[is_passed]
-        robot = _blocks(mask.robot_depth, rays.side).min(axis=2)
-        is_before = rays.is_blank & (robot > 0) & is_drawn
+    for (_, mask), view in zip(seen, views, strict=True):
+        depths = np.zeros_like(view.surely)
+        for other, passed in zip(views, through, strict=True):
+            if other is not view:
+                is_passed = view.run_through(other, depths)
+                passed[other.v[is_passed], other.u[is_passed]] = other.depth[is_passed]
+        robot = _blocks(mask.robot_depth, view.side).min(axis=2)
+        is_before = view.is_lost & (robot > 0) & is_drawn
         depths[is_before] = robot[is_before]
         until.append(_side_by_side(depths, CONTRADICTING_PIXELS))
-    for (frame, _), end, passed in zip(seen, until, through, strict=True):
-        side = _side(frame)
+    for view, end, passed in zip(views, until, through, strict=True):
         yield Contradicted(
-            side=side,
+            side=view.side,
             until=end,
-            is_blank=np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2)),
+            is_blank=np.asarray((_blocks(view.frame.depth, view.side) <= 0).all(axis=2)),
             through=_side_by_side(passed, SEEN_THROUGH_PIXELS),
         )
 
@@ -117,26 +103,10 @@ def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
     return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
 
-def _side(frame: RgbdFrame) -> int:
-    return max(1, frame.intrinsics.width // CONTRADICTING_COLUMNS)
-
-
 def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
     """Pixels (h, w, side^2) of an image's blocks, without incomplete ones at its ends."""
     h, w = (size // side for size in image.shape)
     return image[: h * side, : w * side].reshape(h, side, w, side).swapaxes(1, 2).reshape(h, w, side * side)
-
-
-def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
-    side = _side(frame)
-    depth = _blocks(frame.depth, side)
-    nearest, farthest = depth.min(axis=2), depth.max(axis=2)
-    is_flat = (cv2.erode(nearest, BESIDE) > 0) & _is_plane(nearest) & _is_plane(farthest)
-    is_object = _blocks(mask.kinds == PixelKind.OBJECT, side).all(axis=2)
-    v, u = np.nonzero(is_flat & is_object)
-    middle, mean = side // 2, depth.mean(axis=2)[v, u]
-    points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
-    return _Surface(points=transform_points(frame.T_world_camera, points), v=v, u=u, depth=mean)
 
 
 def _is_plane(depth: Float32) -> Bool:
@@ -150,25 +120,46 @@ def _is_plane(depth: Float32) -> Bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Rays:
-    """Depth (h, w) [m] that all rays of a block and its neighbours reach; blocks that unexpectedly return none."""
+class _BlockView:
+    """A frame in blocks of `side` pixels (h, w): its rays, and the surface that they hit.
+
+    surely (h, w) [m]: depth that all rays of a block and its neighbours reach; is_lost (h, w): they unexpectedly
+    return none. points (K, 3) [m], world: of objects away from depth edges, with block indices (K,), depth (K,) [m].
+    """
 
     frame: RgbdFrame
     side: int
     surely: Float32
-    is_blank: Bool
+    is_lost: Bool
+    points: Float64
+    v: Index
+    u: Index
+    depth: Float32
 
     @classmethod
-    def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_Rays":
-        side = _side(frame)
-        surely = cv2.erode(_blocks(frame.depth, side).min(axis=2), BESIDE)  # 0 next to lost pixels
+    def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_BlockView":
+        side = max(1, frame.intrinsics.width // CONTRADICTING_COLUMNS)
+        depth = _blocks(frame.depth, side)
+        nearest, farthest = depth.min(axis=2), depth.max(axis=2)
+        surely = cv2.erode(nearest, BESIDE)  # 0 next to lost pixels
+        is_object = _blocks(mask.kinds == PixelKind.OBJECT, side).all(axis=2)
+        v, u = np.nonzero((surely > 0) & _is_plane(nearest) & _is_plane(farthest) & is_object)
+        middle, mean = side // 2, depth.mean(axis=2)[v, u]
+        points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
         is_lost = (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~shadowed(frame.depth, frame.intrinsics.fx)
-        if frame.valid is not None:
-            is_lost &= frame.valid
-        is_blank = cv2.erode(_blocks(is_lost, side).all(axis=2).view(np.uint8), BESIDE) > 0
-        return cls(frame=frame, side=side, surely=surely, is_blank=np.asarray(is_blank))
+        is_lost = cv2.erode(_blocks(is_lost & frame.in_view, side).all(axis=2).view(np.uint8), BESIDE) > 0
+        return cls(
+            frame=frame,
+            side=side,
+            surely=surely,
+            is_lost=np.asarray(is_lost),
+            points=transform_points(frame.T_world_camera, points),
+            v=v,
+            u=u,
+            depth=mean,
+        )
 
-    def run_through(self, surface: _Surface, until: Float32) -> Index:
+    def run_through(self, surface: "_BlockView", until: Float32) -> Index:
         """Write the depth of crossed surface points into `until` (h, w).
 
         Return indices of points behind which a ray measures depth.
@@ -179,7 +170,7 @@ class _Rays:
         asked = np.flatnonzero((pixel >= 0) & (v < self.surely.shape[0]) & (u < self.surely.shape[1]))
         v, u, z = v[asked], u[asked], z[asked]
         is_behind = self.surely[v, u] > z + CONTRADICTED
-        is_through = is_behind | (self.is_blank[v, u] & (z < self.frame.depth.max() + CONTRADICTED))
+        is_through = is_behind | (self.is_lost[v, u] & (z < self.frame.depth.max() + CONTRADICTED))
         until[v[is_through], u[is_through]] = z[is_through]
         return asked[is_behind]
 

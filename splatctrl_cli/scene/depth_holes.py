@@ -40,14 +40,14 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     is_shadow = is_blank & shadowed(frame.depth, frame.intrinsics.fx)
     is_blank &= ~is_shadow
     is_end = _with_shadow(cv2.dilate(robot_depth, BESIDE_ROBOT) > 0, is_shadow)
-    if frame.valid is not None:
-        is_end |= ~frame.valid
-    holes = _holes(is_blank, is_end)
+    holes = _holes(is_blank, is_end | ~frame.in_view)
     if not holes.any():
         return iter(())
     behind = _nearest_depth(frame.depth)
     width = config.voxel * frame.intrinsics.fx / float(np.median(behind[holes]))
-    return _on_rays(frame, _wide(holes, fixed.NARROW_HOLE * width), behind, max(int(width), 1), config)
+    apart = max(int(width), 1)
+    v, u = np.nonzero(_wide(holes, fixed.NARROW_HOLE * width)[::apart, ::apart])
+    return points_on_rays(frame, v * apart, u * apart, behind[v * apart, u * apart], config)
 
 
 def _with_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
@@ -63,16 +63,16 @@ def _wide(pixels: Bool, width: float) -> Bool:
     return np.asarray(opened.view(bool))
 
 
-def _on_rays(
-    frame: RgbdFrame, pixels: Bool, behind: Float32, apart: int, config: OccupancyConfig
-) -> Iterator[Float64]:
-    v, u = np.nonzero(pixels[::apart, ::apart])
-    v, u = v * apart, u * apart
-    depths = np.arange(config.min_range, behind[v, u].max(initial=config.min_range), 0.5 * config.voxel)
+def points_on_rays(frame: RgbdFrame, v: Index, u: Index, end: Float32, config: OccupancyConfig) -> Iterator[Float64]:
+    """Yield points (K, 3) [m], world, half a voxel apart on rays from `min_range` to `end` (N,) [m].
+
+    v, u (N,): the rays' pixels.
+    """
+    depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
     rays = back_project_pixels(frame.intrinsics, u, v, np.ones(len(u)))
     num = max(MOST_POINTS // max(len(depths), 1), 1)  # rays at a time
     for some in (slice(first, first + num) for first in range(0, len(u), num)):
-        is_before = depths < behind[v[some], u[some]][:, None]
+        is_before = depths < end[some, None]
         yield transform_points(frame.T_world_camera, (rays[some, None] * depths[:, None])[is_before])
 
 
@@ -123,10 +123,7 @@ def _of_frame(frame: RgbdFrame, mask: SelfMask) -> LostEdges:
         cv2.dilate(pixels.view(np.uint8), reach) > 0
         for pixels, reach in ((is_object, BESIDE), (is_robot, NEAR_ROBOT))
     )
-    is_lost = (frame.depth <= 0) & is_beside & ~is_outline
-    if frame.valid is not None:
-        is_lost &= frame.valid
-    v, u = np.nonzero(is_lost)
+    v, u = np.nonzero((frame.depth <= 0) & is_beside & ~is_outline & frame.in_view)
     depths = beside[v, u]
     places = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depths))
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))
@@ -207,9 +204,7 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> 
 def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> NDArray[np.uint16]:
     """Reason `Unseen` (K,) why a frame does not show points (K, 3) [m]."""
     pixel, z = pixels_at(frame, points)
-    is_in_view = pixel >= 0
-    if frame.valid is not None:
-        is_in_view &= frame.valid.reshape(-1)[pixel]
+    is_in_view = (pixel >= 0) & frame.in_view.reshape(-1)[pixel]
     robot = cv2.dilate(mask.robot_depth, OUTLINE).reshape(-1)[pixel]
     depth = frame.depth.reshape(-1)[pixel]
     is_lost = (frame.depth <= 0) & ~shadowed(frame.depth, frame.intrinsics.fx)

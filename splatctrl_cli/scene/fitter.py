@@ -13,7 +13,7 @@ from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
-from splatctrl_cli.scene.buffer import Filled, SplatBuffer
+from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact, lasts_at_fixed_links
 from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
 from splatctrl_cli.scene.depth_holes import explain_unseen, lost_edges, unanswered_points
@@ -26,7 +26,6 @@ from splatctrl_cli.scene.posture import RobotPosture, carried
 from splatctrl_cli.scene.removal import REASONS, removals, room_for, use_idle
 from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
-    Candidates,
     SeedDensity,
     add_mask,
     candidates,
@@ -41,7 +40,7 @@ from splatctrl_cli.scene.seeding import (
 from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
-    audited,
+    audit_masks,
     object_mask,
     of_label,
     self_mask,
@@ -137,8 +136,9 @@ class SceneFitter:
         self.people.take_in(self.occupancy, proving)
         unanswered = self._each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
         for frame, found in zip(frames, rays, strict=True):
-            self.occupancy.mark_unseen(found.points(frame, config, is_blank=False), Unseen.CONTRADICTED)
-            self.occupancy.mark_unseen(found.points(frame, config, is_blank=True), Unseen.UNANSWERED)
+            for reason, is_blank in ((Unseen.CONTRADICTED, False), (Unseen.UNANSWERED, True)):
+                for points in found.points(frame, config, is_blank=is_blank):
+                    self.occupancy.mark_unseen(points, reason)
         for points in chain.from_iterable(unanswered):
             self.occupancy.mark_unseen(points, Unseen.UNANSWERED)
         self.occupancy.keep_edges(lost_edges(seen, robot, config))
@@ -171,11 +171,11 @@ class SceneFitter:
         if self.shell is not None:
             self.shell.step(self.window, self.mounted, self.descent.background)
         self.num_steps += 1
-        return replace(self._audit(views, filled, removed, terms), **audited(masks))
+        return replace(self._audit(views, filled, removed, terms), **audit_masks(masks))
 
     def plant(self, cloud: PointCloud) -> Filled:
         """Start from coloured points, seeded with at most a share `fill` of the budget."""
-        source = Candidates(points=cloud.points, colors=cloud.colors, pixels=np.zeros(len(cloud), np.float32))
+        source = Seeds(centers=cloud.points, radii=np.zeros(len(cloud), np.float32), colors=cloud.colors)
         count = max(int(self.config.fill * self.config.max_splats), 1)
         self.density = density_for([source], count, self.config)
         seeds = seeds_at([source], self.buffer.centers[self.buffer.is_alive], self.density, self.config)
@@ -210,7 +210,9 @@ class SceneFitter:
         filled = self.refined.filled
         if block < fixed.REFINE_BLOCKS - 2:
             filled += self._seed(views, [object_mask(view.frame) for view in views])
-            filled += self._use_idle(views, rng, removed)
+            more, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
+            filled += more
+            removed["weak"] += num_weak
         self.refined = Refined(
             num_blocks=block + 1,
             filled=filled,
@@ -326,17 +328,17 @@ class SceneFitter:
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
         """Fill dead slots at pixels of M_add; the first full view sets the density."""
-        found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
+        found: dict[Label, list[Seeds]] = {Label.OBJECT: [], Label.ROBOT: []}
         added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
         every = thinning(added)
 
-        def offered(index: int) -> list[Candidates]:
+        def offered(index: int) -> list[Seeds]:
             view, others = views[index], spread(range(len(views)), fixed.SEED_ASKED_VIEWS)
             asked = [views[(index + k) % len(views)] for k in others]
             wanted = (thinned(added[index] & of_label(masks[index], label), every) for label in found)
             sources = (candidates(view.frame, pixels, self.num_threads) for pixels in wanted)
             return [
-                source.select(self._is_grounded(source.points, asked, label))
+                source.select(self._is_grounded(source.centers, asked, label))
                 for label, source in zip(found, sources, strict=True)
             ]
 
@@ -445,11 +447,6 @@ class SceneFitter:
         )
         is_hidden = np.isin(slots, hidden_objects(self.buffer, robot, seen, config))
         self.buffer.set_radius(slots, np.where(is_hidden, np.minimum(radii, np.float32(least)), radii))
-
-    def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
-        filled, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
-        removed["weak"] += num_weak
-        return filled
 
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf

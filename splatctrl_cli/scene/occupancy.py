@@ -12,7 +12,18 @@ from splatctrl_cli.config.fixed import HIDDEN
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
-from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, Balls, KnownVoxels, LostEdges, OccupancyGrid, Unseen
+from splatctrl_cli.voxels import (
+    MOST_VOXELS,
+    NO_EDGES,
+    SOLID,
+    SWEPT,
+    Balls,
+    KnownVoxels,
+    LostEdges,
+    OccupancyGrid,
+    Unseen,
+    voxels_at,
+)
 
 MAX_STEPS = min(Unseen) - 1  # distinct time steps in `last_seen`
 
@@ -101,8 +112,8 @@ class OccupancyMap:
 
         Seen, contradicted and unanswered voxels keep their value.
         """
-        cells = np.floor((points - self.origin) / self.config.voxel + 0.5).astype(np.int64)
-        i, j, k = cells[np.all((cells >= 0) & (cells < self.last_seen.shape), axis=1)].T
+        cells, is_inside = voxels_at(points, self.origin, self.config.voxel, self.last_seen.shape)
+        i, j, k = cells[is_inside].T
         before = self.last_seen[i, j, k]
         is_never = (before == 0) | (before >= min(Unseen)) & (before < Unseen.CONTRADICTED)
         self.last_seen[i[is_never], j[is_never], k[is_never]] = reason
@@ -195,10 +206,8 @@ class OccupancyMap:
 
     def entity_at(self, points_world: Float32) -> NDArray[np.uint8]:
         """Entity bits (N,) at points (N, 3); 0 outside."""
-        cell = np.floor((points_world - self.origin) / self.config.voxel + 0.5)
-        is_inside = np.all((cell >= 0) & (cell < self.entity.shape), axis=1)
-        i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
-        return np.where(is_inside, self.entity[i, j, k], np.uint8(0))
+        cells, is_inside = voxels_at(points_world, self.origin, self.config.voxel, self.entity.shape)
+        return np.where(is_inside, self.entity[tuple(cells.T)], np.uint8(0))
 
     def entity_around(self, points_world: Float32) -> NDArray[np.uint8]:
         """Entity bits (N,) of the eight nearest voxels, ORed."""
@@ -268,7 +277,7 @@ class OccupancyMap:
             last_seen=self.last_seen.copy(),
             step_stamps_ns=np.array(self.step_stamps_ns, np.int64),
             unrepresented=unrepresented,
-            edges=LostEdges.joined([self.edges[camera] for camera in sorted(self.edges)]),
+            edges=NO_EDGES.joined(*(self.edges[camera] for camera in sorted(self.edges))),
         )
 
 

@@ -1,9 +1,8 @@
 """Removal of splats, by reason (III-C), eviction for bare surface, and use of idle slots."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
@@ -14,6 +13,7 @@ from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame,
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thinned, thinning
+from splatctrl_cli.scene.self_mask import least_within
 
 REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak", "evicted")
 
@@ -29,14 +29,8 @@ def nearest_depth(frame: RgbdFrame, reach: float = fixed.NEAREST_REACH, is_robot
         return depth
     half = max(1, round(reach * frame.intrinsics.fx / float(np.median(valid))))
     if is_robot is None or not is_robot.any():
-        return least_around(depth, half)
-    return np.minimum(least_around(np.where(is_robot, np.float32(np.inf), depth), half), least_around(depth, 1))
-
-
-def least_around(depth: Float32, half: int) -> Float32:
-    """Least value (H, W) in the square of 2 half + 1 pixels around each."""
-    window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
-    return np.asarray(cv2.erode(depth, window, borderType=cv2.BORDER_REPLICATE), np.float32)
+        return least_within(depth, half)
+    return np.minimum(least_within(np.where(is_robot, np.float32(np.inf), depth), half), least_within(depth, 1))
 
 
 def removals(
@@ -201,12 +195,8 @@ def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Fil
     return Filled(relocated=buffer.copy(sources, *clone_shape(opacities, buffer.radii.astype(np.float64), count)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Misfit:
-    """A view's mean absolute colour error (H, W), 0 where not mappable."""
-
-    frame: RgbdFrame
-    error: Float32
+Misfit = tuple[RgbdFrame, Float32]
+"""A view's frame, and its mean absolute colour error (H, W), 0 where not mappable."""
 
 
 def use_idle(
@@ -223,7 +213,7 @@ def use_idle(
     if config.when_idle == "leave" or not is_alive.any():
         return Filled(), 0
     found, shown = ([], None) if config.when_idle == "clone" else misfits()
-    if shown is None or not any(misfit.error.any() for misfit in found):  # no depth shows where detail would be
+    if shown is None or not any(error.any() for _, error in found):  # no depth shows where detail would be
         return clone(buffer, int((~is_alive).sum()) - reserve, rng), 0
     weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
     is_weak = np.zeros(len(is_alive), bool)
@@ -238,18 +228,18 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
 
     The error is a 3 x 3 mean, weighted by a pixel's area of surface. No two seeds are closer than their diameters.
     """
-    every = thinning(misfit.error > 0 for misfit in misfits)
-    masks = [thinned(misfit.error > 0, every) for misfit in misfits]
+    every = thinning(error > 0 for _, error in misfits)
+    masks = [thinned(error > 0, every) for _, error in misfits]
     weight = np.concatenate(
         [
-            np.square(uniform_filter(misfit.error, 3)[mask] * misfit.frame.depth[mask], dtype=np.float64)
-            for misfit, mask in zip(misfits, masks, strict=True)
+            np.square(uniform_filter(error, 3)[mask] * frame.depth[mask], dtype=np.float64)
+            for (frame, error), mask in zip(misfits, masks, strict=True)
         ]
     )
     count = min(fixed.SEED_OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
     if count == 0:
         return NO_SEEDS
-    found = _pixels([misfit.frame for misfit in misfits], masks, drawn(weight, count, rng))
+    found = _pixels([frame for frame, _ in misfits], masks, drawn(weight, count, rng))
     kept = _apart(found.centers, 2.0 * found.radii)[:num_seeds]
     return replace(found.select(kept), radii=np.clip(found.radii[kept], config.min_radius, config.max_radius))
 
@@ -281,12 +271,7 @@ def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[
         only.reshape(-1)[pixels[chosen[order[begin:end]] - first]] = True
         parts.append(candidates(frame, only))
         first += len(pixels)
-    found = Seeds(
-        centers=np.concatenate([part.points for part in parts]),
-        radii=np.concatenate([part.pixels for part in parts]),
-        colors=np.concatenate([part.colors for part in parts]),
-    )
-    return found.select(np.argsort(order))
+    return parts[0].joined(*parts[1:]).select(np.argsort(order))
 
 
 def _apart(points: Float32, distances: Float32) -> NDArray[np.intp]:

@@ -12,7 +12,7 @@ from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import SEED_CROWDED, SEED_LEVELS, SEED_MOST_PIXELS
 from splatctrl_cli.kernels.points import Cubes, SplatTree, back_projected
 from splatctrl_cli.kernels.raster import pack_camera
-from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
@@ -24,19 +24,12 @@ NO_SEEDS = Seeds(
 )
 
 
-def world_points(frame: RgbdFrame) -> Float64:
-    """Back-projected points (H, W, 3) [m], world; meaningless where depth is 0."""
-    return back_projected(_placed(frame), frame.depth).reshape(*frame.depth.shape, 3)
-
-
-def world_points_at(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Float64:
-    """Back-projected points (K, 3) [m], world, of a mask (H, W)."""
-    return back_projected(_placed(frame), frame.depth, mask, num_threads)
-
-
-def _placed(frame: RgbdFrame) -> Float64:
+def world_points(frame: RgbdFrame, mask: Bool | None = None, num_threads: int = 1) -> Float64:
+    """Back-projected points [m], world: (K, 3) of a mask (H, W), else (H, W, 3), meaningless where depth is 0."""
     k = frame.intrinsics
-    return pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
+    camera = pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
+    points = back_projected(camera, frame.depth, mask, num_threads)
+    return points.reshape(*frame.depth.shape, 3) if mask is None else points
 
 
 def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
@@ -59,15 +52,6 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
     return np.asarray(mappable & (is_hole | (error > threshold)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Candidates(Columns):
-    """Pixels to seed: points (K, 3) [m] world, colors (K, 3) in [0, 1], pixels (K,) of size D/f [m]."""
-
-    points: Float32
-    colors: Float32
-    pixels: Float32
-
-
 def thinning(masks: Iterable[Bool]) -> int:
     """Step n that leaves about `SEED_MOST_PIXELS` of masks (H, W), or fewer."""
     return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
@@ -82,14 +66,13 @@ def thinned(mask: Bool, every: int) -> Bool:
     return kept.reshape(mask.shape)
 
 
-def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates:
+def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Seeds:
     """Candidates in a mask (H, W)."""
     focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
-    colors = frame.color[mask].astype(np.float32) / 255.0
-    return Candidates(
-        points=world_points_at(frame, mask, num_threads).astype(np.float32),
-        colors=colors,
-        pixels=(frame.depth[mask] / focal).astype(np.float32),
+    return Seeds(
+        centers=world_points(frame, mask, num_threads).astype(np.float32),
+        radii=(frame.depth[mask] / focal).astype(np.float32),
+        colors=frame.color[mask].astype(np.float32) / 255.0,
     )
 
 
@@ -102,22 +85,23 @@ class SeedDensity:
     num_candidates: int = 0
 
 
-def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
+def density_for(sources: Sequence[Seeds], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
     """Density that spends at most `count` seeds on the candidates.
 
     The edge starts at what the largest splats cover, and grows by 5 % while cubes are too many.
     """
-    points, colors, _ = _joined(sources)
+    everything = sources[0].joined(*sources[1:])
+    points = everything.centers
     extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
     edge = config.max_radius / config.radius_per_edge
     while edge < extent and len(Cubes(points, edge, num_threads)) > count:
         edge *= 1.05
-    tolerance = tolerance_for(cube_levels(points, colors, edge, SEED_LEVELS, num_threads), count)
+    tolerance = tolerance_for(cube_levels(points, everything.colors, edge, SEED_LEVELS, num_threads), count)
     return SeedDensity(edge=edge, tolerance=tolerance, num_candidates=len(points))
 
 
 def seeds_at(
-    sources: Sequence[Candidates],
+    sources: Sequence[Seeds],
     live_centers: Float32,
     density: SeedDensity,
     config: SceneConfig,
@@ -128,9 +112,9 @@ def seeds_at(
     None is within 0.7 edges of a live splat (L, 3). The paper's radius min(D/f, r_max) is one pixel; here r =
     min(max(radius_per_edge * edge, D/f), r_max).
     """
-    points, colors, pixel = _joined(sources)
-    levels = cube_levels(points, colors, density.edge, SEED_LEVELS, num_threads)
-    chosen = leaves(levels, density.tolerance)
+    found = sources[0].joined(*sources[1:])
+    levels = cube_levels(found.centers, found.colors, density.edge, SEED_LEVELS, num_threads)
+    pixel, chosen = float(np.median(found.radii)), leaves(levels, density.tolerance)
     parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)]
     return parts[-1].joined(*parts[-2::-1])
 
@@ -155,13 +139,13 @@ def gap_seeds(
     """
     spheres = SplatTree(splats.centers, splats.radii, num_threads)
 
-    def bare(frame: RgbdFrame, mappable: Bool) -> Candidates:
+    def bare(frame: RgbdFrame, mappable: Bool) -> Seeds:
         step = _gap_stride(frame, config.max_gap) if stride is None else stride
         rows = np.arange(len(mappable))
         skipped = (rows % step != 0) | ((rows // step) % 2 == (2 if half is None else 1 - half))
         mask = np.zeros_like(mappable)
         mask[~skipped, ::step] = mappable[~skipped, ::step]
-        mask[mask] = spheres.are_further(world_points_at(frame, mask, num_threads), config.max_gap)
+        mask[mask] = spheres.are_further(world_points(frame, mask, num_threads), config.max_gap)
         return candidates(frame, mask)
 
     sources = [source for source in each(lambda view: bare(*view), views) if len(source)]
@@ -170,10 +154,10 @@ def gap_seeds(
         sources.append(_of_voxels(forgotten, splats))
     if not sources:
         return NO_SEEDS
-    all_points, colors, pixel = _joined(sources)
-    level = cube_levels(all_points, colors, config.max_radius / config.radius_per_edge, 1, num_threads)[0]
-    everything, no_splats = np.ones(len(level.points), bool), np.zeros((0, 3), np.float32)
-    return _seeds_of(level, everything, pixel, no_splats, config)
+    found = sources[0].joined(*sources[1:])
+    level = cube_levels(found.centers, found.colors, config.max_radius / config.radius_per_edge, 1, num_threads)[0]
+    pixel, no_splats = float(np.median(found.radii)), np.zeros((0, 3), np.float32)
+    return _seeds_of(level, np.ones(len(level.points), bool), pixel, no_splats, config)
 
 
 def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
@@ -182,17 +166,11 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
     return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
 
 
-def _of_voxels(centers: Float32, splats: SplatSet) -> Candidates:
+def _of_voxels(centers: Float32, splats: SplatSet) -> Seeds:
     colors = np.full((len(centers), 3), 0.5, np.float32)
     if len(splats):
         colors = splats.colors[cKDTree(splats.centers).query(centers)[1]]
-    return Candidates(points=centers, colors=colors, pixels=np.zeros(len(centers), np.float32))
-
-
-def _joined(sources: Sequence[Candidates]) -> tuple[Float32, Float32, float]:
-    points = np.concatenate([source.points for source in sources])
-    colors = np.concatenate([source.colors for source in sources])
-    return points, colors, float(np.median(np.concatenate([source.pixels for source in sources])))
+    return Seeds(centers=centers, radii=np.zeros(len(centers), np.float32), colors=colors)
 
 
 def _seeds_of(level: CubeLevel, mask: Bool, pixel: float, live_centers: Float32, config: SceneConfig) -> Seeds:

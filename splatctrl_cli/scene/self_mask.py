@@ -112,8 +112,8 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     is_explained &= depth <= farthest + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
-    nearest_at_edge = _least_within(nearest, edge - reach)  # infinite away from the outline
-    nearest = _least_within(nearest_at_edge, wide - edge)
+    nearest_at_edge = least_within(nearest, edge - reach)  # infinite away from the outline
+    nearest = least_within(nearest_at_edge, wide - edge)
     beside = np.isfinite(nearest) & has_depth
     is_core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     is_sure = depth < nearest_at_edge
@@ -310,55 +310,27 @@ def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_S
     return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
 
-@dataclass(frozen=True, kw_only=True)
-class LinkResidual:
-    """The residual of one link over several masks.
+def audit_masks(masks: Sequence[SelfMask]) -> dict[str, Any]:
+    """`self_mask` and `inside_robot` of `AuditRow`, by link that a mask saw.
 
-    median [m]: of measured minus rendered depth over num_pixels, None without any; num_inside: as in `SelfMask`;
-    reach [m]: the least `SelfMask.reach`.
+    sign: 1 if the robot is measured behind its rendered surface, -1 before it; reach: the least `SelfMask.reach`.
     """
-
-    median: float | None
-    num_pixels: int
-    num_inside: int
-    reach: float
-
-    @property
-    def sign(self) -> int:
-        """1 if the robot is measured behind its rendered surface, -1 before it, else 0."""
-        return 0 if self.median is None else int(np.sign(self.median))
-
-
-def link_residuals(masks: Sequence[SelfMask]) -> dict[str, LinkResidual]:
-    """Residual of each link that a mask saw."""
-    links = dict.fromkeys(link for mask in masks for link in [*mask.residuals, *mask.num_inside])
-    found = {}
-    for link in links:
-        parts = [mask.residuals[link] for mask in masks if link in mask.residuals]
-        joined = np.concatenate(parts) if parts else np.zeros(0)
-        found[link] = LinkResidual(
-            median=float(np.median(joined)) if len(joined) else None,
-            num_pixels=len(joined),
-            num_inside=sum(mask.num_inside.get(link, 0) for mask in masks),
-            reach=min((mask.reach for mask in masks if link in mask.residuals), default=0.0),
-        )
-    return found
-
-
-def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
-    """`link_residuals` as in `AuditRow`."""
-    found = link_residuals(masks)
-    rows = {
-        link: {
-            "median_mm": round(1e3 * r.median, 2),
-            "sign": r.sign,
-            "num_pixels": r.num_pixels,
-            "reach_mm": round(1e3 * r.reach, 2),
-        }
-        for link, r in found.items()
-        if r.median is not None
-    }
-    return {"self_mask": rows, "inside_robot": {link: r.num_inside for link, r in found.items() if r.num_inside}}
+    rows, inside = {}, {}
+    for link in dict.fromkeys(link for mask in masks for link in [*mask.residuals, *mask.num_inside]):
+        seen = [mask for mask in masks if link in mask.residuals]
+        if seen:
+            offsets = np.concatenate([mask.residuals[link] for mask in seen])
+            median = float(np.median(offsets))
+            rows[link] = {
+                "median_mm": round(1e3 * median, 2),
+                "sign": int(np.sign(median)),
+                "num_pixels": len(offsets),
+                "reach_mm": round(1e3 * min(mask.reach for mask in seen), 2),
+            }
+        num_inside = sum(mask.num_inside.get(link, 0) for mask in masks)
+        if num_inside:
+            inside[link] = num_inside
+    return {"self_mask": rows, "inside_robot": inside}
 
 
 def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -> dict[str, Any]:
@@ -401,10 +373,11 @@ def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
     """Least depth (H, W) of chosen pixels within `reach` pixels, else inf."""
     kept = np.full(depth.shape, np.inf, np.float32)
     cv2.copyTo(depth, chosen.view(np.uint8), kept)
-    return _least_within(kept, reach)
+    return least_within(kept, reach)
 
 
-def _least_within(image: Float32, reach: int) -> Float32:
+def least_within(image: Float32, reach: int) -> Float32:
+    """Least value (H, W) within `reach` pixels."""
     return np.asarray(cv2.erode(image, _window(reach), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 

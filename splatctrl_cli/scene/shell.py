@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.records import Bool, Box, SplatSet
-from splatctrl_cli.scene.buffer import COLOR, SplatBuffer
+from splatctrl_cli.scene.buffer import COLOR, Seeds, SplatBuffer
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, seen_through
 from splatctrl_cli.scene.render import Color
 from splatctrl_cli.scene.scale import scaled
 from splatctrl_cli.scene.seeding import (
-    Candidates,
     SeedDensity,
     add_mask,
     candidates,
@@ -33,8 +32,7 @@ Masked = Sequence[tuple[View, Bool]]
 def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
     """Valid pixels (H, W) with depth of at least `min_range` [m] outside the workspace, except `mounted` ones."""
     depth = view.target.depth
-    left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0)
-    left_out &= True if view.frame.valid is None else view.frame.valid
+    left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0) & view.frame.in_view
     return np.asarray(left_out if mounted is None else left_out & ~mounted)
 
 
@@ -101,10 +99,10 @@ class Shell:
         if self._density is not None and self._fill(_sources(asked), self._density) <= most:
             return
         stands = self.buffer.is_alive.copy()
-        held = Candidates(
-            points=self.buffer.centers[stands],
+        held = Seeds(
+            centers=self.buffer.centers[stands],
+            radii=self.buffer.radii[stands],
             colors=self.buffer.parameters[stands, COLOR],
-            pixels=self.buffer.radii[stands],
         )
         self.buffer.kill(stands)
         depth = float(np.median(np.concatenate([view.target.depth[mask] for view, mask in shown])))
@@ -113,7 +111,7 @@ class Shell:
         self._begin(depth, density, self._descent.num_iterations)
         self._fill(sources, density)
 
-    def _fill(self, sources: Sequence[Candidates], density: SeedDensity) -> int:
+    def _fill(self, sources: Sequence[Seeds], density: SeedDensity) -> int:
         if not any(len(source) for source in sources):
             return 0
         seeds = seeds_at(sources, self.buffer.centers[self.buffer.is_alive], density, self._scaled, self._num_threads)
@@ -140,6 +138,6 @@ class Shell:
         self._begin(depth, density if edge else None, int(num_iterations))
 
 
-def _sources(masked: Masked) -> list[Candidates]:
+def _sources(masked: Masked) -> list[Seeds]:
     every = thinning(mask for _, mask in masked)
     return [candidates(view.frame, thinned(mask, every)) for view, mask in masked]

@@ -35,6 +35,10 @@ def contradict_all(*frames: RgbdFrame) -> list[Contradicted]:
 OTHER = frame(x=BESIDE, camera="cam1")
 
 
+def points_of(found: Contradicted, its: RgbdFrame, *, is_blank: bool) -> np.ndarray:
+    return np.concatenate([np.zeros((0, 3)), *found.points(its, CONFIG, is_blank=is_blank)])
+
+
 @pytest.mark.parametrize(("behind", "is_wrong"), [(CONTRADICTED + 0.02, True), (CONTRADICTED - 0.02, False)])
 def test_depth_far_behind_what_another_camera_measures_is_contradicted(behind: float, is_wrong: bool) -> None:
     """The floor about it shows through a pixel of the block that lies under the floor."""
@@ -45,8 +49,8 @@ def test_depth_far_behind_what_another_camera_measures_is_contradicted(behind: f
     assert pixels.any() == is_wrong and not (pixels & ~is_block).any()
     assert not is_wrong or pixels.sum() > 0.7 * is_block.sum()
     assert ((without_contradicted(object_mask(shiny), found).kinds == PixelKind.CONTRADICTED) == pixels).all()
-    points = found.points(shiny, CONFIG, is_blank=False)
-    assert bool(len(points)) == is_wrong and not len(found.points(shiny, CONFIG, is_blank=True))
+    points = points_of(found, shiny, is_blank=False)
+    assert bool(len(points)) == is_wrong and not len(points_of(found, shiny, is_blank=True))
     if is_wrong:  # on the rays of the block and above the floor
         assert (points[:, 2] > 0).all() and np.abs(points[:, :2]).max() < 0.12
         assert HEIGHT - CONFIG.min_range - 0.01 < points[:, 2].max() <= HEIGHT - CONFIG.min_range
@@ -59,7 +63,7 @@ def test_a_ray_proves_nothing_free_where_another_camera_sees_through_what_it_mea
     is_unproven = (found.unproven(shiny).depth == 0) & (shiny.depth > 0)
     assert is_unproven.sum() > 0.5 * (shiny.depth < HEIGHT).sum() and not found.until.any()
     assert not found.pixels(shiny.depth.shape).any()  # what it measures stays a surface of the map
-    points = found.points(shiny, CONFIG, is_blank=False)
+    points = points_of(found, shiny, is_blank=False)
     assert HEIGHT - 0.6 - 1e-6 <= points[:, 2].min() < HEIGHT - 0.6 + CONFIG.voxel
     assert beside.until.any() and beside.unproven(OTHER) is OTHER
 
@@ -84,7 +88,7 @@ def test_a_camera_without_depth_where_another_measures_a_surface_looked_in_vain(
     """It makes no surface of the other's doubtful."""
     dark = block_measured_at(0.0)
     found, beside = contradict_all(dark, OTHER)
-    points = found.points(dark, CONFIG, is_blank=True)
+    points = points_of(found, dark, is_blank=True)
     assert len(points) and not found.pixels(dark.depth.shape).any() and not beside.through.any()
     assert np.linalg.norm(points - [0.0, 0.0, BLOCK / 2], axis=1).min() < CONFIG.voxel
 
@@ -132,7 +136,7 @@ def test_a_robot_that_returns_no_depth_is_hidden_by_something(is_drawn: bool) ->
     dark = block_measured_at(0.0)
     mask = replace(object_mask(dark), robot_depth=np.where(dark.depth <= 0, np.float32(0.5), np.float32(0.0)))
     (found,) = contradicted([(dark, mask)], is_drawn=is_drawn)
-    points = found.points(dark, CONFIG, is_blank=True)
+    points = points_of(found, dark, is_blank=True)
     assert bool(len(points)) == is_drawn
     assert not is_drawn or points[:, 2].min() > HEIGHT - 0.5 - 1e-6
 
