@@ -221,11 +221,6 @@ def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Fl
     return np.asarray(np.sqrt(np.einsum("si,si->s", speed, speed)))
 
 
-def is_immovable(G: Float64, velocity_limit: Float64) -> Bool:
-    """True for rows (M,) that no joint velocity changes: fixed spheres or flat field."""
-    return np.asarray(np.abs(G) @ velocity_limit < fixed.IMMOVABLE_ROW)
-
-
 @dataclass(frozen=True, kw_only=True)
 class SceneStep:
     """The two newest scenes known at a time, `seconds` apart."""
@@ -234,6 +229,9 @@ class SceneStep:
     older: DistanceField
     seconds: float
 
+
+FieldAt = Callable[[int], DistanceField]
+"""Stamp [ns] -> the field known then; the same object for the same scene."""
 
 SceneStepAt = Callable[[int], SceneStep | None]
 """Stamp [ns] -> the two newest scenes known then; None if there was only one."""

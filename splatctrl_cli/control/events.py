@@ -122,13 +122,13 @@ class OneEach:
 class Signal:
     """Source of events of one kind: is_on (T,), value (T,).
 
-    names_at: names at a state, the value's own first.
+    names_at: names at a state, the value's own first; none by default.
     """
 
     kind: EventKind
     is_on: Bool
     value: Float64
-    names_at: Callable[[int], Sequence[str]]
+    names_at: Callable[[int], Sequence[str]] = lambda _: ()
     is_high_worse: bool = True
     source: str = ""
 
@@ -238,17 +238,13 @@ def audit_signals(
                 source=source,
             )
         )
-    unknown = np.nan_to_num(audit.unknown_share)
-    signals.append(Signal(kind=EventKind.UNKNOWN_SPACE, is_on=unknown > 0, value=unknown, names_at=_nobody))
-    outside = audit.limit_margin
-    signals.append(
-        _low(EventKind.OUTSIDE_LIMITS, outside < 0, outside, OneEach(names=joints, index=audit.limit_joint))
-    )
-    touching = audit.self_clearance
-    signals.append(
-        _low(EventKind.SELF_COLLISION, touching < 0, touching, OneEach(names=pairs, index=audit.self_pair))
-    )
-    return signals
+    unknown, outside, touching = np.nan_to_num(audit.unknown_share), audit.limit_margin, audit.self_clearance
+    return [
+        *signals,
+        Signal(kind=EventKind.UNKNOWN_SPACE, is_on=unknown > 0, value=unknown),
+        _low(EventKind.OUTSIDE_LIMITS, outside < 0, outside, OneEach(names=joints, index=audit.limit_joint)),
+        _low(EventKind.SELF_COLLISION, touching < 0, touching, OneEach(names=pairs, index=audit.self_pair)),
+    ]
 
 
 def clearance_signals(
@@ -275,16 +271,15 @@ def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
 
 def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[Signal]:
     """Signals between states: clearance bound (T,) [m] below the margin, unbounded time (T,) [s]."""
-    is_low = lower < margin
     return [
-        _low(EventKind.BETWEEN_STATES, is_low, lower, _nobody),
-        Signal(kind=EventKind.NOT_BOUNDED, is_on=unbounded > 0, value=unbounded, names_at=_nobody),
+        Signal(kind=EventKind.BETWEEN_STATES, is_on=lower < margin, value=lower, is_high_worse=False),
+        Signal(kind=EventKind.NOT_BOUNDED, is_on=unbounded > 0, value=unbounded),
     ]
 
 
 def stale_signal(age_s: Float64, max_age_s: float) -> Signal:
     """Signal of a stale scene; age_s (T,) [s], NaN for an unstamped scene."""
-    return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s), names_at=_nobody)
+    return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s))
 
 
 def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
@@ -293,14 +288,8 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
     def relaxed(i: int) -> Sequence[str]:
         return [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)]
 
-    signals = [_intervention_signal(steps, kind) for kind in RowKind]
     slack = _of(steps, lambda step: max((row.slack for row in step.relaxed), default=0.0))
     is_outside = _of(steps, lambda step: float(step.rung is Rung.OUTSIDE)) > 0
-    for kind, is_on in (
-        (EventKind.RELAXED, (slack > 0) & ~is_outside),
-        (EventKind.ROW_BROKEN, (slack > 0) & is_outside),
-    ):
-        signals.append(Signal(kind=kind, is_on=is_on, value=slack, names_at=relaxed))
     residual, clearance = _of(steps, lambda step: step.residual), _of(steps, lambda step: step.clearance)
     is_least = _of(steps, lambda step: float(step.rung is Rung.MINIMUM_VIOLATION)) > 0
     is_hold = _of(steps, lambda step: float(step.rung is Rung.HOLD)) > 0
@@ -311,13 +300,15 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
     def nearest(i: int) -> Sequence[str]:
         return [_asked(steps, i).nearest]
 
-    signals += [
+    return [
+        *(_intervention_signal(steps, kind) for kind in RowKind),
+        Signal(kind=EventKind.RELAXED, is_on=(slack > 0) & ~is_outside, value=slack, names_at=relaxed),
+        Signal(kind=EventKind.ROW_BROKEN, is_on=(slack > 0) & is_outside, value=slack, names_at=relaxed),
         Signal(kind=EventKind.MINIMUM_VIOLATION, is_on=is_least, value=residual, names_at=nearest),
         _low(EventKind.HOLD, is_hold, clearance, nearest),
         _low(EventKind.SCALED_BACK, (scale < 1) & ~is_hold, scale, nearest),
         _low(EventKind.CANNOT_ACT, cannot, fixed, lambda i: _asked(steps, i).violated_fixed),
     ]
-    return signals
 
 
 def _intervention_signal(steps: Sequence[ControlStep | None], kind: RowKind) -> Signal:
@@ -348,7 +339,3 @@ def _asked(steps: Sequence[ControlStep | None], index: int) -> ControlStep:
     step = steps[index]
     assert step is not None
     return step
-
-
-def _nobody(_: int) -> Sequence[str]:
-    return ()

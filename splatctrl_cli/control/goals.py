@@ -81,11 +81,6 @@ class LoggedMotion:
         )
         return position, velocity
 
-    def goal_at(self, model: RobotModel, frame: str, stamp_ns: int) -> tuple[Float64, Guide]:
-        """A frame's logged pose (4, 4) and motion at a stamp."""
-        position, velocity = self.at(stamp_ns)
-        return guided_goal(model, frame, position, velocity)
-
 
 def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
     """A frame's pose (4, 4) and motion at a posture and velocity (J,)."""

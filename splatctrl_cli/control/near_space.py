@@ -89,14 +89,10 @@ class NearSpace:
             is_timed = stamp_ns >= self._next_ns
             if is_timed:
                 self._next_ns = stamp_ns + fixed.NEAR_EVERY_NS
-            if is_timed or self._has_moved(moving[index]):
+            away = np.zeros((0, 3)) if self._looked is None else moving[index] - self._looked
+            if is_timed or np.sum(away**2, axis=1).max(initial=0.0) >= fixed.NEAR_MOVED**2:
                 chosen[index], self._looked = is_timed, moving[index]
         return chosen
-
-    def _has_moved(self, centers: Float64) -> bool:
-        if self._looked is None:
-            return False
-        return bool(np.sum((centers - self._looked) ** 2, axis=1).max(initial=0.0) >= fixed.NEAR_MOVED**2)
 
     def on_the_way(self, first: Float64, last: Float64) -> Float64:
         """Postures (K, J) in between, so dense that no sphere moves by `NEAR_MOVED`."""

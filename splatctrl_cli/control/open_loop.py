@@ -1,20 +1,17 @@
 """Open loop: the controller's command at every logged state, next to the logged one."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.barriers import SceneStepAt, rate_of
+from splatctrl_cli.control.barriers import FieldAt, SceneStepAt, rate_of
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
-from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.robot.model import RobotModel
-
-FieldAt = Callable[[int], DistanceField]
 
 
 @dataclass(frozen=True, kw_only=True)

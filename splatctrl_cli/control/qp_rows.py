@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind, is_immovable
+from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind
 from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, held, is_usable
 from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
@@ -97,7 +97,8 @@ class RowBuilder:
 
     def at(self, state: State) -> Rows:
         barriers = tuple(term.rows(state) for term in self._terms)
-        is_fixed = np.concatenate([is_immovable(b.G, self._model.velocity_limit) for b in barriers])
+        # Rows that no joint velocity changes: of fixed spheres, or in a flat field.
+        is_fixed = np.concatenate([np.abs(b.G) @ self._model.velocity_limit < fixed.IMMOVABLE_ROW for b in barriers])
         binds = np.concatenate([can_bind(b.G, b.h, *state.box) for b in barriers])
         return Rows(barriers=barriers, margin=self._margin, is_fixed=is_fixed, in_qp=binds & ~is_fixed)
 

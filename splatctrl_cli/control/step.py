@@ -204,12 +204,14 @@ class QpIkController:
         """A step's input at a moment. Raises as `step`."""
         q = checked_posture(self._model, moment.q)
         error = pose_error(self._model.frame_pose(q, self._frame), moment.T_world_goal)
+        linear, angular = self._config.max_linear_speed, self._config.max_angular_speed
+        reference = reference_velocity(error, gain=self._config.pose_gain, max_linear=linear, max_angular=angular)
         state = State(
             model=self._model,
             frame=self._frame,
             q=q,
             box=self._limits.box(q, moment.last_velocity),
-            reference=self._reference(error, moment.guide),
+            reference=reference if moment.guide is None else reference + moment.guide.twist,
             guide=moment.guide,
             last_velocity=moment.last_velocity,
             distance_rate=moment.distance_rate,
@@ -251,13 +253,6 @@ class QpIkController:
             limit=float(limits[limit]),
             limit_row=self._limit_names[limit],
         )
-
-    def _reference(self, error: Float64, guide: Guide | None) -> Float64:
-        config = self._config
-        reference = reference_velocity(
-            error, gain=config.pose_gain, max_linear=config.max_linear_speed, max_angular=config.max_angular_speed
-        )
-        return reference if guide is None else reference + guide.twist
 
     def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
         """Rows, the ladder's choice, and True if the later distances keep the promise.

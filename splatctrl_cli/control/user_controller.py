@@ -126,7 +126,7 @@ def serve(target: str) -> None:
         def rows(number: int = asked["id"], known: list[Sequence[ClearanceRow]] = known) -> Sequence[ClearanceRow]:
             if not known:
                 answer(id=number, ask="rows")
-                known.append([_row(row) for row in line()["rows"]])
+                known.append([ClearanceRow(**{**row, "G": _array(row["G"])}) for row in line()["rows"]])
             return known[0]
 
         answer(id=asked["id"], velocity=_velocities(target, controller.step(_input(asked, rows))))
@@ -153,10 +153,6 @@ def _input(asked: Mapping[str, Any], rows: Callable[[], Sequence[ClearanceRow]])
     return ControllerInput(
         stamp_ns=asked["stamp_ns"], ask_rows=rows, **{name: _array(asked[name]) for name in arrays}
     )
-
-
-def _row(document: Mapping[str, Any]) -> ClearanceRow:
-    return ClearanceRow(**{**document, "G": np.array(document["G"], np.float64)})
 
 
 def _array(values: Sequence[Any] | None) -> Any:

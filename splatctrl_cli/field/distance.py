@@ -67,9 +67,7 @@ class LogSumExpField(ABC):
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
         """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
-        terms = self.terms()
-        bake = native.bake_matern if terms.is_matern else native.bake_gaussian
-        bake(self.spheres.clusters, terms, span, distance, gradient, threads=threads)
+        native.bake_kernel(self.spheres.clusters, self.terms(), span, distance, gradient, threads=threads)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient as in `query_raw`, or the exact ones where undefined."""

@@ -91,7 +91,7 @@ class PaperProbability:
             length=self._half,
             tolerance=self._share,
         )
-        native.bake_matern(places.clusters, terms, span, half, threads=threads)
+        native.bake_kernel(places.clusters, terms, span, half, threads=threads)
         return self._combined(gpdf.astype(np.float64), half.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:

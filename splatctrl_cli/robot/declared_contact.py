@@ -16,27 +16,17 @@ REMEDY = "see splatctrl help declare for the keys of a declaration"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Carried:
-    """A carried box in the frame of `link` [m], `start` to `end` [s after the first state]."""
+class DeclaredContact:
+    """A box [m] at `link` from `start` to `end` [s after the first state]: carried, in the link's frame, or touched.
 
-    link: str
-    box: Box
-    start: float
-    end: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExpectedContact:
-    """An intended contact of `link` within a world box [m], `start` to `end` [s after the first state].
-
-    is_learned: from an observed grasp, not a file.
+    An intended contact lies within its box in world, for a `reason`. is_learned: from an observed grasp, not a file.
     """
 
     link: str
     box: Box
     start: float
     end: float
-    reason: str
+    reason: str = ""
     is_learned: bool = False
 
 
@@ -47,8 +37,8 @@ class Declarations:
     num_uses: by (table, index), how often an entry changed a label or excused a contact.
     """
 
-    carried: tuple[Carried, ...] = ()
-    expected_contact: tuple[ExpectedContact, ...] = ()
+    carried: tuple[DeclaredContact, ...] = ()
+    expected_contact: tuple[DeclaredContact, ...] = ()
     num_uses: dict[tuple[str, int], int] = field(default_factory=dict)
 
     def carried_at(self, time_s: float) -> list[tuple[str, Box]]:
@@ -65,7 +55,7 @@ class Declarations:
                 inside |= its
         return inside
 
-    def expects(self, link: str, point_world: Floats, time_s: float) -> ExpectedContact | None:
+    def expects(self, link: str, point_world: Floats, time_s: float) -> DeclaredContact | None:
         """First entry for a contact at a point (3,) [m]; counts its use."""
         for index, entry in enumerate(self.expected_contact):
             if link == entry.link and entry.start <= time_s <= entry.end and entry.box.contains(point_world):
@@ -115,9 +105,11 @@ def read_declarations(path: Path, links: Collection[str] | None = None) -> Decla
     unknown = sorted(set(document) - {"carried", "expected_contact"})
     if unknown:
         raise InputError(f"{path}: expected [[carried]] and [[expected_contact]], got {unknown[0]}", remedy=REMEDY)
-    carried = [Carried(**entry) for entry in _entries(path, document, "carried", links)]
-    expected = [ExpectedContact(**entry) for entry in _entries(path, document, "expected_contact", links)]
-    return Declarations(carried=tuple(carried), expected_contact=tuple(expected))
+    found = {
+        table: tuple(DeclaredContact(**entry) for entry in _entries(path, document, table, links))
+        for table in ("carried", "expected_contact")
+    }
+    return Declarations(**found)
 
 
 def _entries(

@@ -184,7 +184,7 @@ def _learn_link(
     at = np.array([k for _, k in used])
     origin, mask = _candidates(np.concatenate(points), at.repeat([len(part) for part in points]))
     cells = origin + VOXEL * np.argwhere(mask)
-    gap = _own_distance(surface, number, cells, reach)
+    gap = surface.distance_to(surface.links[number], cells, within=reach)
     is_near = (gap <= reach) & (gap > -TRUNCATION)
     mask[mask], cells, gap = is_near, cells[is_near], gap[is_near]
     in_order = [used[int(np.argmax(at == k))][0] for k in range(at.max() + 1)]
@@ -290,12 +290,12 @@ def _is_on_other_link(
 ) -> Bool:
     """True for cells nearer to a link against which they move less than `STEP`."""
     found = np.zeros(len(cells), bool)
-    for other in range(len(surface.links)):
+    for other, link in enumerate(surface.links):
         places = _moved(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
         if other != number and len(cells):
             is_still = _span(places, seen) < STEP
             at = places[seen.argmax(axis=0), np.arange(len(cells))]
-            found |= is_still & (_own_distance(surface, other, at, reach) < gap)
+            found |= is_still & (surface.distance_to(link, at, within=reach) < gap)
     return found
 
 
@@ -337,12 +337,6 @@ def _triangles(distance: Float32, origin: Float64) -> Float64:
         return np.zeros((0, 3, 3))
     vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="ascent")
     return np.asarray(origin + VOXEL * vertices[faces], np.float64)
-
-
-def _own_distance(surface: RobotSurface, number: int, points: Float64, within: float) -> Float64:
-    others = [link for k, link in enumerate(surface.links) if k != number]
-    still = np.tile(np.eye(4), (len(surface.links), 1, 1))
-    return surface.distance(still, points, without=others, within=within)
 
 
 def _boxes(surface: RobotSurface) -> Float64:

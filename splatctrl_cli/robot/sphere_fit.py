@@ -178,11 +178,7 @@ class _Link:
         centers = self._candidates[chosen]
         for _ in range(FIT_ROUNDS):
             owner, worst = self._assigned(centers)
-            moved = centers.copy()
-            for ball in range(len(centers)):
-                mine = owner == ball
-                if mine.any():
-                    moved[ball] = self._candidates[int(np.argmin(self._cost[:, mine].max(axis=1)))]
+            moved = _recentred(centers, owner, [self._candidates] * len(centers), [self._cost] * len(centers))
             if self._assigned(moved)[1] >= worst:
                 break
             centers = moved
@@ -212,12 +208,7 @@ class _Link:
             owner, worst = self._assigned(centers)
             tried = (centers[:, None] + step * self._spacing * offsets).reshape(-1, 3)
             cost = (self._reach(tried) + self._distance(tried)[:, None]).reshape(len(centers), len(offsets), -1)
-            moved = centers.copy()
-            for ball in range(len(centers)):
-                mine = owner == ball
-                if mine.any():
-                    needed = cost[ball][:, mine].max(axis=1)
-                    moved[ball] = tried.reshape(len(centers), -1, 3)[ball, int(np.argmin(needed))]
+            moved = _recentred(centers, owner, tried.reshape(len(centers), -1, 3), cost)
             if self._assigned(moved)[1] < worst:
                 centers = moved
         return centers, self._assigned(centers)[1]
@@ -246,6 +237,19 @@ class _Link:
         if len(inside) < wanted // 20:
             inside = np.concatenate([inside, patches.mean(axis=1)])
         return inside, spacing
+
+
+def _recentred(
+    centers: Float64, owner: Index, places: Sequence[Float64] | Float64, costs: Sequence[Float64] | Float64
+) -> Float64:
+    """Centres (n, 3), each at that of its places (K, 3) with the least cost for the patches that it owns.
+
+    places, costs (K, patches): by centre.
+    """
+    moved = centers.copy()
+    for ball in np.unique(owner):
+        moved[ball] = places[ball][np.argmin(costs[ball][:, owner == ball].max(axis=1))]
+    return moved
 
 
 def _greedy(by_patch: Bool, rng: np.random.Generator | None, at_most: int) -> list[int] | None:

@@ -243,13 +243,15 @@ class RobotSurface:
         )  # fmt: skip
         return least
 
-    def distance_to(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:
+    def distance_to(
+        self, link: str, points: Float64, outside: Bool | None = None, *, within: float = np.inf
+    ) -> Float64:
         """Signed distances (Q,) [m] of points (Q, 3), link frame, to one link.
 
-        Carried boxes count. outside (Q,): known outside.
+        Carried boxes count. outside (Q,): known outside; within [m]: as in `distance`.
         """
-        still = np.tile(np.eye(4), (len(self.links), 1, 1))
-        return self.distance(still, points, without=[name for name in self.links if name != link], outside=outside)
+        still, others = np.tile(np.eye(4), (len(self.links), 1, 1)), [name for name in self.links if name != link]
+        return self.distance(still, points, without=others, within=within, outside=outside)
 
     def gaps(self, link: str, T_world_link: Float64, centers: Floats, radii: Floats) -> Float64:
         """A link's signed gap (T,) [m] to the nearest ball; infinite without balls.

@@ -11,7 +11,7 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.config.fixed import CONTACT_REACH, ROBOT_REACH
 from splatctrl_cli.records import Box, Label, RgbdFrame
-from splatctrl_cli.robot.declared_contact import Carried, Declarations
+from splatctrl_cli.robot.declared_contact import Declarations, DeclaredContact
 from splatctrl_cli.scene import fitter as fitter_module
 from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.fitter import SceneFitter
@@ -55,7 +55,9 @@ def test_a_carried_box_that_pixels_need_is_used_and_one_in_the_air_is_not() -> N
     assert robot.surface is not None
     held = Box(lower=np.array([-0.1, -0.1, -0.3]), upper=np.array([0.1, 0.1, VISITOR - 0.3]))  # in the ball's frame
     aside = Box(lower=np.array([0.2, 0.2, 0.0]), upper=np.array([0.3, 0.3, 0.1]))
-    declared = Declarations(carried=tuple(Carried(link="arm", box=box, start=0.0, end=1.0) for box in (held, aside)))
+    declared = Declarations(
+        carried=tuple(DeclaredContact(link="arm", box=box, start=0.0, end=1.0) for box in (held, aside))
+    )
     at_frame = {0: np.repeat(robot.T_world_surface[0], 3, axis=0)}  # the link's pose, and that of each box
     holding = replace(robot, surface=robot.surface.with_boxes(declared.carried_at(0.5)), T_world_surface=at_frame)
     mask = self_mask(view, holding, OccupancyConfig())
