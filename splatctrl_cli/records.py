@@ -4,7 +4,7 @@ N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixels.
 """
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from operator import attrgetter
@@ -31,21 +31,15 @@ SECOND_NS = 1_000_000_000
 MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m], and [1/m]
 
 
-class FloatRows(Protocol):
+class FloatRows(Sized, Iterable[Any], Protocol):
     """Rows (T, ...) of float64 by number, slice or index (K,), in memory or a file."""
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(T, ...)."""
 
-    def __len__(self) -> int:
-        """T."""
-
     def __getitem__(self, which: Any, /) -> Any:
         """A row, or rows of a slice or an index."""
-
-    def __iter__(self) -> Iterator[Any]:
-        """Yield the rows."""
 
 
 class Label(IntEnum):

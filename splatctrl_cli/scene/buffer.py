@@ -69,12 +69,13 @@ class SplatBuffer:
         """(M,) [m]."""
         return np.asarray(np.exp(self.parameters[:, LOG_RADIUS]), np.float32)
 
-    def kill(self, slots: Bool) -> None:
-        """Make slots of a mask (M,) dead: transparent, without moments, reusable."""
+    def kill(self, slots: Bool) -> int:
+        """Make slots of a mask (M,) dead: transparent, without moments, reusable; return their number."""
         self.is_alive[slots] = False
         self.parameters[slots, LOGIT] = DEAD_LOGIT
         self.labels[slots] = Label.OBJECT
         self._reset(np.flatnonzero(slots))
+        return int(np.count_nonzero(slots))
 
     def set_radius(self, slots: NDArray[np.intp], radius: NDArray[np.floating] | float) -> None:
         """Set radii (K,) [m] of slots (K,)."""

@@ -26,11 +26,6 @@ from splatctrl_cli.scene.self_mask import (
 )
 
 
-def is_in_contact(points_world: NDArray[np.floating], robot: RobotPosture) -> Bool:
-    """True for points (N, 3) [m] within `CONTACT_REACH` of moving links."""
-    return np.asarray(robot.distance_to_moving(points_world) < fixed.CONTACT_REACH)
-
-
 def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Bool:
     """Pixels (H, W) of objects within `CONTACT_REACH` of moving links."""
     is_robot: Bool = mask.robot_depth > 0
@@ -40,7 +35,7 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
     shown, reach = mask.robot_depth, pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
     chosen &= frame.depth > nearest_within(shown, is_robot, reach) - fixed.CONTACT_REACH  # a quick superset
     chosen &= frame.depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS
-    chosen[chosen] = is_in_contact(world_points(frame, chosen), robot)
+    chosen[chosen] = robot.distance_to_moving(world_points(frame, chosen)) < fixed.CONTACT_REACH
     return chosen
 
 

@@ -48,7 +48,7 @@ class Descent:
 
         depth: factor of the depth loss.
         """
-        weights = self._weights()
+        weights = loss_weights(self._config, self.background or BLACK)
         weights = replace(weights, depth=depth * weights.depth)
         if self.device is not None and views:
             return self._run_on(self.device, views, weights, settings)
@@ -104,12 +104,8 @@ class Descent:
         return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
 
     def evaluate(self, view: View) -> LossTerms:
-        return self._loss.evaluate(
-            self.planes(view), view.target, self._weights(), empty_planes(*view.target.depth.shape)
-        )
-
-    def _weights(self) -> LossWeights:
-        return loss_weights(self._config, self.background or BLACK)
+        weights = loss_weights(self._config, self.background or BLACK)
+        return self._loss.evaluate(self.planes(view), view.target, weights, empty_planes(*view.target.depth.shape))
 
     def settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
         """Learning rates times `rate`, of centre and radius times `geometry`."""

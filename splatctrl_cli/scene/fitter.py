@@ -14,7 +14,7 @@ from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
-from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact, lasts_at_fixed_links
+from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
 from splatctrl_cli.scene.depth_holes import explain_unseen, lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
@@ -49,7 +49,7 @@ from splatctrl_cli.scene.self_mask import (
     without,
 )
 from splatctrl_cli.scene.shell import Shell
-from splatctrl_cli.scene.steady_depth import object_twice, steadied
+from splatctrl_cli.scene.surface_depth import object_twice, steadied
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
 from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
@@ -300,17 +300,13 @@ class SceneFitter:
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into air or out, or made faint; count it in `removed`."""
-        drifted = self._relabel(robot, seen)
-        self.buffer.kill(drifted)
-        floating = self._floating(views)
-        self.buffer.kill(floating)
-        outside = self.buffer.is_alive & ~self.workspace.contains(self.buffer.centers)
-        self.buffer.kill(outside)
-        faint = self.buffer.is_alive & (self.buffer.opacities < self.config.min_opacity)
-        self.buffer.kill(faint)
-        reasons = {"robot": drifted, "seen_through": floating, "workspace": outside, "opacity": faint}
-        for reason, mask in reasons.items():
-            removed[reason] += int(mask.sum())
+        buffer = self.buffer
+        removed["robot"] += buffer.kill(
+            relabel(buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
+        )
+        removed["seen_through"] += buffer.kill(self._floating(views))
+        removed["workspace"] += buffer.kill(buffer.is_alive & ~self.workspace.contains(buffer.centers))
+        removed["opacity"] += buffer.kill(buffer.is_alive & (buffer.opacities < self.config.min_opacity))
 
     def _remove(self, is_trail: Bool, is_floating: Bool, *, counts_time: bool = True) -> dict[str, int]:
         reasons = removals(
@@ -322,9 +318,7 @@ class SceneFitter:
             is_floating=is_floating,
             counts_time=counts_time,
         )
-        for mask in reasons.values():
-            self.buffer.kill(mask)
-        return {reason: int(mask.sum()) for reason, mask in reasons.items()}
+        return {reason: self.buffer.kill(mask) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
         """Fill dead slots at pixels of M_add; the first full view sets the density."""
@@ -400,8 +394,7 @@ class SceneFitter:
             if label == Label.OBJECT and num_missing > 0 and self.num_steps % fixed.EVICT_EVERY == 0:
                 shown, gap = self.descent.misfits(views)[1], self.config.max_gap
                 is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, gap)
-                self.buffer.kill(is_evicted)
-                removed["evicted"] += int(is_evicted.sum())
+                removed["evicted"] += self.buffer.kill(is_evicted)
             filled += self.buffer.fill(seeds, self.config.initial_opacity, label=label)
         return filled
 
@@ -420,7 +413,8 @@ class SceneFitter:
             return Filled()
         radius, is_object = 0.5 * self.config.contact_radius, self._standing_for(Label.OBJECT)
         slots = np.flatnonzero(is_object)
-        self.buffer.set_radius(slots[is_in_contact(self.buffer.centers[slots], robot)], radius)
+        is_near = robot.distance_to_moving(self.buffer.centers[slots]) < fixed.CONTACT_REACH
+        self.buffer.set_radius(slots[is_near], radius)
         splats = self.splats().select(is_object[self.buffer.is_alive])
         mappable = [view.mappable & pixels for view, pixels in zip(views, steady, strict=True)]
         seeds = contact_seeds(

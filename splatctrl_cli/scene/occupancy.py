@@ -238,11 +238,8 @@ class OccupancyMap:
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
         voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))
-        return voxels[~self._may_be_robot(voxels)]
-
-    def _may_be_robot(self, voxels: NDArray[np.intp]) -> Bool:
-        """True for voxels (K,) swept, without an object since."""
-        return np.asarray(self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) == SWEPT)
+        # Those swept, without an object since, may be the robot's.
+        return np.asarray(voxels[self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) != SWEPT])
 
     def swept_box(self) -> Box | None:
         """Box of the robot's path so far; None without any."""

@@ -218,9 +218,9 @@ def use_idle(
     weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
     is_weak = np.zeros(len(is_alive), bool)
     is_weak[weakest[: int(config.weak_share * is_alive.sum())]] = True
-    buffer.kill(is_weak)
+    num_weak = buffer.kill(is_weak)
     seeds = detail_seeds(found, int((~is_alive).sum()) - reserve, config, rng)
-    return buffer.fill(seeds, config.initial_opacity), int(is_weak.sum())
+    return buffer.fill(seeds, config.initial_opacity), num_weak
 
 
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:

@@ -30,7 +30,7 @@ from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.surface_steps import surface_steps
+from splatctrl_cli.scene.surface_depth import surface_steps
 from splatctrl_cli.scene.time_steps import AuditRow
 
 

@@ -19,7 +19,7 @@ from splatctrl_cli.scene.keyframes import kept_radii
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
-from splatctrl_cli.scene.steady_depth import steadied
+from splatctrl_cli.scene.surface_depth import steadied
 from tests.scene.test_labels import VISITOR, ball, seen_and_masked, seen_with, splats_at
 from tests.scene.wall import WORKSPACE, frame, plain_seeds
 

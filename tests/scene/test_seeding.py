@@ -10,16 +10,18 @@ from splatctrl_cli.kernels.points import Cubes
 from splatctrl_cli.records import Bool, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.scene.seed_octree import cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.seeding import (
     SeedDensity,
     add_mask,
     candidates,
+    cube_levels,
     gap_seeds,
     inside_workspace,
+    leaves,
     seeds_at,
     thinned,
     thinning,
+    tolerance_for,
     world_points,
 )
 from tests.plain import plain_splats

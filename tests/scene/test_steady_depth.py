@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Bool, Float32, Intrinsics, RgbdFrame
-from splatctrl_cli.scene.steady_depth import object_twice, steadied
+from splatctrl_cli.scene.surface_depth import object_twice, steadied
 from tests.plain import plain_frame
 
 LENS = Intrinsics(fx=150.0, fy=150.0, cx=79.5, cy=59.5, width=160, height=120)
