@@ -301,9 +301,7 @@ class SceneFitter:
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into air or out, or made faint; count it in `removed`."""
         buffer = self.buffer
-        removed["robot"] += buffer.kill(
-            relabel(buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
-        )
+        removed["robot"] += buffer.kill(self._relabel(robot, seen))
         removed["seen_through"] += buffer.kill(self._floating(views))
         removed["workspace"] += buffer.kill(buffer.is_alive & ~self.workspace.contains(buffer.centers))
         removed["opacity"] += buffer.kill(buffer.is_alive & (buffer.opacities < self.config.min_opacity))
