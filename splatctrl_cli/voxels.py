@@ -177,15 +177,8 @@ class SeenVoxels:
         return np.concatenate([[-1], self.step_stamps_ns])[step], classes
 
 
-def _classes() -> UInt8:
-    """`EvidenceClass` by 1 + the lower four bits of `Unseen`; 0: no reason."""
-    classes = np.full(17, np.uint8(EvidenceClass.OUT_OF_VIEW))
-    for reason in Unseen:
-        classes[1 + (reason & 0xF)] = EvidenceClass[reason.name]
-    return classes
-
-
-_CLASS_OF = _classes()
+_CLASS_OF = np.full(17, np.uint8(EvidenceClass.OUT_OF_VIEW))  # by 1 + the lower four bits of `Unseen`; 0: no reason
+_CLASS_OF[[1 + (reason & 0xF) for reason in Unseen]] = [EvidenceClass[reason.name] for reason in Unseen]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -205,14 +205,9 @@ def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, ra
     return np.asarray(gain * (distance - margin) + rate)
 
 
-def fastest_approach(G: Float64, lowest: Float64, highest: Float64) -> Float64:
-    """Largest G v (M,) [m/s] over the box of joint velocities."""
-    return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1))
-
-
 def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> Bool:
     """True for rows (M,) that some velocity of the box violates; others change no solution."""
-    return np.asarray(fastest_approach(G, lowest, highest) > h)
+    return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1) > h)
 
 
 def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Float64:

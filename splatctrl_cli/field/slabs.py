@@ -6,8 +6,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import FieldConfig, OccupancyConfig
-from splatctrl_cli.config.fixed import MAX_RADIUS_SPREAD, ROUGH_LENGTH
+from splatctrl_cli.config import FieldConfig, OccupancyConfig, fixed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker, Planes
 from splatctrl_cli.field.grid_cells import GridLayout, check_memory, check_room, observed_planes
@@ -81,10 +80,10 @@ def _set_warnings(centers: Floats, radii: Floats, length: float, *, has_kernel: 
             f"the length scale {length:g} m exceeds the extent of the splats, {extent:.3g} m: "
             "the kernel field cannot tell them apart; give a smaller --length-scale"
         )
-    if has_kernel and length >= ROUGH_LENGTH:
+    if has_kernel and length >= fixed.ROUGH_LENGTH:
         yield f"the length scale {length:g} m is so large that rounding shows in the fields; give a smaller one"
     thick = radii[radii > 0]
-    if len(thick) and thick.max() > MAX_RADIUS_SPREAD * thick.min():
+    if len(thick) and thick.max() > fixed.MAX_RADIUS_SPREAD * thick.min():
         yield (
             f"radii from {thick.min() * 1e3:.3g} to {thick.max() * 1e3:.3g} mm in one set: "
             "the median radius and its ratios stand for neither end; check the splats' unit, metres"

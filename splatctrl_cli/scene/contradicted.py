@@ -11,14 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import (
-    CONTRADICTED,
-    CONTRADICTING_COLUMNS,
-    CONTRADICTING_PIXELS,
-    MASK_STEP,
-    SEEN_THROUGH_PIXELS,
-)
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
 from splatctrl_cli.scene.depth_holes import points_on_rays, shadowed
@@ -89,13 +82,13 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
         robot = _blocks(mask.robot_depth, view.side).min(axis=2)
         is_before = view.is_lost & (robot > 0) & is_drawn
         depths[is_before] = robot[is_before]
-        until.append(_side_by_side(depths, CONTRADICTING_PIXELS))
+        until.append(_side_by_side(depths, fixed.CONTRADICTING_PIXELS))
     for view, end, passed in zip(views, until, through, strict=True):
         yield Contradicted(
             side=view.side,
             until=end,
             is_blank=np.asarray((_blocks(view.frame.depth, view.side) <= 0).all(axis=2)),
-            through=_side_by_side(passed, SEEN_THROUGH_PIXELS),
+            through=_side_by_side(passed, fixed.SEEN_THROUGH_PIXELS),
         )
 
 
@@ -116,7 +109,7 @@ def _is_plane(depth: Float32) -> Bool:
     """
     inverse = 1 / np.maximum(depth, np.float32(1e-3))
     bend = [cv2.filter2D(inverse, -1, line, borderType=cv2.BORDER_REPLICATE) for line in (ALONG, ALONG.T)]
-    return np.asarray(np.maximum(*map(np.abs, bend)) * depth**2 < 2 * MASK_STEP)
+    return np.asarray(np.maximum(*map(np.abs, bend)) * depth**2 < 2 * fixed.MASK_STEP)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +131,7 @@ class _BlockView:
 
     @classmethod
     def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_BlockView":
-        side = max(1, frame.intrinsics.width // CONTRADICTING_COLUMNS)
+        side = max(1, frame.intrinsics.width // fixed.CONTRADICTING_COLUMNS)
         depth = _blocks(frame.depth, side)
         nearest, farthest = depth.min(axis=2), depth.max(axis=2)
         surely = cv2.erode(nearest, BESIDE)  # 0 next to lost pixels
@@ -169,8 +162,8 @@ class _BlockView:
         v, u = pixel // width // self.side, pixel % width // self.side
         asked = np.flatnonzero((pixel >= 0) & (v < self.surely.shape[0]) & (u < self.surely.shape[1]))
         v, u, z = v[asked], u[asked], z[asked]
-        is_behind = self.surely[v, u] > z + CONTRADICTED
-        is_through = is_behind | (self.is_lost[v, u] & (z < self.frame.depth.max() + CONTRADICTED))
+        is_behind = self.surely[v, u] > z + fixed.CONTRADICTED
+        is_through = is_behind | (self.is_lost[v, u] & (z < self.frame.depth.max() + fixed.CONTRADICTED))
         until[v[is_through], u[is_through]] = z[is_through]
         return asked[is_behind]
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, fixed
-from splatctrl_cli.config.fixed import ASKED_REACH, MASK_EDGE, SHADOW_BASELINE, SHADOW_STEP
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.kernels import points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
@@ -135,7 +134,7 @@ def shadowed(depth: Float32, focal: float) -> Bool:
     depth (H, W) [m], 0 = none; focal [px]. With baseline B, an object at z hides B focal (1/z - 1/z_behind) pixels
     behind it, always on the same side. The image gives side and baseline (`_baseline`), and z_behind (`_behind`).
     """
-    is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
+    is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / fixed.MASK_EDGE, 1.0)
     for turn in (1, -1):  # the nearer object is right of its shadow, then left
         image = np.ascontiguousarray(depth[:, ::turn])
         column = np.arange(image.shape[1], dtype=np.int32)
@@ -160,14 +159,14 @@ def _baseline(depth: Float32, following: Index, focal: float) -> float:
     following = following[:, 1:]
     before = depth[:, :-1]
     after = np.take_along_axis(depth, np.minimum(following, depth.shape[1] - 1), axis=1)
-    is_step = (before > 0) & (after > 0) & (SHADOW_STEP * before * after <= focal * (before - after))
+    is_step = (before > 0) & (after > 0) & (fixed.SHADOW_STEP * before * after <= focal * (before - after))
     columns = np.nonzero(is_step)[1]
     if not len(columns):
         return 0.0
     height = focal * (1.0 / after[is_step] - 1.0 / before[is_step])
     baselines = (following[is_step] - 1 - columns) / height
     higher = height >= _median(height, height)
-    return min(_median(baselines[higher], height[higher]), SHADOW_BASELINE)
+    return min(_median(baselines[higher], height[higher]), fixed.SHADOW_BASELINE)
 
 
 def _median(values: Float64, weights: Float64) -> float:
@@ -192,7 +191,7 @@ OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
 
 def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> None:
     """Note why (`Unseen`) no camera ever saw voxels within `ASKED_REACH` of the robot."""
-    voxels = occupancy.unexplained(robot.centers, robot.radii + ASKED_REACH)
+    voxels = occupancy.unexplained(robot.centers, robot.radii + fixed.ASKED_REACH)
     points = occupancy.centers_of(voxels)
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
     for frame, mask in seen:

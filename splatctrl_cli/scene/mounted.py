@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, label, uniform_filter
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float64, RgbdFrame
 
 
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
@@ -31,7 +31,8 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
     """
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None
-    colors = np.stack([_blurred(frame) for frame in frames])
+    sigmas = (fixed.MOUNTED_BLUR, fixed.MOUNTED_BLUR, 0)
+    colors = np.stack([gaussian_filter(frame.color.astype(np.float32) / 255.0, sigmas) for frame in frames])
     deviation = np.median(np.abs(colors - np.median(colors, axis=0)), axis=0).max(axis=-1)
     has_depth = np.mean([frame.depth >= min_range for frame in frames], axis=0, dtype=np.float64)
     depth_share = uniform_filter(has_depth, fixed.MOUNTED_WINDOW)
@@ -62,11 +63,6 @@ def _entering(mask: Bool) -> Bool:
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     area = np.bincount(parts.ravel())
     return np.isin(parts, [part for part in border if part and area[part] >= fixed.MOUNTED_AREA * mask.size])
-
-
-def _blurred(frame: RgbdFrame) -> Float32:
-    sigma = fixed.MOUNTED_BLUR
-    return np.asarray(gaussian_filter(frame.color.astype(np.float32) / 255.0, (sigma, sigma, 0)), np.float32)
 
 
 def _texture(frame: RgbdFrame) -> Float64:

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import HIDDEN
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
@@ -162,7 +161,7 @@ class OccupancyMap:
 
         The unseen side of an object that arrived may fill that space.
         """
-        reach = math.ceil(HIDDEN / self.config.voxel)
+        reach = math.ceil(fixed.HIDDEN / self.config.voxel)
         around = (arrived[:, None] + np.argwhere(np.ones(3 * [2 * reach + 1])) - reach).reshape(-1, 3)
         i, j, k = around[np.all((around >= 0) & (around < self.last_seen.shape), axis=1)].T
         last = self.last_seen[i, j, k]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
+from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -56,7 +56,9 @@ def removals(
     centers = buffer.centers
     is_broken: Bool = ~np.all(np.isfinite(buffer.parameters), axis=1)
     value, is_observed = occupancy.occupancy_around(np.where(is_broken[:, None], np.float32(0), centers))
-    is_free, is_uncertain = _verdict(value, is_observed, config)
+    is_known = is_observed | (config.rule == "literal")
+    is_free = is_known & (value < config.free_below)
+    is_uncertain = is_known & (value >= config.free_below) & (value < config.occupied_above)
     if counts_time:
         buffer.num_uncertain[:] = np.where(is_uncertain, buffer.num_uncertain + 1, 0)
     masks = {
@@ -77,15 +79,6 @@ def removals(
         reasons[reason] = masks[reason] & remaining
         remaining &= ~masks[reason]
     return reasons
-
-
-def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tuple[Bool, Bool]:
-    if config.rule == "literal":
-        return value < config.free_below, (value >= config.free_below) & (value < config.occupied_above)
-    return (
-        is_observed & (value < config.free_below),
-        is_observed & (value >= config.free_below) & (value < config.occupied_above),
-    )
 
 
 def room_for(

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import SEED_BEND, SEED_CROWDED, SEED_LEVELS, SEED_MOST_PIXELS
+from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.kernels.points import CubeMeans, Cubes, SplatTree, back_projected
 from splatctrl_cli.kernels.raster import pack_camera
 from splatctrl_cli.records import Bool, Box, Float32, Float64, RgbdFrame, SplatSet
@@ -59,7 +58,7 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
 
 def thinning(masks: Iterable[Bool]) -> int:
     """Step n that leaves about `SEED_MOST_PIXELS` of masks (H, W), or fewer."""
-    return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
+    return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / fixed.SEED_MOST_PIXELS))
 
 
 def thinned(mask: Bool, every: int) -> Bool:
@@ -100,7 +99,7 @@ class CubeLevel:
         color_variance = (means.square - means.color**2).sum(axis=1)
         covariance = means.covariance[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         thickness = np.maximum(np.linalg.eigvalsh(covariance)[:, 0], 0.0)
-        unexplained = np.maximum(color_variance, 0.0) + SEED_BEND * thickness / self.edge**2
+        unexplained = np.maximum(color_variance, 0.0) + fixed.SEED_BEND * thickness / self.edge**2
         return np.asarray(means.count * unexplained)
 
 
@@ -166,7 +165,7 @@ def density_for(sources: Sequence[Seeds], count: int, config: SceneConfig, num_t
     edge = config.max_radius / config.radius_per_edge
     while edge < extent and len(Cubes(points, edge, num_threads)) > count:
         edge *= 1.05
-    tolerance = tolerance_for(cube_levels(points, everything.colors, edge, SEED_LEVELS, num_threads), count)
+    tolerance = tolerance_for(cube_levels(points, everything.colors, edge, fixed.SEED_LEVELS, num_threads), count)
     return SeedDensity(edge=edge, tolerance=tolerance, num_candidates=len(points))
 
 
@@ -183,7 +182,7 @@ def seeds_at(
     min(max(radius_per_edge * edge, D/f), r_max).
     """
     found = sources[0].joined(*sources[1:])
-    levels = cube_levels(found.centers, found.colors, density.edge, SEED_LEVELS, num_threads)
+    levels = cube_levels(found.centers, found.colors, density.edge, fixed.SEED_LEVELS, num_threads)
     pixel, chosen = float(np.median(found.radii)), leaves(levels, density.tolerance)
     parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)]
     return parts[-1].joined(*parts[-2::-1])
@@ -246,7 +245,7 @@ def _of_voxels(centers: Float32, splats: SplatSet) -> Seeds:
 def _seeds_of(level: CubeLevel, mask: Bool, pixel: float, live_centers: Float32, config: SceneConfig) -> Seeds:
     centers, colors = level.points[mask].astype(np.float32), level.means.color[mask].astype(np.float32)
     if len(live_centers) and len(centers):
-        reach = SEED_CROWDED * level.edge
+        reach = fixed.SEED_CROWDED * level.edge
         is_free = ~np.isfinite(cKDTree(live_centers).query(centers, distance_upper_bound=reach)[0])
         centers, colors = centers[is_free], colors[is_free]
     radius = np.clip(max(config.radius_per_edge * level.edge, pixel), config.min_radius, config.max_radius)

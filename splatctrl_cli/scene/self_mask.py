@@ -10,21 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import (
-    CONTACT_THICKNESS,
-    MASK_ALONE,
-    MASK_BORDER,
-    MASK_EDGE,
-    MASK_FAR_OFF,
-    MASK_PIXELS,
-    MASK_SIGMAS,
-    MASK_SPECK,
-    MASK_STEEP,
-    MASK_STEP,
-    MASK_SURE,
-    VOTE_SHARE,
-)
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
 from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
@@ -74,7 +60,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
 
     The image is widened by 1 / `MASK_BORDER`.
     """
-    k, border = frame.intrinsics, frame.intrinsics.width // MASK_BORDER
+    k, border = frame.intrinsics, frame.intrinsics.width // fixed.MASK_BORDER
     lens = replace(k, cx=k.cx + border, cy=k.cy + border, width=k.width + 2 * border, height=k.height + 2 * border)
     wider = _mask_within(replace(frame, intrinsics=lens, depth=np.pad(frame.depth, border)), robot, config)
     image = slice(border, border + k.height), slice(border, border + k.width)
@@ -90,7 +76,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
         frame.T_world_camera,
         frame.depth,
         tolerance=config.self_mask_tolerance,
-        quadratic=MASK_SIGMAS * config.depth_error,
+        quadratic=fixed.MASK_SIGMAS * config.depth_error,
     )
     kinds = object_mask(frame).kinds
     mask = SelfMask(kinds=kinds, robot_depth=shown.depth, residuals={}, num_inside={})
@@ -98,7 +84,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     if box is None:
         return mask
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
-    edge = max(round(frame.intrinsics.width / MASK_EDGE), reach)
+    edge = max(round(frame.intrinsics.width / fixed.MASK_EDGE), reach)
     wide = 2 * edge + reach + 1  # pixels, beyond which nothing is explained, doubted or inside
     part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may extend
     depth, rendered, kinds = np.ascontiguousarray(frame.depth[part]), shown.depth[part], kinds[part]
@@ -119,10 +105,12 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     is_sure = depth < nearest_at_edge
     is_sure |= cv2.erode(is_core.view(np.uint8), _window(edge - reach)).view(bool)
     if surface.trees:
-        is_near = depth < farthest_within(farthest, wide - reach) + CONTACT_THICKNESS
+        is_near = depth < farthest_within(farthest, wide - reach) + fixed.CONTACT_THICKNESS
         v, u = np.nonzero(beside & is_near & ~is_explained)
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
-        sure = tolerance_at(depth[v, u], config, MASK_SURE) + edge * depth[v, u] / np.float32(frame.intrinsics.fx)
+        sure = tolerance_at(depth[v, u], config, fixed.MASK_SURE) + edge * depth[v, u] / np.float32(
+            frame.intrinsics.fx
+        )
         gap = surface.distance(
             T_world_link,
             transform_points(frame.T_world_camera, rays),
@@ -141,9 +129,9 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     steps[_fixed_outline(surface, is_robot, link)] = 0.0  # else a table would run on into the foot on it
     _judge(kinds, depth, beside, area, steps)
     offset = depth - rendered
-    is_told = is_core & has_depth & (np.abs(offset) <= MASK_FAR_OFF)
+    is_told = is_core & has_depth & (np.abs(offset) <= fixed.MASK_FAR_OFF)
     is_told &= link < len(surface.links) - surface.num_carried
-    is_told &= rendered - nearest < MASK_STEP  # stereo may give it the depth of a nearer part next to it
+    is_told &= rendered - nearest < fixed.MASK_STEP  # stereo may give it the depth of a nearer part next to it
     is_inside = is_core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,
@@ -160,15 +148,15 @@ def _is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, f
 
     Time-of-flight cameras mix their depths. The object is nearer than a surface tilted by `MASK_STEEP`.
     """
-    apart = np.maximum(np.float32(MASK_STEP), np.float32(MASK_STEEP * reach / fx) * depth)
+    apart = np.maximum(np.float32(fixed.MASK_STEP), np.float32(fixed.MASK_STEEP * reach / fx) * depth)
     is_behind = depth - nearest_within(depth, is_object, reach) > apart
     return np.asarray(is_object & is_behind & (farthest_within(depth, reach) - depth > tolerance))
 
 
 def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: NDArray[np.int16]) -> Bool:
     """Outermost robot pixels (H, W) of links that no joint moves."""
-    fixed = [number for number, name in enumerate(surface.links) if name in surface.fixed]
-    shown = (is_robot & np.isin(link, fixed)).view(np.uint8)
+    still = [number for number, name in enumerate(surface.links) if name in surface.fixed]
+    shown = (is_robot & np.isin(link, still)).view(np.uint8)
     return np.asarray((shown > 0) & (cv2.erode(shown, _window(1)) == 0))
 
 
@@ -181,8 +169,8 @@ def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Flo
     is_object, shown = kinds == PixelKind.OBJECT, np.empty(depth.shape)
     asked = is_object & beside
     native.piece_areas(depth, steps, area, is_object.view(np.uint8), asked.view(np.uint8), shown)
-    kinds[shown < MASK_ALONE] = PixelKind.DOUBTED
-    kinds[shown < MASK_SPECK] = PixelKind.MIXED
+    kinds[shown < fixed.MASK_ALONE] = PixelKind.DOUBTED
+    kinds[shown < fixed.MASK_SPECK] = PixelKind.MIXED
 
 
 def settled(
@@ -199,7 +187,7 @@ def settled(
         return mask
     depth = np.ascontiguousarray(frame.depth)
     points = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depth[v, u]))
-    is_object, steps = np.full(len(v), not others), np.full_like(depth, MASK_STEP)
+    is_object, steps = np.full(len(v), not others), np.full_like(depth, fixed.MASK_STEP)
     votes, balance = np.zeros(depth.shape), np.empty(depth.shape)
     for other, its in others:
         pixel, z = pixels_at(other, points)
@@ -236,7 +224,7 @@ def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: fl
     rows = rows[np.all((rows[:, :3] >= low) & (rows[:, :3] <= high), axis=1)]
     cell = np.ravel_multi_index(tuple((rows[:, :3] - low).T), tuple(high - low + 1))
     num_robot, num_object = (np.bincount(cell, weights=rows[:, 6] == own) for own in (0, 1))
-    lost = rows[(rows[:, 6] == 1) & (num_object < VOTE_SHARE * num_robot)[cell]]
+    lost = rows[(rows[:, 6] == 1) & (num_object < fixed.VOTE_SHARE * num_robot)[cell]]
     found = []
     for number, (_, mask) in enumerate(seen):
         kinds = mask.kinds.copy()
@@ -305,7 +293,7 @@ def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
     return replace(frame, depth=np.where(is_of_it, np.float32(0.0), frame.depth)) if is_of_it.any() else frame
 
 
-def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:
+def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = fixed.MASK_SIGMAS) -> Float32:
     """Largest allowed difference [m] of the robot's measured and rendered depth."""
     return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
@@ -342,7 +330,7 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}
-    seen = {link for link in links if pixels[link] >= MASK_PIXELS}
+    seen = {link for link in links if pixels[link] >= fixed.MASK_PIXELS}
     judged = seen.difference(holding) or seen
     found = {}
     for link in links:
