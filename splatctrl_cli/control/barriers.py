@@ -66,7 +66,7 @@ class SceneRows(BarrierTerm):
     def rows(self, state: State) -> Barrier:
         """Rows, by one query of distance and gradient."""
         centers, jacobians = state.spheres
-        distance, gradient = self._queried(centers)
+        distance, gradient = self._query(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
         distance = self.by_surfaces(state.q, distance, state.by_surface, G)
         h = distance_bound(self._config, self._acceleration, distance, self.margin, G, state.distance_rate)
@@ -97,7 +97,7 @@ class SceneRows(BarrierTerm):
         cost, weight = self._config.slack_cost, self._config.weight_slack
         return Barrier(index=index, G=G, h=h, distance=distance, slack_cost=cost, slack_weight=weight)
 
-    def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
+    def _query(self, centers: Float64) -> tuple[Float64, Float64]:
         points = np.ascontiguousarray(centers[self._moving])
         distance, gradient = self._field.query(points)
         bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
@@ -273,7 +273,7 @@ class PeopleGrown:
         )
 
 
-def guarded(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
+def guard_people(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
     """Field from which a controller keeps `config.margin`.
 
     People count as nearer by `config.human_margin` less the margin.

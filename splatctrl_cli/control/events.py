@@ -286,7 +286,7 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
     """Signals of the controller's steps at T states; None: no step."""
 
     def relaxed(i: int) -> Sequence[str]:
-        return [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)]
+        return [row.name for row in sorted(_taken_step(steps, i).relaxed, key=lambda row: -row.slack)]
 
     slack = _of(steps, lambda step: max((row.slack for row in step.relaxed), default=0.0))
     is_outside = _of(steps, lambda step: float(step.rung is Rung.OUTSIDE)) > 0
@@ -298,7 +298,7 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
     fixed = _of(steps, lambda step: step.fixed_distance)
 
     def nearest(i: int) -> Sequence[str]:
-        return [_asked(steps, i).nearest]
+        return [_taken_step(steps, i).nearest]
 
     return [
         *(_intervention_signal(steps, kind) for kind in RowKind),
@@ -307,7 +307,7 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
         Signal(kind=EventKind.MINIMUM_VIOLATION, is_on=is_least, value=residual, names_at=nearest),
         _low(EventKind.HOLD, is_hold, clearance, nearest),
         _low(EventKind.SCALED_BACK, (scale < 1) & ~is_hold, scale, nearest),
-        _low(EventKind.CANNOT_ACT, cannot, fixed, lambda i: _asked(steps, i).violated_fixed),
+        _low(EventKind.CANNOT_ACT, cannot, fixed, lambda i: _taken_step(steps, i).violated_fixed),
     ]
 
 
@@ -316,7 +316,7 @@ def _intervention_signal(steps: Sequence[ControlStep | None], kind: RowKind) -> 
         return max((row.multiplier for row in step.interventions if row.kind is kind), default=0.0)
 
     def names_at(index: int) -> Sequence[str]:
-        rows = [row for row in _asked(steps, index).interventions if row.kind is kind]
+        rows = [row for row in _taken_step(steps, index).interventions if row.kind is kind]
         return [row.name for row in sorted(rows, key=lambda row: -row.multiplier)]
 
     value = _of(steps, largest)
@@ -335,7 +335,7 @@ def _of(
     return np.array([otherwise if step is None else value(step) for step in steps], dtype=np.float64)
 
 
-def _asked(steps: Sequence[ControlStep | None], index: int) -> ControlStep:
+def _taken_step(steps: Sequence[ControlStep | None], index: int) -> ControlStep:
     step = steps[index]
     assert step is not None
     return step

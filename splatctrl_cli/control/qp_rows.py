@@ -14,7 +14,7 @@ from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind
 from splatctrl_cli.control.limits import box_rows
-from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, held, is_usable
+from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, is_usable, stand_still
 from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
 from splatctrl_cli.robot.model import RobotModel
@@ -164,7 +164,7 @@ def solve_printed(
     J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)
     solution = solver(assemble_printed(state, configured_weights(config), posture, external, firm))
     if not is_usable(solution, config.max_residual):
-        return held(J, M + num_firm, solution, num_refused=1)
+        return stand_still(J, M + num_firm, solution, num_refused=1)
     slack = np.concatenate([np.maximum(-solution.z[J + 6 :], 0.0), np.zeros(num_firm)])
     return Choice(
         velocity=solution.z[:J],

@@ -11,7 +11,7 @@ from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
-from splatctrl_cli.control.qp import SOLVERS, Choice, QpSolver, Rung, descend, held, unsolved
+from splatctrl_cli.control.qp import SOLVERS, Choice, QpSolver, Rung, descend, stand_still, unsolved
 from splatctrl_cli.control.qp_rows import PRINTED, RowBuilder, Rows, solve_printed
 from splatctrl_cli.control.terms import (
     BarrierTerm,
@@ -23,7 +23,7 @@ from splatctrl_cli.control.terms import (
     eliminated_weight,
     reach_cost,
     standard_costs,
-    summed,
+    sum_costs,
 )
 from splatctrl_cli.records import Bool, DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel
@@ -190,15 +190,15 @@ class QpIkController:
         rest = self._limits.rest(state.last_velocity)
         costs = [cost(state) for cost in self._costs]
         if config.program == PRINTED:
-            printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
-            return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
+            printed = solve_printed(self._solver, state, sum_costs(costs), rows.for_qp, config)
+            return self._report(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
         costs.append(reach_cost(state.jacobian, state.reference, self._reach_weight))
-        rows, choice, is_kept = self._descended(state, costs, rows)
+        rows, choice, is_kept = self._descend(state, costs, rows)
         while np.any(newly := self._sticking_out(state, rows, choice)):
             state = replace(state, by_surface=state.by_surface | newly)
-            rows, choice, is_kept = self._descended(state, costs, self._builder.at(state))
+            rows, choice, is_kept = self._descend(state, costs, self._builder.at(state))
         scale = 1.0 if is_kept else self._kept_scale(state, choice, rows, rest)
-        return replace(self._reported(error, rows, choice, rest, scale), by_surface=self._named(state.by_surface))
+        return replace(self._report(error, rows, choice, rest, scale), by_surface=self._named(state.by_surface))
 
     def view(self, moment: Moment) -> View:
         """A step's input at a moment. Raises as `step`."""
@@ -227,14 +227,14 @@ class QpIkController:
         rest, rows = self._limits.rest(view.state.last_velocity), view.rows
         J, M = len(rest), int(rows.in_qp.sum())
         choice = replace(
-            held(J, M, unsolved(J, M, status), num_refused=0),
+            stand_still(J, M, unsolved(J, M, status), num_refused=0),
             velocity=rest if velocity is None else velocity,
             rung=Rung.HOLD if velocity is None else Rung.OUTSIDE,
         )
         if velocity is not None and M:
             broken = np.concatenate([barrier.G @ velocity - barrier.h for barrier in rows.for_qp])
             choice = replace(choice, slack=np.maximum(broken, 0.0))
-        return self._reported(view.error, rows, choice, rest, 1.0)
+        return self._report(view.error, rows, choice, rest, 1.0)
 
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
         """Room that any joint velocity (J,) [rad/s] leaves at q (J,).
@@ -254,7 +254,7 @@ class QpIkController:
             limit_row=self._limit_names[limit],
         )
 
-    def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
+    def _descend(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
         """Rows, the ladder's choice, and True if the later distances keep the promise.
 
         A sphere that would meet another surface than its row's adds a row. Then the ladder runs again: cutting
@@ -309,7 +309,7 @@ class QpIkController:
                 return scale
         return 0.0
 
-    def _reported(self, error: Float64, rows: Rows, choice: Choice, rest: Float64, scale: float) -> ControlStep:
+    def _report(self, error: Float64, rows: Rows, choice: Choice, rest: Float64, scale: float) -> ControlStep:
         slack = rows.spread(choice.slack)
         violated_fixed = rows.is_fixed & (rows.distance < rows.margin)
         return ControlStep(

@@ -107,7 +107,7 @@ def stray_cost(velocity: Float64, weight: float) -> Cost:
     return 2.0 * weight * np.eye(len(velocity)), -2.0 * weight * velocity
 
 
-def summed(costs: Sequence[Cost]) -> Cost:
+def sum_costs(costs: Sequence[Cost]) -> Cost:
     H, c = np.zeros_like(costs[0][0]), np.zeros_like(costs[0][1])
     for cost_H, cost_c in costs:
         H += cost_H

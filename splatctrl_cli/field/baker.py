@@ -125,22 +125,22 @@ class Baker:
         if self.probability is not None:
             whole = np.zeros(span.shape_of_channel, np.float32)
             whole[... if where is None else where] = made["sdf"]
-            made["probability"] = _picked(self.probability.baked(span, whole, threads=self.threads), cells)
+            made["probability"] = _pick(self.probability.baked(span, whole, threads=self.threads), cells)
         if entry is not None:
             made["label"] = self.labels[self.spheres.source[entry]]
         if "observed" in self.channels:
             observed = observed_planes(self._occupancy, self.layout, self._thresholds, span.first, span.last)
-            made["observed"] = _picked(observed, cells)
+            made["observed"] = _pick(observed, cells)
         return made
 
     def _by_processor(self, span: GridSpan, cells: NDArray[np.int64] | None) -> _Made:
         exact, exact_gradient, entry = self._hard(span)
-        hard = _picked(exact, cells)
-        gradient = None if exact_gradient is None else _picked(exact_gradient, cells)
+        hard = _pick(exact, cells)
+        gradient = None if exact_gradient is None else _pick(exact_gradient, cells)
         kernels: dict[str, tuple[Float32, Float32 | None]] = {}
         for name in self.kernels:
             distance, slope = self._kernel(name, span)
-            kernels[name] = (_picked(distance, cells), None if slope is None else _picked(slope, cells))
+            kernels[name] = (_pick(distance, cells), None if slope is None else _pick(slope, cells))
             self.counts[f"{name}_without_value"] += int(np.count_nonzero(np.isnan(kernels[name][0])))
             self.counts[f"{name}_over_estimates"] += int(np.count_nonzero(kernels[name][0] > hard + RESOLUTION))
         sdf, gradient = self._chosen(hard, gradient, kernels)
@@ -151,7 +151,7 @@ class Baker:
             made["bound"] = (hard.astype(np.float64) - self.bound_margin).astype(np.float32)
         for name, (distance, _) in kernels.items():
             made[name] = np.where(np.isnan(distance), hard, distance)
-        return made, None if entry is None else _picked(entry, cells)
+        return made, None if entry is None else _pick(entry, cells)
 
     def _by_device(self, span: GridSpan) -> _Made:
         assert self.on_device is not None
@@ -191,7 +191,7 @@ class Baker:
         return sdf, np.where(is_smooth[..., None], smooth_gradient, gradient)
 
 
-def _picked(values: NDArray[T], cells: NDArray[np.int64] | None) -> NDArray[T]:
+def _pick(values: NDArray[T], cells: NDArray[np.int64] | None) -> NDArray[T]:
     return values if cells is None else values.reshape(-1, *values.shape[3:])[cells]
 
 

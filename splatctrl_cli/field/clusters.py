@@ -37,7 +37,7 @@ class Spheres:
         and coordinates. Raises NotEvaluableError without any, InputError for a wrong shape, a non-finite value, or a
         negative radius.
         """
-        points, radius_array = _checked(centers, radii)
+        points, radius_array = _check(centers, radii)
         lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
         anchor = 0.5 * (lower + upper)
         codes = _hilbert_codes(points, lower, float((upper - lower).max()))
@@ -148,7 +148,7 @@ def not_finite(points: Float64) -> InputError:
     return InputError(f"query point {i}: expected finite coordinates, got {points[i].tolist()}")
 
 
-def _checked(centers: ArrayLike, radii: ArrayLike) -> tuple[Float64, Float64]:
+def _check(centers: ArrayLike, radii: ArrayLike) -> tuple[Float64, Float64]:
     center_array, radius_array = np.asarray(centers, dtype=np.float64), np.asarray(radii, dtype=np.float64)
     if center_array.ndim != 2 or center_array.shape[1] != 3 or radius_array.shape != center_array.shape[:1]:
         raise InputError(

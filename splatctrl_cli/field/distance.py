@@ -101,7 +101,7 @@ class GpdfField(LogSumExpField):
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined.
 
         ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this,
-        normalised (`normalised`).
+        normalised (`normalise`).
         """
         score, gradient = native.matern(
             self.spheres.clusters,
@@ -212,7 +212,7 @@ class SafeField:
         return np.where(is_less, smooth, distance), np.where(is_less[:, None], smooth_gradient, gradient)
 
 
-def normalised(gradient: Float64) -> Float64:
+def normalise(gradient: Float64) -> Float64:
     """Unit gradients (Q, 3), eq. 11 with its sign corrected; 0 stays 0."""
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
@@ -257,7 +257,7 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
     rest, gradient = field.query(hit)
     for _ in range(steps):
         length = np.clip(np.minimum(rest, exact.query(hit)[0]), 0.0, None)
-        direction = normalised(gradient)
+        direction = normalise(gradient)
         hit -= length[:, None] * direction
         walked += np.where(direction.any(axis=1), length, 0.0)  # without a slope there is nowhere to go
         rest, gradient = field.query(hit)

@@ -274,12 +274,12 @@ def row_sum_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
 
     M of eq. 12 is ``w_i k_d(-r_i)``.
     """
-    return _lumped(log_row_sums(kernel, spheres, threads=threads), noise)
+    return _lump(log_row_sums(kernel, spheres, threads=threads), noise)
 
 
 def voxel_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
     """`row_sum_weights` from a voxel grid (III-D)."""
-    return _lumped(np.log(voxel_row_sums(_centers(spheres), kernel.length, kernel.value)), noise)
+    return _lump(np.log(voxel_row_sums(_centers(spheres), kernel.length, kernel.value)), noise)
 
 
 def process_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
@@ -306,7 +306,7 @@ Method = Callable[[Spheres, Kernel, float, int], Weights]
 METHODS: Mapping[str, Method] = {"rowsum": row_sum_weights, "voxel": voxel_weights, "cg": process_weights}
 
 
-def _lumped(log_sums: Float64, noise: float) -> Weights:
+def _lump(log_sums: Float64, noise: float) -> Weights:
     with np.errstate(divide="ignore"):  # noise 0 gives log 0 = -inf, rightly
         return Weights(log_size=np.asarray(-np.logaddexp(log_sums, np.log(noise))), sign=None)
 

@@ -105,11 +105,11 @@ def read_declarations(path: Path, links: Collection[str] | None = None) -> Decla
     unknown = sorted(set(document) - {"carried", "expected_contact"})
     if unknown:
         raise InputError(f"{path}: expected [[carried]] and [[expected_contact]], got {unknown[0]}", remedy=REMEDY)
-    found = {
-        table: tuple(DeclaredContact(**entry) for entry in _entries(path, document, table, links))
+    carried, expected = (
+        tuple(DeclaredContact(**entry) for entry in _entries(path, document, table, links))
         for table in ("carried", "expected_contact")
-    }
-    return Declarations(**found)
+    )
+    return Declarations(carried=carried, expected_contact=expected)
 
 
 def _entries(

@@ -52,7 +52,7 @@ def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOS
     Farthest-point sampling by places and ways in between. T_world_link: (M, L, 4, 4).
     """
     corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
-    placed = _moved(T_world_link, corners).reshape(len(T_world_link), -1, 3)
+    placed = _move(T_world_link, corners).reshape(len(T_world_link), -1, 3)
     steps = np.linalg.norm(np.diff(placed, axis=0), axis=2).max(axis=1)
     path = PATH_SHARE * np.append(0.0, np.cumsum(steps))
     chosen, gap = [0], np.full(len(placed), np.inf)
@@ -84,7 +84,7 @@ def learn(
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
-    placed = _moved(T_world_link, corners)
+    placed = _move(T_world_link, corners)
     views = _views(
         surface,
         frames,
@@ -263,7 +263,7 @@ def _stays_in_world(
 
     A cell stays if views show a surface at its old place, `AWAY` from the new one, as often as they see through it.
     """
-    places, votes = _moved(poses, cells), np.zeros(len(cells), np.int64)
+    places, votes = _move(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:
         for m in spread(range(len(poses)), MOST_ASKED):
             asked = np.flatnonzero(seen[m] & (np.linalg.norm(places[m] - places[k], axis=1) >= AWAY))
@@ -291,7 +291,7 @@ def _is_on_other_link(
     """True for cells nearer to a link against which they move less than `STEP`."""
     found = np.zeros(len(cells), bool)
     for other, link in enumerate(surface.links):
-        places = _moved(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
+        places = _move(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
         if other != number and len(cells):
             is_still = _span(places, seen) < STEP
             at = places[seen.argmax(axis=0), np.arange(len(cells))]
@@ -299,7 +299,7 @@ def _is_on_other_link(
     return found
 
 
-def _moved(T: Float64, points: Float64) -> Float64:
+def _move(T: Float64, points: Float64) -> Float64:
     return np.asarray(np.einsum("...ij,...nj->...ni", T[..., :3, :3], points) + T[..., None, :3, 3])
 
 

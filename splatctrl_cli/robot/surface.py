@@ -25,7 +25,7 @@ from splatctrl_cli.kernels.surface_image import (
     render_surface,
 )
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Floats, Intrinsics, SphereSet
-from splatctrl_cli.robot.link_meshes import mesh_path, placed
+from splatctrl_cli.robot.link_meshes import mesh_path, place_mesh
 from splatctrl_cli.robot.urdf import Shape, UrdfFile, visual_urdf
 
 KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
@@ -295,7 +295,7 @@ def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Floa
         except InputError as error:
             unread.setdefault(mesh.link, error.message)
         else:
-            pieces.append((mesh.link, placed(mesh, loaded).corners))
+            pieces.append((mesh.link, place_mesh(mesh, loaded).corners))
     return [(link, corners) for link, corners in pieces if link not in unread], unread
 
 

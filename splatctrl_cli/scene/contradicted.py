@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
-from splatctrl_cli.scene.depth_holes import points_on_rays, shadowed
+from splatctrl_cli.scene.depth_holes import find_shadows, points_on_rays
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
 
@@ -62,7 +62,7 @@ class Contradicted:
         return out
 
 
-def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
+def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
     """Yield what other frames or the drawn robot contradict in each frame of a step.
 
     All rays of a contradicted block and its neighbours cross another frame's surface. They end more than
@@ -92,7 +92,7 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
         )
 
 
-def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
+def mark_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
     return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
 
@@ -139,7 +139,9 @@ class _BlockView:
         v, u = np.nonzero((surely > 0) & _is_plane(nearest) & _is_plane(farthest) & is_object)
         middle, mean = side // 2, depth.mean(axis=2)[v, u]
         points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
-        is_lost = (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~shadowed(frame.depth, frame.intrinsics.fx)
+        is_lost = (
+            (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~find_shadows(frame.depth, frame.intrinsics.fx)
+        )
         is_lost = cv2.erode(_blocks(is_lost & frame.in_view, side).all(axis=2).view(np.uint8), BESIDE) > 0
         return cls(
             frame=frame,

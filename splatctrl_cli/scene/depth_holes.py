@@ -36,7 +36,7 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return iter(())
-    is_shadow = is_blank & shadowed(frame.depth, frame.intrinsics.fx)
+    is_shadow = is_blank & find_shadows(frame.depth, frame.intrinsics.fx)
     is_blank &= ~is_shadow
     is_end = _with_shadow(cv2.dilate(robot_depth, BESIDE_ROBOT) > 0, is_shadow)
     holes = _holes(is_blank, is_end | ~frame.in_view)
@@ -128,7 +128,7 @@ def _of_frame(frame: RgbdFrame, mask: SelfMask) -> LostEdges:
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))
 
 
-def shadowed(depth: Float32, focal: float) -> Bool:
+def find_shadows(depth: Float32, focal: float) -> Bool:
     """Pixels (H, W) without depth in the shadow of something nearer in their row.
 
     depth (H, W) [m], 0 = none; focal [px]. With baseline B, an object at z hides B focal (1/z - 1/z_behind) pixels
@@ -206,7 +206,7 @@ def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> NDArray[np.u
     is_in_view = (pixel >= 0) & frame.in_view.reshape(-1)[pixel]
     robot = cv2.dilate(mask.robot_depth, OUTLINE).reshape(-1)[pixel]
     depth = frame.depth.reshape(-1)[pixel]
-    is_lost = (frame.depth <= 0) & ~shadowed(frame.depth, frame.intrinsics.fx)
+    is_lost = (frame.depth <= 0) & ~find_shadows(frame.depth, frame.intrinsics.fx)
     behind = np.where(is_lost.reshape(-1)[pixel], np.uint16(Unseen.NO_RETURN), np.uint16(Unseen.HIDDEN_BY_THING))
     is_arm = (robot > 0) & ((robot < z) | (depth <= 0)) & (mask.kinds.reshape(-1)[pixel] != PixelKind.OBJECT)
     behind[is_arm] = Unseen.HIDDEN_BY_ARM

@@ -15,14 +15,14 @@ from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, lasts_at_fixed_links
-from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
+from splatctrl_cli.scene.contradicted import find_contradicted, mark_contradicted
 from splatctrl_cli.scene.depth_holes import explain_unseen, lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
-from splatctrl_cli.scene.posture import RobotPosture, carried
+from splatctrl_cli.scene.posture import RobotPosture, carry_splats
 from splatctrl_cli.scene.removal import REASONS, removals, room_for, use_idle
 from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
@@ -33,7 +33,7 @@ from splatctrl_cli.scene.seeding import (
     gap_seeds,
     inside_workspace,
     seeds_at,
-    thinned,
+    thin_mask,
     thinning,
     world_points,
 )
@@ -41,17 +41,17 @@ from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
     audit_masks,
+    drop_pixels,
+    label_pixels,
     object_mask,
-    of_label,
+    outvote_objects,
     self_mask,
-    settled,
-    voted,
-    without,
+    settle_pieces,
 )
 from splatctrl_cli.scene.shell import Shell
-from splatctrl_cli.scene.surface_depth import object_twice, steadied
+from splatctrl_cli.scene.surface_depth import object_twice, steady_depth
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
-from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
+from splatctrl_cli.scene.unrepresented import bare_voxels, confirm_bare, unrepresented_voxels
 from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 
 
@@ -91,7 +91,7 @@ class SceneFitter:
         self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) of what it carries
         self.refined = Refined(num_blocks=0, filled=Filled(), removed=dict.fromkeys(REASONS, 0))
         self._unrepresented: Balls | None = None
-        self.bare: Balls | None = None  # of the last time step, before `confirmed`
+        self.bare: Balls | None = None  # of the last time step, before `confirm_bare`
         self.seen: Seen = ()  # frames of the last time step, as in its newest views, with masks
         self.objects: dict[str, Bool] = {}  # by camera, object pixels (H, W) of its newest frame
 
@@ -105,23 +105,23 @@ class SceneFitter:
         if robot is not None:
             seen = list(zip(frames, self._each(lambda f: self_mask(f, robot, config), frames), strict=True))
             others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
-            masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
-            masks = voted(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
+            masks = [settle_pieces(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
+            masks = outvote_objects(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
         rays = list(
-            contradicted(
+            find_contradicted(
                 list(zip(frames, masks, strict=True)),
                 is_drawn=robot is not None and robot.surface is not None and robot.surface.is_drawn,
             )
         )
-        masks = list(map(without_contradicted, masks, rays))
-        frames = [without(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
+        masks = list(map(mark_contradicted, masks, rays))
+        frames = [drop_pixels(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
         known = {view.frame.camera: view.frame for view in self.window.newest if view.frame.camera in self.objects}
         before = {camera: (frame, self.objects[camera]) for camera, frame in known.items()}
         objects = [mask.kinds == PixelKind.OBJECT for mask in masks]
         self.objects |= {frame.camera: pixels for frame, pixels in zip(frames, objects, strict=True)}
         frames, steady = zip(
             *(
-                steadied(frame, before.get(frame.camera), pixels, config)
+                steady_depth(frame, before.get(frame.camera), pixels, config)
                 for frame, pixels in zip(frames, objects, strict=True)
             ),
             strict=True,
@@ -131,7 +131,7 @@ class SceneFitter:
         if self.descent.background is None:
             self.descent.background = self._behind(views)
         proving = [
-            found.unproven(without(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
+            found.unproven(drop_pixels(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
         ]
         self.people.take_in(self.occupancy, proving)
         unanswered = self._each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
@@ -240,7 +240,7 @@ class SceneFitter:
             found = unrepresented_voxels(self.occupancy, self.splats(), self.config, error)
             if self.posture is not None:
                 found = found.select(~self.posture.holds(found.centers, fixed.WELL_INSIDE))
-            self._unrepresented, self.bare = confirmed(found, self.bare), found
+            self._unrepresented, self.bare = confirm_bare(found, self.bare), found
         return self._unrepresented
 
     @unrepresented.setter
@@ -286,7 +286,7 @@ class SceneFitter:
         if before is None or robot is None:
             return
         slots = np.flatnonzero(self.buffer.is_alive & (self.buffer.labels == Label.ROBOT))
-        self.buffer.centers[slots] = carried(self.buffer.centers[slots], before, robot)
+        self.buffer.centers[slots] = carry_splats(self.buffer.centers[slots], before, robot)
 
     def _floating(self, views: Sequence[View]) -> Bool:
         is_floating = np.zeros(len(self.buffer.centers), bool)
@@ -327,7 +327,7 @@ class SceneFitter:
         def offered(index: int) -> list[Seeds]:
             view, others = views[index], spread(range(len(views)), fixed.SEED_ASKED_VIEWS)
             asked = [views[(index + k) % len(views)] for k in others]
-            wanted = (thinned(added[index] & of_label(masks[index], label), every) for label in found)
+            wanted = (thin_mask(added[index] & label_pixels(masks[index], label), every) for label in found)
             sources = (candidates(view.frame, pixels, self.num_threads) for pixels in wanted)
             return [
                 source.select(self._is_grounded(source.centers, asked, label))
@@ -376,7 +376,7 @@ class SceneFitter:
             if label == Label.OBJECT:
                 bare = bare_voxels(self.occupancy, splats, self.workspace, self.config, half)
             seeds = gap_seeds(
-                [(v.frame, v.mappable & of_label(m, label)) for v, m in zip(views, masks, strict=True)],
+                [(v.frame, v.mappable & label_pixels(m, label)) for v, m in zip(views, masks, strict=True)],
                 bare,
                 self.occupancy.config.voxel,
                 splats,

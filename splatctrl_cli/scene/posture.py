@@ -79,7 +79,7 @@ def posture_of(
 POSTURE_NAMES = ("centers", "radii", "T_world_link")  # kept for the next time step
 
 
-def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
+def carry_splats(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
     """Move points (N, 3) [m], world, with the link of the nearest sphere surface.
 
     Splats left behind would become trails. The paper does not move them.

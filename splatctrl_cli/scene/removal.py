@@ -12,7 +12,7 @@ from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thinned, thinning
+from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thin_mask, thinning
 from splatctrl_cli.scene.self_mask import least_within
 
 REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak", "evicted")
@@ -87,14 +87,14 @@ def room_for(
     """Slots (M,) of at most `num` splats to evict, and the seeds in order of service.
 
     Only object splats go: redundant ones that show least, then, for seeds near the robot's path, far ones. shown
-    (M,): how much slots show; tolerance [m]: of `redundant`.
+    (M,): how much slots show; tolerance [m]: of `find_redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
     others, may_go = live[stands], live[splats.labels == Label.OBJECT]
     weakest = may_go[np.argsort(shown[may_go], kind="stable")][: fixed.EVICT_ASKED * num]
     order, voxels = np.searchsorted(others, weakest), occupancy.occupied_centers()
-    chosen = others[redundant(order, num, splats.select(stands), voxels, tolerance, occupancy.num_threads)]
+    chosen = others[find_redundant(order, num, splats.select(stands), voxels, tolerance, occupancy.num_threads)]
     is_evicted = np.zeros(len(shown), bool)
     is_evicted[chosen] = True
     path = occupancy.swept_box()
@@ -102,11 +102,11 @@ def room_for(
         seeds = seeds.select(np.argsort(distance_to_box(seeds.centers, path), kind="stable"))
         left, slots = num - len(chosen), may_go[~is_evicted[may_go]]
         waiting = seeds.centers[len(seeds) - left :]
-        is_evicted[slots[far_away(left, waiting, buffer.centers[slots], path)]] = True
+        is_evicted[slots[find_far(left, waiting, buffer.centers[slots], path)]] = True
     return is_evicted, seeds
 
 
-def redundant(
+def find_redundant(
     order: NDArray[np.intp],
     num_wanted: int,
     splats: SplatSet,
@@ -139,7 +139,7 @@ def redundant(
     return np.array(chosen, np.intp)
 
 
-def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
+def find_far(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
     """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
     Each is at least EVICT_NEARER farther from the path than its seed.
@@ -222,7 +222,7 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
     The error is a 3 x 3 mean, weighted by a pixel's area of surface. No two seeds are closer than their diameters.
     """
     every = thinning(error > 0 for _, error in misfits)
-    masks = [thinned(error > 0, every) for _, error in misfits]
+    masks = [thin_mask(error > 0, every) for _, error in misfits]
     weight = np.concatenate(
         [
             np.square(uniform_filter(error, 3)[mask] * frame.depth[mask], dtype=np.float64)
@@ -232,12 +232,12 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
     count = min(fixed.SEED_OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
     if count == 0:
         return NO_SEEDS
-    found = _pixels([frame for frame, _ in misfits], masks, drawn(weight, count, rng))
+    found = _pixels([frame for frame, _ in misfits], masks, draw_indices(weight, count, rng))
     kept = _apart(found.centers, 2.0 * found.radii)[:num_seeds]
     return replace(found.select(kept), radii=np.clip(found.radii[kept], config.min_radius, config.max_radius))
 
 
-def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
     """Draw `count` different indices in proportion to weight (K,), at least `count` of them positive.
 
     Same as ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, but faster.

@@ -95,7 +95,7 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
         return config
     is_found = config.scene.scale == 0
     scale = depth.median / fixed.SCALE_DEPTH if is_found else config.scene.scale
-    scene, occupancy = scaled(config.scene, scale), scaled(config.occupancy, scale)
+    scene, occupancy = scale_lengths(config.scene, scale), scale_lengths(config.occupancy, scale)
     values: dict[str, float] = {"scale": scale}
     if is_found and scene.radius_depth == 0:
         values["radius_depth"] = depth.median
@@ -108,7 +108,7 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
     return config.derived(scene=scene.derived(**values), occupancy=occupancy.derived(**ranges))
 
 
-def in_words(config: Config, depth: RecordedDepth) -> str:
+def describe_scale(config: Config, depth: RecordedDepth) -> str:
     scene, occupancy = config.scene, config.occupancy
     if scene.scale == 0:
         return f"depth is noisier than usual: {1e3 * occupancy.depth_error:.2g} mm at 1 m, growing with its square"
@@ -118,7 +118,7 @@ def in_words(config: Config, depth: RecordedDepth) -> str:
     )
 
 
-def scaled(section: Lengths, scale: float) -> Lengths:
+def scale_lengths(section: Lengths, scale: float) -> Lengths:
     """Multiply defaults by the power of `scale` that a length has in them."""
     powers, default = POWERS[section.section], type(section)()
     kept = {key: getattr(section, key) for key in powers}

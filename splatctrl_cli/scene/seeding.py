@@ -61,7 +61,7 @@ def thinning(masks: Iterable[Bool]) -> int:
     return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / fixed.SEED_MOST_PIXELS))
 
 
-def thinned(mask: Bool, every: int) -> Bool:
+def thin_mask(mask: Bool, every: int) -> Bool:
     """Keep the first of each `every` pixels of a mask (H, W), in row order."""
     if every == 1:
         return mask

@@ -173,7 +173,7 @@ def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Flo
     kinds[shown < fixed.MASK_SPECK] = PixelKind.MIXED
 
 
-def settled(
+def settle_pieces(
     frame: RgbdFrame, mask: SelfMask, others: Sequence[tuple[RgbdFrame, SelfMask]], config: OccupancyConfig
 ) -> SelfMask:
     """Mask with each doubted piece decided: object or mixed.
@@ -202,7 +202,7 @@ def settled(
     return replace(mask, kinds=kinds)
 
 
-def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
+def outvote_objects(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
     """Masks of one time step without object pixels that robot pixels outvote.
 
     Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
@@ -282,12 +282,12 @@ def _nothing_rendered(shape: tuple[int, int]) -> Float32:
     return image
 
 
-def of_label(mask: SelfMask, label: Label) -> Bool:
+def label_pixels(mask: SelfMask, label: Label) -> Bool:
     """Pixels (H, W) of the robot, or of objects."""
     return np.asarray(mask.kinds == (PixelKind.ROBOT if label == Label.ROBOT else PixelKind.OBJECT))
 
 
-def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
+def drop_pixels(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
     """Frame with depth 0 in pixels of a kind."""
     is_of_it = mask.kinds == kind
     return replace(frame, depth=np.where(is_of_it, np.float32(0.0), frame.depth)) if is_of_it.any() else frame

@@ -15,21 +15,21 @@ from splatctrl_cli.scene.buffer import COLOR, Seeds, SplatBuffer
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, seen_through
 from splatctrl_cli.scene.render import Color
-from splatctrl_cli.scene.scale import scaled
+from splatctrl_cli.scene.scale import scale_lengths
 from splatctrl_cli.scene.seeding import (
     SeedDensity,
     add_mask,
     candidates,
     density_for,
     seeds_at,
-    thinned,
+    thin_mask,
     thinning,
 )
 
 Masked = Sequence[tuple[View, Bool]]
 
 
-def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
+def pixels_beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
     """Valid pixels (H, W) with depth of at least `min_range` [m] outside the workspace, except `mounted` ones."""
     depth = view.target.depth
     left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0) & view.frame.in_view
@@ -55,11 +55,11 @@ class Shell:
     def _begin(self, depth: float, density: SeedDensity | None, num_iterations: int = 0) -> None:
         self._depth, self._density, config = depth, density, self.config
         if density is not None:
-            config = scaled(config, depth / fixed.SCALE_DEPTH).derived(radius_depth=depth)
+            config = scale_lengths(config, depth / fixed.SCALE_DEPTH).derived(radius_depth=depth)
             least, most = config.min_radius, config.max_radius  # the user may have set either
             widest = max(least, most, config.radius_per_edge * density.edge)  # else far walls have holes
             config = config.derived(max_radius=widest)
-            self._see_through = scaled(self.occupancy, depth / fixed.SCALE_DEPTH).see_through
+            self._see_through = scale_lengths(self.occupancy, depth / fixed.SCALE_DEPTH).see_through
         self._scaled = config
         self._descent = Descent(config, self.buffer, self._seed, self._num_threads)
         self._descent.num_iterations = num_iterations
@@ -70,7 +70,7 @@ class Shell:
         self.num_steps += 1
         self._remove(views.newest)
         every = [*views.newest, *views.keyframes]
-        masks = [beyond(view, self.occupancy.min_range, mounted.get(view.frame.camera)) for view in every]
+        masks = [pixels_beyond(view, self.occupancy.min_range, mounted.get(view.frame.camera)) for view in every]
         shown = [(view, mask) for view, mask in zip(every, masks, strict=True) if mask.any()]
         if not shown:
             return
@@ -106,7 +106,7 @@ class Shell:
         )
         self.buffer.kill(stands)
         depth = float(np.median(np.concatenate([view.target.depth[mask] for view, mask in shown])))
-        sources, config = [*_sources(shown), held], scaled(self.config, depth / fixed.SCALE_DEPTH)
+        sources, config = [*_sources(shown), held], scale_lengths(self.config, depth / fixed.SCALE_DEPTH)
         density = density_for(sources, max(int(config.fill * config.max_splats), 1), config, self._num_threads)
         self._begin(depth, density, self._descent.num_iterations)
         self._fill(sources, density)
@@ -140,4 +140,4 @@ class Shell:
 
 def _sources(masked: Masked) -> list[Seeds]:
     every = thinning(mask for _, mask in masked)
-    return [candidates(view.frame, thinned(mask, every)) for view, mask in masked]
+    return [candidates(view.frame, thin_mask(mask, every)) for view, mask in masked]

@@ -13,7 +13,9 @@ Before = tuple[RgbdFrame, Bool] | None
 """A camera's last averaged frame and its object pixels (H, W)."""
 
 
-def steadied(frame: RgbdFrame, before: Before, is_object: Bool, config: OccupancyConfig) -> tuple[RgbdFrame, Bool]:
+def steady_depth(
+    frame: RgbdFrame, before: Before, is_object: Bool, config: OccupancyConfig
+) -> tuple[RgbdFrame, Bool]:
     """Frame with a running mean of its depth, and its steady pixels (H, W).
 
     An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2. Depths around

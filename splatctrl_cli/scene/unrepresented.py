@@ -35,7 +35,7 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     )
 
 
-def confirmed(found: Balls, before: Balls | None) -> Balls:
+def confirm_bare(found: Balls, before: Balls | None) -> Balls:
     """Balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
     before: of the last time step; None in the first, where all count.

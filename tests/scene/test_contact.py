@@ -19,7 +19,7 @@ from splatctrl_cli.scene.keyframes import kept_radii
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
-from splatctrl_cli.scene.surface_depth import steadied
+from splatctrl_cli.scene.surface_depth import steady_depth
 from tests.scene.test_labels import VISITOR, ball, seen_and_masked, seen_with, splats_at
 from tests.scene.wall import WORKSPACE, frame, plain_seeds
 
@@ -193,7 +193,7 @@ def test_what_was_the_robots_before_is_told_to_the_running_mean_of_depth(monkeyp
     target.step([view], robot)
     shown = target.seen[0][1].kinds
     assert (shown == PixelKind.ROBOT).any()
-    spy = Mock(side_effect=steadied)
+    spy = Mock(side_effect=steady_depth)
     monkeypatch.setattr(fitter_module, "steadied", spy)
     target.step([view], robot)
     np.testing.assert_array_equal(spy.call_args_list[0].args[1][1], shown == PixelKind.OBJECT)

@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.config.fixed import CONTRADICTED
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.scene.contradicted import Contradicted, contradicted, without_contradicted
+from splatctrl_cli.scene.contradicted import Contradicted, find_contradicted, mark_contradicted
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.self_mask import PixelKind, object_mask
 from splatctrl_cli.voxels import EvidenceClass
@@ -29,7 +29,7 @@ def block_measured_at(depth: float, *, x: float = 0.0, camera: str = "cam0") -> 
 
 def contradict_all(*frames: RgbdFrame) -> list[Contradicted]:
     """Return what the other frames contradict of each frame."""
-    return [*contradicted([(seen, object_mask(seen)) for seen in frames], is_drawn=False)]
+    return [*find_contradicted([(seen, object_mask(seen)) for seen in frames], is_drawn=False)]
 
 
 OTHER = frame(x=BESIDE, camera="cam1")
@@ -48,7 +48,7 @@ def test_depth_far_behind_what_another_camera_measures_is_contradicted(behind: f
     assert not none.until.any() and not contradict_all(shiny)[0].until.any()  # nor does a lone camera
     assert pixels.any() == is_wrong and not (pixels & ~is_block).any()
     assert not is_wrong or pixels.sum() > 0.7 * is_block.sum()
-    assert ((without_contradicted(object_mask(shiny), found).kinds == PixelKind.CONTRADICTED) == pixels).all()
+    assert ((mark_contradicted(object_mask(shiny), found).kinds == PixelKind.CONTRADICTED) == pixels).all()
     points = points_of(found, shiny, is_blank=False)
     assert bool(len(points)) == is_wrong and not len(points_of(found, shiny, is_blank=True))
     if is_wrong:  # on the rays of the block and above the floor
@@ -135,7 +135,7 @@ def test_a_robot_that_returns_no_depth_is_hidden_by_something(is_drawn: bool) ->
     """A robot half a metre before the camera in its block's place, of which only some returned depth."""
     dark = block_measured_at(0.0)
     mask = replace(object_mask(dark), robot_depth=np.where(dark.depth <= 0, np.float32(0.5), np.float32(0.0)))
-    (found,) = contradicted([(dark, mask)], is_drawn=is_drawn)
+    (found,) = find_contradicted([(dark, mask)], is_drawn=is_drawn)
     points = points_of(found, dark, is_blank=True)
     assert bool(len(points)) == is_drawn
     assert not is_drawn or points[:, 2].min() > HEIGHT - 0.5 - 1e-6

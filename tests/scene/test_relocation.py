@@ -6,7 +6,7 @@ import pytest
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.scene.buffer import SplatBuffer
-from splatctrl_cli.scene.removal import clone_shape, clone_sources, detail_seeds, drawn
+from splatctrl_cli.scene.removal import clone_shape, clone_sources, detail_seeds, draw_indices
 from tests.scene.wall import HEIGHT, INTRINSICS, frame, plain_seeds
 
 CONFIG = SceneConfig()
@@ -78,4 +78,4 @@ def test_pixels_are_drawn_as_numpy_draws_them() -> None:
     weight[::7] = 0.0
     for count in (1, 30, int(np.count_nonzero(weight))):
         wanted = np.random.default_rng(2).choice(500, count, replace=False, p=weight / weight.sum())
-        np.testing.assert_array_equal(drawn(weight, count, np.random.default_rng(2)), wanted)
+        np.testing.assert_array_equal(draw_indices(weight, count, np.random.default_rng(2)), wanted)

@@ -17,10 +17,10 @@ from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
     audit_masks,
+    drop_pixels,
+    outvote_objects,
     self_mask,
-    settled,
-    voted,
-    without,
+    settle_pieces,
 )
 from tests.plain import plain_frame
 
@@ -70,7 +70,7 @@ def kinds(
     """Settled by the depths of other frames."""
     views = [frame(each) for each in (depth, *others)]
     (view, mask), *beside = [(view, self_mask(view, posture or robot(), config)) for view in views]
-    return settled(view, mask, beside, config).kinds
+    return settle_pieces(view, mask, beside, config).kinds
 
 
 SHOWN = np.isfinite(ball_depth())
@@ -113,7 +113,7 @@ def test_a_depth_between_the_robot_and_the_floor_at_its_outline_is_mixed_and_lef
     depth[edge] = 1.08
     mask = masked(depth)
     assert (mask.kinds[edge] == PixelKind.MIXED).all()
-    left = without(frame(depth), mask, PixelKind.MIXED).depth
+    left = drop_pixels(frame(depth), mask, PixelKind.MIXED).depth
     assert not left[edge].any() and left[~SHOWN].all()
 
 
@@ -145,7 +145,7 @@ def test_a_doubted_pixel_is_not_confirmed_by_a_view_of_its_neighbour_behind() ->
     kinds[near] = kinds[far] = PixelKind.DOUBTED
     mask = replace(masked(depth), kinds=kinds)
     other, seen = np.where(depth == 1.2, depth, 0.0), np.where(depth == 1.2, kinds, 0).astype(np.uint8)
-    decided = settled(frame(depth), mask, [(frame(other), replace(mask, kinds=seen))], CONFIG).kinds
+    decided = settle_pieces(frame(depth), mask, [(frame(other), replace(mask, kinds=seen))], CONFIG).kinds
     assert decided[near] == PixelKind.MIXED and decided[far] == PixelKind.OBJECT
 
 
@@ -279,7 +279,7 @@ ROBOT, OBJECT = [PixelKind.ROBOT], [PixelKind.OBJECT]
 )
 def test_few_object_pixels_in_a_voxel_of_the_robot_are_outvoted(frames: list[list[int]], num_objects: int) -> None:
     seen = [shown(own) for own in frames]
-    for mask, (_, own) in zip(voted(seen, np.array([0.0, 0.0, 1.0]), 0.1), seen, strict=True):
+    for mask, (_, own) in zip(outvote_objects(seen, np.array([0.0, 0.0, 1.0]), 0.1), seen, strict=True):
         is_object = own.kinds == PixelKind.OBJECT
         assert ((mask.kinds == PixelKind.OBJECT) == (is_object & (num_objects > 0))).all()
         assert ((mask.kinds == PixelKind.MIXED) == (is_object & (num_objects == 0))).all()
@@ -287,8 +287,10 @@ def test_few_object_pixels_in_a_voxel_of_the_robot_are_outvoted(frames: list[lis
 
 def test_the_robots_votes_count_in_their_own_voxel_alone() -> None:
     robot, beside = shown(16 * ROBOT), shown(16 * OBJECT, depth=1.11)
-    assert (voted([robot, beside], np.array([0.0, 0.0, 1.0]), 0.1)[1].kinds == beside[1].kinds).all()
-    assert not (voted([robot, beside], np.array([0.0, 0.0, 1.1]), 0.3)[1].kinds == PixelKind.MIXED).any()  # 16 to 16
+    assert (outvote_objects([robot, beside], np.array([0.0, 0.0, 1.0]), 0.1)[1].kinds == beside[1].kinds).all()
+    assert not (
+        outvote_objects([robot, beside], np.array([0.0, 0.0, 1.1]), 0.3)[1].kinds == PixelKind.MIXED
+    ).any()  # 16 to 16
 
 
 def drawn() -> RobotPosture:
