@@ -210,9 +210,7 @@ class SceneFitter:
         filled = self.refined.filled
         if block < fixed.REFINE_BLOCKS - 2:
             filled += self._seed(views, [object_mask(view.frame) for view in views])
-            more, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
-            filled += more
-            removed["weak"] += num_weak
+            filled += self._use_idle(views, rng, removed)
         self.refined = Refined(
             num_blocks=block + 1,
             filled=filled,
@@ -439,6 +437,11 @@ class SceneFitter:
         )
         is_hidden = np.isin(slots, hidden_objects(self.buffer, robot, seen, config))
         self.buffer.set_radius(slots, np.where(is_hidden, np.minimum(radii, np.float32(least)), radii))
+
+    def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
+        filled, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
+        removed["weak"] += num_weak
+        return filled
 
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf

@@ -194,7 +194,7 @@ def test_what_was_the_robots_before_is_told_to_the_running_mean_of_depth(monkeyp
     shown = target.seen[0][1].kinds
     assert (shown == PixelKind.ROBOT).any()
     spy = Mock(side_effect=steady_depth)
-    monkeypatch.setattr(fitter_module, "steadied", spy)
+    monkeypatch.setattr(fitter_module, "steady_depth", spy)
     target.step([view], robot)
     np.testing.assert_array_equal(spy.call_args_list[0].args[1][1], shown == PixelKind.OBJECT)
 

@@ -164,8 +164,8 @@ class DeviceFit:
             self.device.copy(self._addresses[f"{name}_before"], self._addresses[name], self._sizes[name])
         while True:
             self.rewind(schedule, weights, settings, seed)
-            for size, group in groupby(schedule, lambda k: self.views[k].target.depth.shape):
-                self._graph(*size, "step").run(len(list(group)))
+            for (height, width), group in groupby(schedule, lambda k: self.views[k].target.depth.shape):
+                self._graph(height, width, "step").run(len(list(group)))
             if self._fits():
                 return self._terms(schedule)
             for name in STATE:
