@@ -1,10 +1,12 @@
-"""Rays through a surface that another camera measures: shiny or dark objects.
+"""Evidence of a time step: masks of its frames, rays that frames contradict, and what the occupancy takes in.
 
-Depth of such an object is far too large, or missing.
+Rays go through a surface that another camera measures if an object is shiny or dark: its depth is far too large, or
+missing.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TypeVar
 
 import cv2
@@ -14,9 +16,28 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
-from splatctrl_cli.scene.depth_holes import find_shadows, points_on_rays
+from splatctrl_cli.scene.depth_holes import (
+    explain_unseen,
+    find_shadows,
+    lost_edges,
+    points_on_rays,
+    unanswered_points,
+)
 from splatctrl_cli.scene.labels import Seen
-from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
+from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
+from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.seeding import Each
+from splatctrl_cli.scene.self_mask import (
+    PixelKind,
+    SelfMask,
+    drop_pixels,
+    object_mask,
+    outvote_objects,
+    pixels_at,
+    self_mask,
+    settle_pieces,
+)
+from splatctrl_cli.voxels import Unseen
 
 T = TypeVar("T", bound=np.generic)
 BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
@@ -90,6 +111,55 @@ def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
             is_blank=np.asarray((_blocks(view.frame.depth, view.side) <= 0).all(axis=2)),
             through=_side_by_side(passed, fixed.SEEN_THROUGH_PIXELS),
         )
+
+
+def mask_frames(
+    frames: Sequence[RgbdFrame], robot: RobotPosture | None, last: Seen, occupancy: OccupancyMap, each: Each
+) -> tuple[list[RgbdFrame], list[SelfMask], list[Contradicted]]:
+    """Frames of a time step without mixed depth, their masks, and what other frames contradict.
+
+    last: frames and masks of the last time step; each: a `map` over frames.
+    """
+    config = occupancy.config
+    masks = [object_mask(frame) for frame in frames]
+    if robot is not None:
+        seen = list(zip(frames, each(lambda frame: self_mask(frame, robot, config), frames), strict=True))
+        others = [[*(other for other in seen if other is not one), *last] for one in seen]
+        masks = [settle_pieces(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
+        masks = outvote_objects(list(zip(frames, masks, strict=True)), occupancy.origin, config.voxel)
+    is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
+    rays = list(find_contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
+    masks = list(map(mark_contradicted, masks, rays))
+    return [drop_pixels(*one, PixelKind.MIXED) for one in zip(frames, masks, strict=True)], masks, rays
+
+
+def take_in_evidence(
+    occupancy: OccupancyMap,
+    people: PeopleMemory,
+    seen: Seen,
+    rays: Sequence[Contradicted],
+    robot: RobotPosture | None,
+    each: Each,
+) -> None:
+    """Add a time step's depth to the occupancy, reasons of unseen voxels, lost edges, and the robot."""
+    config = occupancy.config
+    proving = [
+        found.unproven(drop_pixels(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
+    ]
+    people.take_in(occupancy, proving)
+    unanswered = each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
+    for (frame, _), found in zip(seen, rays, strict=True):
+        for reason, is_blank in ((Unseen.CONTRADICTED, False), (Unseen.UNANSWERED, True)):
+            for points in found.points(frame, config, is_blank=is_blank):
+                occupancy.mark_unseen(points, reason)
+    for points in chain.from_iterable(unanswered):
+        occupancy.mark_unseen(points, Unseen.UNANSWERED)
+    occupancy.keep_edges(lost_edges(seen, robot, config))
+    if robot is not None:
+        pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
+        occupancy.label_robot(robot.centers, robot.radii, pixels)
+        occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
+        explain_unseen(occupancy, seen, robot)
 
 
 def mark_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:

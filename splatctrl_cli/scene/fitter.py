@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 
 import numpy as np
 
@@ -15,8 +14,7 @@ from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, lasts_at_fixed_links
-from splatctrl_cli.scene.contradicted import find_contradicted, mark_contradicted
-from splatctrl_cli.scene.depth_holes import explain_unseen, lost_edges, unanswered_points
+from splatctrl_cli.scene.contradicted import mask_frames, take_in_evidence
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
@@ -41,18 +39,14 @@ from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
     audit_masks,
-    drop_pixels,
     label_pixels,
     object_mask,
-    outvote_objects,
-    self_mask,
-    settle_pieces,
 )
 from splatctrl_cli.scene.shell import Shell
 from splatctrl_cli.scene.surface_depth import object_twice, steady_depth
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirm_bare, unrepresented_voxels
-from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
+from splatctrl_cli.voxels import Balls, KnownVoxels
 
 
 class SceneFitter:
@@ -101,20 +95,7 @@ class SceneFitter:
         robot = robot and replace(robot, num_threads=self.num_threads)
         self._find_mounted(frames)
         config = self.occupancy.config
-        masks = [object_mask(frame) for frame in frames]
-        if robot is not None:
-            seen = list(zip(frames, self._each(lambda f: self_mask(f, robot, config), frames), strict=True))
-            others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
-            masks = [settle_pieces(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
-            masks = outvote_objects(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
-        rays = list(
-            find_contradicted(
-                list(zip(frames, masks, strict=True)),
-                is_drawn=robot is not None and robot.surface is not None and robot.surface.is_drawn,
-            )
-        )
-        masks = list(map(mark_contradicted, masks, rays))
-        frames = [drop_pixels(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
+        frames, masks, rays = mask_frames(frames, robot, self.seen, self.occupancy, self._each)
         known = {view.frame.camera: view.frame for view in self.window.newest if view.frame.camera in self.objects}
         before = {camera: (frame, self.objects[camera]) for camera, frame in known.items()}
         objects = [mask.kinds == PixelKind.OBJECT for mask in masks]
@@ -130,24 +111,8 @@ class SceneFitter:
         seen = self.seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
             self.descent.background = self._behind(views)
-        proving = [
-            found.unproven(drop_pixels(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
-        ]
-        self.people.take_in(self.occupancy, proving)
-        unanswered = self._each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
-        for frame, found in zip(frames, rays, strict=True):
-            for reason, is_blank in ((Unseen.CONTRADICTED, False), (Unseen.UNANSWERED, True)):
-                for points in found.points(frame, config, is_blank=is_blank):
-                    self.occupancy.mark_unseen(points, reason)
-        for points in chain.from_iterable(unanswered):
-            self.occupancy.mark_unseen(points, Unseen.UNANSWERED)
-        self.occupancy.keep_edges(lost_edges(seen, robot, config))
+        take_in_evidence(self.occupancy, self.people, seen, rays, robot, self._each)
         self._carry(robot)
-        if robot is not None:
-            pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
-            self.occupancy.label_robot(robot.centers, robot.radii, pixels)
-            self.occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
-            explain_unseen(self.occupancy, seen, robot)
         removed = self._remove(self._relabel(robot, seen), self._floating(views))
         filled = self._seed(views, masks)
         is_first = self.descent.num_iterations == 0 and bool(self.buffer.is_alive.any())
