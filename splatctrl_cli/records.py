@@ -19,6 +19,7 @@ from splatctrl_cli.errors import UsageError
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
+UInt16 = NDArray[np.uint16]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.int64]
 Floats = NDArray[np.floating]

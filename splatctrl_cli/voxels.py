@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.records import Bool, Columns, Float32, Float64, Floats, Index, UInt8
+from splatctrl_cli.records import Bool, Columns, Float32, Float64, Floats, Index, UInt8, UInt16
 
 MOST_VOXELS = 400_000_000  # of a grid
 FIRST_REASON = 0xF0  # in one byte (0xFFF0 in two): from here on `last_seen` is the reason of a never-seen voxel
@@ -77,7 +76,7 @@ class OccupancyGrid:
     origin: Float64
     voxel: float
     log_odds: Float32
-    num_updates: NDArray[np.uint16]
+    num_updates: UInt16
     entity: UInt8
 
     def states(self, free_below: float, occupied_above: float) -> UInt8:
@@ -157,12 +156,12 @@ class SeenVoxels:
 
     origin: Float64
     voxel: float
-    last_seen: NDArray[np.uint8] | NDArray[np.uint16]
-    step_stamps_ns: NDArray[np.int64]
+    last_seen: UInt8 | UInt16
+    step_stamps_ns: Index
     edges: LostEdges = NO_EDGES
     is_free: Bool | None = None
 
-    def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
+    def look(self, points: Floats) -> tuple[Index, UInt8]:
         """Stamps (Q,) [ns] of the last views, -1 for never, and `EvidenceClass` (Q,).
 
         points (Q, 3) [m], world. The class is `FREE` for every voxel ever seen.
@@ -189,8 +188,8 @@ class KnownVoxels:
     """
 
     grid: OccupancyGrid
-    last_seen: NDArray[np.uint16]
-    step_stamps_ns: NDArray[np.int64]
+    last_seen: UInt16
+    step_stamps_ns: Index
     unrepresented: Balls
     edges: LostEdges = NO_EDGES
 

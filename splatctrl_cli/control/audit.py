@@ -233,9 +233,9 @@ def between_states(
 ) -> Between:
     """Bounds between states (T, J) at stamps (T,) [ns] in one scene.
 
-    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm is
-    assumed to move straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may go
-    anywhere within its velocity limits: bounded only where that stays above the margin [m].
+    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm
+    moves straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may go anywhere
+    within its velocity limits: bounded only where that stays above the margin [m].
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))

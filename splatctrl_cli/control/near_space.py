@@ -46,9 +46,9 @@ class Account:
     shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
     unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place;
-    blind_to_surface [m]: likewise of `NOT_OCCLUDED` points, about spheres with almost only never-seen points
-    (`NEAR_BLIND`). Infinite and NaN without any. age [s]: quantile `NEAR_FRESH_SHARE` of seen points' ages; ahead
-    [s]: to the latest view. NaN without views.
+    blind_to_surface [m]: of `NOT_OCCLUDED` points, about spheres with almost only never-seen points (`NEAR_BLIND`).
+    Infinite and NaN without any. age [s]: quantile `NEAR_FRESH_SHARE` of ages; ahead [s]: to the latest view. NaN
+    without views.
     """
 
     shares: Float64

@@ -64,10 +64,10 @@ class ControlStep:
     """The controller's decision at one configuration.
 
     velocity (J,) [rad/s], scaled by `scale` (1 unless the next distance broke a row's promise); pose_error (6,) [m,
-    rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf without
-    pairs); violated_fixed: violated rows that no joint velocity changes; fixed_distance [m]: their least distance
-    (inf without any); interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT residual
-    of the last solution, with its status; num_refused: unusable solutions; by_surface: as in `step`, from now on.
+    rad]; clearance [m] of the nearest moving sphere by the controller's field; self_clearance [m] (inf without
+    pairs); violated_fixed: rows that no joint velocity changes, fixed_distance [m]: their least (inf without any);
+    interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT residual of the last
+    solution, with its status; num_refused: unusable solutions; by_surface: as in `step`, from now on.
     """
 
     velocity: Float64

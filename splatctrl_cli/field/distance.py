@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import FieldConfig, fixed
 from splatctrl_cli.errors import UsageError
@@ -17,7 +17,7 @@ from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField
 from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import GridSpan, LogSumExp
-from splatctrl_cli.records import DistanceField, Float32, Float64
+from splatctrl_cli.records import DistanceField, Float32, Float64, Index
 
 DEFAULT = FieldConfig()
 
@@ -38,7 +38,7 @@ class SphereField:
         score, gradient, _ = native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
 
-    def nearest(self, points: Float64) -> NDArray[np.int64]:
+    def nearest(self, points: Float64) -> Index:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the distance."""
         local = self.spheres.relative(checked_points(points))
         return self.spheres.source[native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]]
@@ -247,8 +247,8 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
     Each of the `steps` goes against the local gradient, as far as the field reads, at most the `exact` distance: it
-    crosses no sphere. The Matern field's zero level stands before the spheres (`slabs.planar_zero_level`). Points at
-    or behind it stay. Raises UsageError for less than one step.
+    crosses no sphere. Points at or behind the zero level, which Matern's field has before the spheres
+    (`slabs.planar_zero_level`), stay. Raises UsageError for less than one step.
     """
     if steps < 1:
         raise UsageError(f"marching: expected at least 1 step, got {steps}")
@@ -290,7 +290,7 @@ class OnDevice:
         """points (Q, 3) [m] -> distance (Q,) [m]."""
         return self._answer(points).distance.astype(np.float64) if len(points) else np.zeros(0)
 
-    def nearest(self, points: Float64) -> NDArray[np.int64]:
+    def nearest(self, points: Float64) -> Index:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the exact distance."""
         if not len(points):
             return np.zeros(0, np.int64)

@@ -34,10 +34,9 @@ MAX_BLOCKS = 2000
 def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Float64:
     """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
-    Each centre spreads one unit over eight nodes (trilinear), these are convolved, and it reads them back. Its own
-    term becomes k(0) = 1. Spreading and reading blur by h^2 / 3 per axis (h: node spacing); convolving with
-    ``2 k - (mean of k at the six neighbours)`` undoes it to second order. Raises UsageError for over `MAX_BLOCKS`
-    blocks.
+    Each centre spreads one unit over eight nodes (trilinear), and reads their convolution. Its own term becomes k(0)
+    = 1. Spreading and reading blur by h^2 / 3 per axis (h: node spacing), which convolving with ``2 k - (mean of k at
+    the six neighbours)`` undoes to second order. Raises UsageError for over `MAX_BLOCKS` blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
     nodes = (centers - centers.min(axis=0)) / voxel

@@ -78,9 +78,9 @@ def learn(
 
     T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
     link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
-    `NUM_CONFIGURATIONS` show it as a surface, and at most `FREE_SHARE` see through it; most views of one decide. It
-    must also leave its place in the world with the link, and move against each nearer link. Raises InputError where
-    no link can be learned.
+    `NUM_CONFIGURATIONS` show it as a surface, at most `FREE_SHARE` see through it (most views of one decide), it
+    leaves its place in the world with the link, and moves against each nearer link. Raises InputError where no link
+    can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]

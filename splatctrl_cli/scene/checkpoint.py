@@ -5,9 +5,8 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.records import Box, Intrinsics, RgbdFrame
+from splatctrl_cli.records import Box, Intrinsics, RgbdFrame, Values
 from splatctrl_cli.scene.buffer import Filled
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import Window
@@ -18,7 +17,7 @@ from splatctrl_cli.scene.self_mask import object_mask
 from splatctrl_cli.scene.time_steps import Refined
 from splatctrl_cli.voxels import Balls, LostEdges
 
-Arrays = Mapping[str, NDArray[np.generic]]
+Arrays = Mapping[str, Values]
 
 GRID_NAMES = ("log_odds", "num_updates", "entity", "last_seen")
 DENSITY_NAMES = ("edge", "tolerance", "num_candidates")
@@ -26,12 +25,12 @@ FILLED_NAMES = ("added", "relocated", "unmet")
 FRAME_NAMES = tuple(field.name for field in fields(RgbdFrame))
 
 
-def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
+def fitter_state(fitter: SceneFitter) -> dict[str, Values]:
     """Splats, moments, occupancy, frames and counters: views, not copies.
 
     There is no random state: steps and blocks seed generators by number.
     """
-    arrays: dict[str, NDArray[np.generic]] = dict(fitter.buffer.arrays())
+    arrays: dict[str, Values] = dict(fitter.buffer.arrays())
     arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
     arrays["step_stamps_ns"] = np.array(fitter.occupancy.step_stamps_ns, np.int64)
     arrays["workspace"] = np.array([fitter.workspace.lower, fitter.workspace.upper])
@@ -127,7 +126,7 @@ def workspace_of(arrays: Arrays) -> Box:
     return Box(lower=lower, upper=upper)
 
 
-def _frame_arrays(frame: RgbdFrame) -> dict[str, NDArray[np.generic]]:
+def _frame_arrays(frame: RgbdFrame) -> dict[str, Values]:
     values = {name: getattr(frame, name) for name in FRAME_NAMES}
     k = frame.intrinsics
     values["intrinsics"] = [k.fx, k.fy, k.cx, k.cy, k.width, k.height]

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.geometry import invert_transform, transform_points
-from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Float32, Index, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
@@ -104,9 +103,7 @@ def lasts_at_fixed_links(
     return np.asarray(is_kept)
 
 
-def hidden_objects(
-    buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig
-) -> NDArray[np.intp]:
+def hidden_objects(buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig) -> Index:
     """Slots (K,) of objects within `ROBOT_REACH` of the robot or base that no pixel shows.
 
     Fitting would pull them out of their object.

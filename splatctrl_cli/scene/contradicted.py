@@ -87,9 +87,9 @@ def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
     """Yield what other frames or the drawn robot contradict in each frame of a step.
 
     All rays of a contradicted block and its neighbours cross another frame's surface. They end more than
-    `CONTRADICTED` [m] behind it, or have no return, in range and outside stereo shadows. No return from the drawn
-    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Where others' rays cross at least
-    `SEEN_THROUGH_PIXELS` adjacent blocks, these prove no space free.
+    `CONTRADICTED` [m] behind it, or have no return, in range and outside stereo shadows, or none from the drawn
+    robot. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks that
+    others' rays cross prove no space free.
     """
     views = [_BlockView.of(*one) for one in seen]
     through = [np.zeros_like(view.surely) for view in views]

@@ -1,19 +1,18 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
-An object in a hole is on its rays, which rays of other cameras and later images clear. At depth edges without depth,
-the nearer surface may extend. Voxels near the robot that no camera ever saw get a reason.
+An object in a hole is on its rays, until other rays clear them. At depth edges without depth, the nearer surface may
+extend. Voxels near the robot that no camera ever saw get a reason.
 """
 
 from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.kernels import points
-from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame, UInt16
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
@@ -29,9 +28,8 @@ MOST_POINTS = 1 << 18  # per batch: fine voxels and a large hole may need a hund
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
     """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
-    Some repeat. Rays are about a voxel apart, from `min_range` to the depth of the nearest pixel with depth. Holes
-    up to `NARROW_HOLE` voxels wide do not count, nor those at the robot or its stereo shadow. robot_depth (H, W)
-    [m]: rendered, 0 = none.
+    Some repeat. Rays about a voxel apart end at the depth of the nearest pixel with depth. Holes up to `NARROW_HOLE`
+    voxels wide do not count, nor those at the robot or its stereo shadow. robot_depth (H, W) [m]: rendered, 0 = none.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
@@ -200,7 +198,7 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> 
     occupancy.explain(voxels, reasons)
 
 
-def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> NDArray[np.uint16]:
+def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> UInt16:
     """Reason `Unseen` (K,) why a frame does not show points (K, 3) [m]."""
     pixel, z = pixels_at(frame, points)
     is_in_view = (pixel >= 0) & frame.in_view.reshape(-1)[pixel]

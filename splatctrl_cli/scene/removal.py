@@ -4,12 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig, fixed
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Index, Label, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thin_mask, thinning
@@ -47,10 +46,8 @@ def removals(
 
     broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
     seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: no longer
-    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
-
-    Splats in never-seen surroundings stay, unless the rule is "literal". counts_time: count this step towards the
-    patience.
+    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail). Splats in
+    never-seen surroundings stay, unless the rule is "literal". counts_time: towards the patience.
     """
     config = occupancy.config
     centers = buffer.centers
@@ -87,7 +84,7 @@ def room_for(
     """Slots (M,) of at most `num` splats to evict, and the seeds in order of service.
 
     Only object splats go: redundant ones that show least, then, for seeds near the robot's path, far ones. shown
-    (M,): how much slots show; tolerance [m]: of `find_redundant`.
+    (M,): by slot; tolerance [m]: of `find_redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
@@ -107,13 +104,13 @@ def room_for(
 
 
 def find_redundant(
-    order: NDArray[np.intp],
+    order: Index,
     num_wanted: int,
     splats: SplatSet,
     voxels: Float32,
     tolerance: float,
     num_threads: int = 1,
-) -> NDArray[np.intp]:
+) -> Index:
     """The first splats of `order`, at most `num_wanted`, that the others together can replace.
 
     splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within `tolerance`
@@ -139,7 +136,7 @@ def find_redundant(
     return np.array(chosen, np.intp)
 
 
-def find_far(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
+def find_far(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> Index:
     """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
     Each is at least EVICT_NEARER farther from the path than its seed.
@@ -158,7 +155,7 @@ def distance_to_box(points: Float32, box: Box) -> Float64:
     return np.asarray(np.linalg.norm(outside, axis=1), np.float64)
 
 
-def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
+def clone_shape(opacity: Float64, radius: Float64, count: Index) -> tuple[Float64, Float64]:
     """Opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies.
 
     The peak is conserved, `a = 1 - (1 - alpha)^(1/N)`, and the blended opacity over the screen, `r' = r sqrt(alpha
@@ -172,7 +169,7 @@ def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> t
     return a, radius * np.sqrt(np.divide(opacity, mass, out=np.ones_like(mass), where=mass > 0))
 
 
-def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator) -> Index:
     """Draw indices (num_clones,) in proportion to opacity, with replacement."""
     total = float(opacities.sum())
     if num_clones < 1 or total <= 0.0:
@@ -237,7 +234,7 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
     return replace(found.select(kept), radii=np.clip(found.radii[kept], config.min_radius, config.max_radius))
 
 
-def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> Index:
     """Draw `count` different indices in proportion to weight (K,), at least `count` of them positive.
 
     Same as ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, but faster.
@@ -254,7 +251,7 @@ def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> NDArr
     return found
 
 
-def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[np.intp]) -> Seeds:
+def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: Index) -> Seeds:
     order = np.argsort(chosen, kind="stable")
     parts, first = [], 0
     for frame, mask in zip(frames, masks, strict=True):
@@ -267,7 +264,7 @@ def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[
     return parts[0].joined(*parts[1:]).select(np.argsort(order))
 
 
-def _apart(points: Float32, distances: Float32) -> NDArray[np.intp]:
+def _apart(points: Float32, distances: Float32) -> Index:
     """Indices of points (K, 3) not within the distance (K,) of earlier kept ones."""
     is_taken = np.zeros(len(points), bool)
     neighbours = cKDTree(points).query_ball_point(points, distances)

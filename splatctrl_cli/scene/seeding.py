@@ -11,13 +11,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.kernels.points import CubeMeans, Cubes, SplatTree, back_projected
 from splatctrl_cli.kernels.raster import pack_camera
-from splatctrl_cli.records import Bool, Box, Float32, Float64, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Integers, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
 
@@ -90,7 +89,7 @@ class CubeLevel:
     edge: float
     points: Float32
     means: CubeMeans
-    parent: NDArray[np.int32]
+    parent: Integers
 
     @cached_property
     def detail(self) -> Float64:

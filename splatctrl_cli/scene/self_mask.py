@@ -8,12 +8,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
-from splatctrl_cli.kernels import native
-from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
+from splatctrl_cli.kernels import Int16, native
+from splatctrl_cli.records import Array, Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.surface_depth import surface_steps
@@ -54,9 +53,9 @@ class SelfMask:
 def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
     """Self-mask of a frame, with the robot's pose at its stamp.
 
-    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths nearby:
-    in as many pixels as the tolerance spans. So is a point this near to a triangle, or inside. Points inside balls
-    and carried boxes are robot. Other depth is object, if `_judge` agrees.
+    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths in as
+    many pixels as the tolerance spans. So is a point this near to a triangle, or inside one, a ball or a carried box.
+    Other depth is object, if `_judge` agrees.
 
     The image is widened by 1 / `MASK_BORDER`.
     """
@@ -153,7 +152,7 @@ def _is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, f
     return np.asarray(is_object & is_behind & (farthest_within(depth, reach) - depth > tolerance))
 
 
-def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: NDArray[np.int16]) -> Bool:
+def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: Int16) -> Bool:
     """Outermost robot pixels (H, W) of links that no joint moves."""
     still = [number for number, name in enumerate(surface.links) if name in surface.fixed]
     shown = (is_robot & np.isin(link, still)).view(np.uint8)
@@ -178,8 +177,8 @@ def settle_pieces(
 ) -> SelfMask:
     """Mask with each doubted piece decided: object or mixed.
 
-    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` measured half of it, or
-    if there are none. others: of other cameras, and settled ones of the last step.
+    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` (of other cameras, and
+    settled ones of the last step) measured half of it, or without any.
     """
     doubted = (mask.kinds == PixelKind.DOUBTED).view(np.uint8)
     v, u = np.nonzero(doubted)
@@ -244,7 +243,7 @@ def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float
     return np.where(is_inside, v * k.width + u, -1), z
 
 
-def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _by_link(values: Array, links: Int16, names: Sequence[str]) -> dict[str, Array]:
     order = np.argsort(links, kind="stable")
     ends = np.searchsorted(links[order], np.arange(len(names) + 1))
     parts = {name: values[order[first:end]] for name, first, end in zip(names, ends, ends[1:], strict=False)}

@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
-from splatctrl_cli.records import Bool, Box, SplatSet
+from splatctrl_cli.records import Bool, Box, SplatSet, Values
 from splatctrl_cli.scene.buffer import COLOR, Seeds, SplatBuffer
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, seen_through
@@ -122,13 +121,13 @@ class Shell:
         gone |= seen_through(self.buffer.centers, views, self._see_through, self._num_threads)
         self.buffer.kill(self.buffer.is_alive & gone)
 
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
+    def arrays(self) -> dict[str, Values]:
         d = self._density
         density = (0.0, 0.0, 0) if d is None else (d.edge, d.tolerance, d.num_candidates)
         counters = (self.num_steps, self._descent.num_iterations)
         return self.buffer.arrays() | {"begun": np.array([*counters, self._depth, *density])}
 
-    def restore(self, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+    def restore(self, arrays: Mapping[str, Values]) -> None:
         """Restore a state of the same configuration, seed and workspace."""
         for name, array in self.buffer.arrays().items():
             array[...] = arrays[name]

@@ -18,10 +18,9 @@ def steady_depth(
 ) -> tuple[RgbdFrame, Bool]:
     """Frame with a running mean of its depth, and its steady pixels (H, W).
 
-    An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2. Depths around
-    it may change by at most `STEADY_MOVED` `depth_error` z^2 on average. Only what was an object before is averaged.
-
-    Without `before`, no pixel is steady. If the camera moved, depth stays, and all pixels are steady.
+    An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2, and depths
+    around it by `STEADY_MOVED` `depth_error` z^2 on average. Only what was an object before is averaged. Without
+    `before`, no pixel is steady; if the camera moved, depth stays, and all are.
     """
     if before is None or before[1].shape != frame.depth.shape:
         return frame, np.zeros(frame.depth.shape, bool)
@@ -51,11 +50,11 @@ def surface_steps(
 ) -> Float32:
     """Largest depth step (H, W) [m] from each pixel to a neighbour on its surface.
 
-    It is `MASK_STEP`, except in the robot's outline (is_edge), `edge` pixels wide. An object pixel there, off its
-    plane by more than `tolerance` (H, W) [m], gets half that distance, if less.
+    It is `MASK_STEP`. In the robot's outline (is_edge), `edge` pixels wide, an object pixel off its plane by more
+    than `tolerance` (H, W) [m] gets half that distance, if less.
 
     The plane fits 1 / depth of object pixels beyond the outline, within `MASK_PLANES` widths. It counts if
-    its residuals match the sensor (`depth_error` [m] at 1 m) and its variance is at most `MASK_UNSURE` of a pixel's.
+    residuals match the sensor (`depth_error` [m] at 1 m) and its variance is at most `MASK_UNSURE` of a pixel's.
     """
     steps = np.full(depth.shape, fixed.MASK_STEP, np.float32)
     beyond, asked = is_object & ~is_edge, is_object & is_edge
