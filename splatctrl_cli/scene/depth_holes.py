@@ -195,7 +195,7 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> 
     for frame, mask in seen:
         np.maximum(reasons, _in_frame(points, frame, mask), out=reasons)
     reasons[robot.distance(points) <= 0] = Unseen.SWEPT
-    occupancy.explain(voxels, reasons)
+    occupancy.last_seen.reshape(-1)[voxels] = reasons
 
 
 def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> UInt16:

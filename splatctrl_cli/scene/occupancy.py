@@ -125,10 +125,6 @@ class OccupancyMap:
         is_open = (last == 0) | (last >= Unseen.OUT_OF_VIEW) & (last < Unseen.CONTRADICTED)
         return np.asarray(voxels[is_open])
 
-    def explain(self, voxels: Index, reasons: UInt16) -> None:
-        """Set the `Unseen` reasons (K,) of voxels (K,)."""
-        self.last_seen.reshape(-1)[voxels] = reasons
-
     def keep_edges(self, edges: Mapping[str, LostEdges]) -> None:
         """Replace these cameras' lost edges, within the grid."""
         upper = self.origin + self.config.voxel * (np.array(self.log_odds.shape) - 1)

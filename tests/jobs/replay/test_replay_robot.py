@@ -245,9 +245,9 @@ def test_blocks_of_any_size_give_the_same_files(
 def signals(values: Sequence[float], names: Sequence[str]) -> list[Signal]:
     value = np.array(values)
     low = Signal(
-        kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, names_at=lambda i: [names[i]], is_high_worse=False
+        kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, names=lambda i: [names[i]], is_high_worse=False
     )
-    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, names_at=lambda i: [names[i]])]
+    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, names=lambda i: [names[i]])]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5, 12])
