@@ -40,13 +40,13 @@ class SceneRows(BarrierTerm):
         self.names = tuple(names[s] for s in self._moving)
         self._links = np.array(model.sphere_set.links)[self._moving]
 
-    def in_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
+    def with_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
         """Rows in another field, of `balls` (None: links' surfaces do not count)."""
         other = copy(self)
         other._field, other._balls = field, balls
         return other
 
-    def by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
+    def raise_by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
         """Distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
 
         Where that gap is larger, rows G (M, J) become its rows, in place.
@@ -68,7 +68,7 @@ class SceneRows(BarrierTerm):
         centers, jacobians = state.spheres
         distance, gradient = self._query(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
-        distance = self.by_surfaces(state.q, distance, state.by_surface, G)
+        distance = self.raise_by_surfaces(state.q, distance, state.by_surface, G)
         h = distance_bound(self._config, self._acceleration, distance, self.margin, G, state.distance_rate)
         return self._barrier(self._moving, G, h, distance)
 
@@ -83,7 +83,7 @@ class SceneRows(BarrierTerm):
         centers, jacobians = state.model.spheres_at(q)
         later, gradient = self._field.query(np.ascontiguousarray(centers[self._moving]))
         G = -external_gradient(gradient, jacobians[self._moving])
-        later = self.by_surfaces(q, later - self._radii, state.by_surface, G)
+        later = self.raise_by_surfaces(q, later - self._radii, state.by_surface, G)
         now, G = np.maximum(later + period * (G @ velocity), distance)[chosen], G[chosen]
         rate = np.broadcast_to(state.distance_rate, len(self.names))[chosen]
         h = distance_bound(self._config, self._acceleration, now, self.margin[chosen], G, rate)

@@ -78,7 +78,7 @@ class NearSpace:
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres at the last evaluation
 
-    def due(self, stamps: Index, centers: Float64) -> dict[int, bool]:
+    def choose(self, stamps: Index, centers: Float64) -> dict[int, bool]:
         """Indices of states to evaluate; True if their ages count.
 
         A state is due once a sphere has moved by `NEAR_MOVED`, and (True) every `NEAR_EVERY_NS`. stamps (T,) [ns]
@@ -94,7 +94,7 @@ class NearSpace:
                 chosen[index], self._looked = is_timed, moving[index]
         return chosen
 
-    def on_the_way(self, first: Float64, last: Float64) -> Float64:
+    def postures_between(self, first: Float64, last: Float64) -> Float64:
         """Postures (K, J) in between, so dense that no sphere moves by `NEAR_MOVED`."""
         begin, end = self._model.sphere_centers_batch(np.stack([first, last]))[:, self._moving]
         num = int(np.ceil(np.linalg.norm(end - begin, axis=1).max(initial=0.0) / fixed.NEAR_MOVED))

@@ -154,14 +154,14 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
         except Misbehaved as error:
             self.failure = Failure(fault=error.fault, sentence=error.sentence, stamp_ns=moment.stamp_ns)
             self.close()
-            return controller.given(view, None, str(error))
+            return controller.take_velocity(view, None, str(error))
         spent = max(program.spent for program in self._programs)
         self.num_answers, self.seconds, self.slowest = (
             self.num_answers + 1,
             self.seconds + spent,
             max(self.slowest, spent),
         )
-        return controller.given(view, velocity)
+        return controller.take_velocity(view, velocity)
 
     def _agree(self, question: Document, rows: Callable[[], list[Document]]) -> Float64:
         limits = dict(zip(self._model.joint_names, self._model.velocity_limit.tolist(), strict=True))

@@ -92,7 +92,7 @@ class RowBuilder:
     def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
         """Rows in another field; see `SceneRows.in_field`."""
         other = copy(self)
-        other.scene = self.scene.in_field(field, balls)
+        other.scene = self.scene.with_field(field, balls)
         return other
 
     def at(self, state: State) -> Rows:
@@ -117,7 +117,7 @@ class RowBuilder:
     def distances(self, q: Float64, by_surface: Bool = NO_SPHERE) -> Float64:
         """Every row's distance (M,) [m] at q; by_surface as in `State`."""
         centers = self._model.sphere_centers(q)
-        scene = self.scene.by_surfaces(q, self.scene.distances(centers), by_surface)
+        scene = self.scene.raise_by_surfaces(q, self.scene.distances(centers), by_surface)
         return np.concatenate([scene, *(term.distances(centers) for term in self._others)])
 
 

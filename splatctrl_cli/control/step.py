@@ -219,7 +219,7 @@ class QpIkController:
         )
         return View(error=error, state=state, rows=self._builder.at(state))
 
-    def given(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
+    def take_velocity(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
         """An external velocity (J,) [rad/s] as a step; slack is its row violation.
 
         None: the arm stops, with the reason in `status`.
@@ -279,7 +279,7 @@ class QpIkController:
         """True for spheres (M,) with relaxed rows whose links' surfaces are farther away."""
         distance, scene = rows.external.distance, self._builder.scene
         has_given_way = rows.spread(choice.slack)[: len(distance)] > self._config.slack_tolerance
-        return np.asarray(scene.by_surfaces(state.q, distance, has_given_way & ~state.by_surface) > distance)
+        return np.asarray(scene.raise_by_surfaces(state.q, distance, has_given_way & ~state.by_surface) > distance)
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
         """True for rows (M,) whose `later` distance, a period on, breaks their promise.

@@ -54,7 +54,7 @@ class LogSumExpField(ABC):
         self.kernel = self.kernel_type(config.length_scale)
         self.weights = METHODS[config.weights](spheres, self.kernel, config.noise, threads)
         sign = self.weights.sign
-        self.sign = None if sign is None else spheres.laid_out(sign, spare=1.0).astype(np.float32)
+        self.sign = None if sign is None else spheres.lay_out(sign, spare=1.0).astype(np.float32)
         self.tolerance = config.truncation * (1.0 if sign is None else fixed.SIGNED_CARE)
 
     @abstractmethod
@@ -118,8 +118,8 @@ class GpdfField(LogSumExpField):
         return LogSumExp(
             is_matern=True,
             offsets=self.spheres.offsets(self.offsets),
-            exact=self.spheres.laid_out(self.offsets, spare=native.SPARE_OFFSET),
-            radii=self.spheres.laid_out(self.spheres.radii, spare=0.0).astype(np.float32),
+            exact=self.spheres.lay_out(self.offsets, spare=native.SPARE_OFFSET),
+            radii=self.spheres.lay_out(self.spheres.radii, spare=0.0).astype(np.float32),
             sign=self.sign,
             length=self.kernel.length,
             tolerance=self.share,
@@ -183,7 +183,7 @@ class SeField(LogSumExpField):
         return LogSumExp(
             is_matern=False,
             offsets=self.spheres.offsets(self.unit * log_size),
-            exact=self.spheres.laid_out(log_size, spare=native.SPARE_OFFSET),
+            exact=self.spheres.lay_out(log_size, spare=native.SPARE_OFFSET),
             radii=self.radii.values,
             sign=self.sign,
             length=self.kernel.length,

@@ -86,7 +86,7 @@ class PaperProbability:
         terms = replace(
             self._gpdf.terms(),
             offsets=places.offsets(self._offsets),
-            exact=places.laid_out(self._offsets, spare=native.SPARE_OFFSET),
+            exact=places.lay_out(self._offsets, spare=native.SPARE_OFFSET),
             sign=None,
             length=self._half,
             tolerance=self._share,

@@ -267,7 +267,7 @@ class UnknownSpace:
         }
 
 
-def baked_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
+def bake_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
     """Channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
     planes = baker.allocate(last - first)
     if kept is None:
@@ -305,7 +305,7 @@ def bake(
     baker = Baker(
         chosen, layout, config, channels=channels, occupancy=occupancy, thresholds=thresholds, threads=threads
     )
-    planes = baked_planes(baker, 0, layout.shape[0])
+    planes = bake_planes(baker, 0, layout.shape[0])
     header = field_header(splats, chosen, labels, baker, has_occupancy=occupancy is not None)
     if config.unknown != "free":
         unknown = UnknownSpace(layout, config, occupancy, thresholds or OccupancyConfig())

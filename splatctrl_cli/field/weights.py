@@ -248,7 +248,7 @@ def log_row_sums(kernel: Kernel, spheres: Spheres, *, threads: int = 0) -> Float
     sums = native.row_sums(
         spheres.clusters, spheres.is_point, kernel.length, is_matern=isinstance(kernel, Matern12), threads=threads
     )
-    return np.asarray(np.log(spheres.gathered(sums)))
+    return np.asarray(np.log(spheres.gather(sums)))
 
 
 NO_LOG = -1e4  # for a weight of zero: negligible, and finite
@@ -311,4 +311,4 @@ def _lump(log_sums: Float64, noise: float) -> Weights:
 
 
 def _centers(spheres: Spheres) -> Float64:
-    return np.stack([spheres.gathered(axis.astype(np.float64)) for axis in spheres.clusters.centers], axis=1)
+    return np.stack([spheres.gather(axis.astype(np.float64)) for axis in spheres.clusters.centers], axis=1)

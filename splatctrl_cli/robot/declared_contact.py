@@ -51,19 +51,19 @@ class Declarations:
         for index, entry in enumerate(self.carried):
             if entry.link == link and entry.start <= time_s <= entry.end:
                 its = entry.box.contains(points_link)
-                self.used("carried", index, int(its.sum()))
+                self.count_use("carried", index, int(its.sum()))
                 inside |= its
         return inside
 
-    def expects(self, link: str, point_world: Floats, time_s: float) -> DeclaredContact | None:
+    def find_expected(self, link: str, point_world: Floats, time_s: float) -> DeclaredContact | None:
         """First entry for a contact at a point (3,) [m]; counts its use."""
         for index, entry in enumerate(self.expected_contact):
             if link == entry.link and entry.start <= time_s <= entry.end and entry.box.contains(point_world):
-                self.used("expected_contact", index, 1)
+                self.count_use("expected_contact", index, 1)
                 return entry
         return None
 
-    def used(self, table: str, index: int, count: int) -> None:
+    def count_use(self, table: str, index: int, count: int) -> None:
         if count:
             self.num_uses[table, index] = self.num_uses.get((table, index), 0) + count
 

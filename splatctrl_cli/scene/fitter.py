@@ -16,7 +16,7 @@ from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.contradicted import mask_frames, take_in_evidence
 from splatctrl_cli.scene.descent import Descent
-from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface, seen_through
+from splatctrl_cli.scene.keyframes import View, Window, make_view, move_to_surface, seen_through, shrink_radii
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
@@ -395,9 +395,9 @@ class SceneFitter:
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
         slots = slots[robot.distance(self.buffer.centers[slots]) < fixed.ROBOT_REACH]
-        self.buffer.centers[slots] = on_surface(self.buffer.centers[slots], views, config.see_through)
+        self.buffer.centers[slots] = move_to_surface(self.buffer.centers[slots], views, config.see_through)
         error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
-        radii = kept_radii(
+        radii = shrink_radii(
             self.buffer.centers[slots], self.buffer.radii[slots], views, error, least, self.num_threads
         )
         is_hidden = np.isin(slots, hidden_objects(self.buffer, robot, seen, config))

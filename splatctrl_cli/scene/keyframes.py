@@ -81,7 +81,7 @@ def seen_through(
     return points.seen_through(centers, cameras, nearest, tolerance, num_threads)
 
 
-def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
+def move_to_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
     """Move centres (N, 3) [m], world, floating up to `most` [m], onto the measured surface.
 
     A centre floats if all views that see it measure more depth at and around its pixel. It moves to the least of
@@ -100,7 +100,7 @@ def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
     return np.asarray(centers + np.where(is_off, least, np.float32(0.0))[:, None] * towards, np.float32)
 
 
-def kept_radii(
+def shrink_radii(
     centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
 ) -> Float32:
     """Radii (N,) [m] that keep spheres within measured depth, `least` [m] or more.

@@ -15,7 +15,7 @@ from splatctrl_cli.robot.declared_contact import Declarations, DeclaredContact
 from splatctrl_cli.scene import fitter as fitter_module
 from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.keyframes import kept_radii
+from splatctrl_cli.scene.keyframes import shrink_radii
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
@@ -148,7 +148,7 @@ def test_near_the_robot_no_splat_reaches_past_the_surface_that_depth_shows() -> 
     near = objects.select(robot.distance(objects.centers) < ROBOT_REACH)
     assert (near.radii > least).any() and (near.radii == np.float32(least)).sum() > 5
     error = self_mask(view, robot, config).reach - config.self_mask_tolerance
-    assert (kept_radii(near.centers, near.radii, [target.view(view)], error, least) == near.radii).all()
+    assert (shrink_radii(near.centers, near.radii, [target.view(view)], error, least) == near.radii).all()
 
 
 def test_a_splat_of_the_robot_that_depth_shows_to_be_the_floor_is_small_at_once(
