@@ -121,15 +121,13 @@ def audit(
     stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Part of the states gives that part of the audit,
     to the bit.
     """
-    parts: dict[str, list[Clearance]] = {}
-    spheres: dict[str, list[Float64]] = {}
+    parts: dict[str, list[tuple[Clearance, Float64]]] = {}
     self_parts, unknown_parts = [], []
     for first, last in _runs(stamps, distances_at):
         centers = model.sphere_centers_batch(positions[first:last])
         for name, distance_to in distances_at(int(stamps[first])).items():
-            least, each = moving_clearance(model, positions[first:last], distance_to, centers)
-            parts.setdefault(name, []).append(least)
-            spheres.setdefault(name, []).append(each)
+            part = moving_clearance(model, positions[first:last], distance_to, centers)
+            parts.setdefault(name, []).append(part)
         self_parts.append(_self_clearance(model, centers))
         unknown_parts.append(_unknown_share(model, centers, observed))
     limit = np.minimum(model.upper - positions, positions - model.lower)
@@ -137,13 +135,13 @@ def audit(
     return AuditTrace(
         stamp_ns=stamps,
         position=positions,
-        clearance={name: first.joined(*others) for name, (first, *others) in parts.items()},
+        clearance={name: own[0][0].joined(*(least for least, _ in own[1:])) for name, own in parts.items()},
         limit_margin=limit.min(axis=1),
         limit_joint=limit.argmin(axis=1),
         self_clearance=of_self.distance,
         self_pair=of_self.sphere,
         unknown_share=np.concatenate(unknown_parts),
-        of_spheres={name: np.concatenate(several) for name, several in spheres.items()},
+        of_spheres={name: np.concatenate([each for _, each in own]) for name, own in parts.items()},
     )
 
 

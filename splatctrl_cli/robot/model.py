@@ -368,19 +368,18 @@ class RobotModel:
         placement = np.array([self.T_world_base, *(p.homogeneous for p in list(self._model.jointPlacements)[1:])])
         data = self._model.createData()
         pinocchio.computeJointJacobians(self._model, data, self._configuration(self.middle))
-        kind, axis = [REVOLUTE], [np.array([0.0, 0.0, 1.0])]
-        for body in range(1, self.num_joints + 1):
-            local = pinocchio.getJointJacobian(self._model, data, body, pinocchio.ReferenceFrame.LOCAL)
-            column = np.asarray(local).reshape(6, -1)[:, body - 1]
-            linear, angular = column[:3], column[3:]
-            is_turn = bool(np.linalg.norm(angular) > 0.5)
-            kind.append(REVOLUTE if is_turn else PRISMATIC)
-            axis.append(angular if is_turn else linear)
+        local = [
+            np.asarray(pinocchio.getJointJacobian(self._model, data, body, pinocchio.ReferenceFrame.LOCAL))
+            for body in range(1, self.num_joints + 1)
+        ]
+        columns = np.array([J.reshape(6, -1)[:, joint] for joint, J in enumerate(local)])
+        is_turn = np.linalg.norm(columns[:, 3:], axis=1) > 0.5
+        axis = np.where(is_turn[:, None], columns[:, 3:], columns[:, :3])
         return Chain(
             parent=np.array(self._model.parents, dtype=np.int64),
-            kind=np.array(kind, dtype=np.int64),
+            kind=np.append(REVOLUTE, np.where(is_turn, REVOLUTE, PRISMATIC)).astype(np.int64),
             placement=np.ascontiguousarray(placement[:, :3, :]),
-            axis=np.array(axis, dtype=np.float64),
+            axis=np.vstack([[0.0, 0.0, 1.0], axis]),
             sphere_body=self._sphere_joint,
             offset=np.ascontiguousarray(self._sphere_offset).reshape(-1, 3),
         )

@@ -4,7 +4,7 @@ Projective signed distances (Curless and Levoy, A volumetric method for building
 1996). L links, V views, K configurations of a link, N cells, F triangles.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,12 +85,14 @@ def learn(
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
     placed = _move(T_world_link, corners)
-    views = _views(
-        surface,
-        frames,
-        T_world_link,
-        np.stack([placed.min(axis=2), placed.max(axis=2)], axis=2),
-        max(reach, MOST_REACH),
+    views = list(
+        _views(
+            surface,
+            frames,
+            T_world_link,
+            np.stack([placed.min(axis=2), placed.max(axis=2)], axis=2),
+            max(reach, MOST_REACH),
+        )
     )
     learned: list[LearnedLink] = []
     unknown = {}
@@ -133,12 +135,12 @@ class _View:
 
 def _views(
     surface: RobotSurface, frames: Sequence[RgbdFrame], T_world_link: Float64, boxes: Float64, reach: float
-) -> list[_View]:
-    """Compare frames with the rendered robot, which explains pixels within the recording's noise.
+) -> Iterator[_View]:
+    """Yield frames, compared with the rendered robot, which explains pixels within the recording's noise.
 
     Unexplained points within `reach` of the boxes (V, L, 2, 3) stay.
     """
-    thinned, ratios, views = [], [np.zeros(1)], []
+    thinned, ratios = [], [np.zeros(1)]
     for frame, T in zip(frames, T_world_link, strict=True):
         stride = max(1, round(frame.depth.shape[1] / WIDE))
         lens, depth = strided_lens(frame.intrinsics, stride), np.ascontiguousarray(frame.depth[::stride, ::stride])
@@ -158,12 +160,10 @@ def _views(
         points = points[is_near]
         is_own = surface.distance(T, points, within=tolerance[v, u]) <= tolerance[v, u]
         links[v[is_own], u[is_own]] = EXPLAINED
-        view = _View(
+        yield _View(
             stamp_ns=frame.stamp_ns, stride=stride, lens=frame.intrinsics, links=links, points_world=points[~is_own],
             T_camera_world=invert_transform(frame.T_world_camera), T_world_link=T, depth=frame.depth,
         )  # fmt: skip
-        views.append(view)
-    return views
 
 
 def _grow_link(
@@ -215,24 +215,25 @@ def _learn_link(
             place = cells[is_part][heights.argmax()]
             known = np.argmax(np.cumsum(seen[:, is_part], axis=0) >= NUM_CONFIGURATIONS, axis=0)
             since = 1e-9 * float(np.median(stamps[run][known]) - stamps.min())
-        part = LearnedLink(
-            link=surface.links[number],
-            origin=origin,
-            voxel=VOXEL,
-            distance=np.where(spread_cells(mask, (seen | free).sum(axis=0), 0) > 0, grid, np.float32(np.nan)),
-            configurations=spread_cells(mask, seen.sum(axis=0), 0).astype(np.uint8),
-            triangles=_triangles(grid, origin),
-            outside_95=float(np.quantile(heights, 0.95)),
-            outside_most=float(heights.max()),
-            place=place,
-            since=since,
-            num_pixels=int(num_own.sum()) + sum(map(len, points)),
-            num_configurations=len(in_order),
-            start_ns=interval.start_ns,
-            end_ns=interval.end_ns,
-            first_ns=int(stamps.min()),
+        found.append(
+            LearnedLink(
+                link=surface.links[number],
+                origin=origin,
+                voxel=VOXEL,
+                distance=np.where(spread_cells(mask, (seen | free).sum(axis=0), 0) > 0, grid, np.float32(np.nan)),
+                configurations=spread_cells(mask, seen.sum(axis=0), 0).astype(np.uint8),
+                triangles=_triangles(grid, origin),
+                outside_95=float(np.quantile(heights, 0.95)),
+                outside_most=float(heights.max()),
+                place=place,
+                since=since,
+                num_pixels=int(num_own.sum()) + sum(map(len, points)),
+                num_configurations=len(in_order),
+                start_ns=interval.start_ns,
+                end_ns=interval.end_ns,
+                first_ns=int(stamps.min()),
+            )
         )
-        found.append(part)
     return found
 
 

@@ -209,12 +209,18 @@ def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) ->
 
     They keep `margin` [m], or a share of their largest gap if that is less.
     """
-    standing = fixtures(model)
-    postures, found = random_postures(model, SELF_TOUCHING, seed=0), []
-    for pair in (pair for pair in surfaces.pairs if not standing.isdisjoint(pair)):
-        apart = min(margin, SELF_SHARE * max(surfaces.gap(q, pair) for q in postures))
-        found.append(KeptMargin(links=pair, margin=None, apart=apart, surface_gap=None, is_fixture=True))
-    return tuple(found)
+    standing, postures = fixtures(model), random_postures(model, SELF_TOUCHING, seed=0)
+    return tuple(
+        KeptMargin(
+            links=pair,
+            margin=None,
+            apart=min(margin, SELF_SHARE * max(surfaces.gap(q, pair) for q in postures)),
+            surface_gap=None,
+            is_fixture=True,
+        )
+        for pair in surfaces.pairs
+        if not standing.isdisjoint(pair)
+    )
 
 
 def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None) -> tuple[KeptMargin, ...]:

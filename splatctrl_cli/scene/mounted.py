@@ -15,12 +15,10 @@ from splatctrl_cli.records import Bool, Float64, RgbdFrame
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     """The first frames, at most `MOUNTED_MAX_VIEWS`, over `MOUNTED_APART` [m] apart."""
     chosen: list[RgbdFrame] = []
-    places: list[Float64] = []
     for frame in frames:
-        place = frame.T_world_camera[:3, 3]
-        if all(np.linalg.norm(place - other) > fixed.MOUNTED_APART for other in places):
+        away = [np.linalg.norm(frame.T_world_camera[:3, 3] - other.T_world_camera[:3, 3]) for other in chosen]
+        if min(away, default=np.inf) > fixed.MOUNTED_APART:
             chosen.append(frame)
-            places.append(place)
     return chosen[: fixed.MOUNTED_MAX_VIEWS]
 
 
@@ -47,11 +45,9 @@ def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tu
 
     Surroundings lose depth in whole areas; a hole has depth around it.
     """
-    parts = []
-    for frame, mask in zip(frames, counted, strict=True):
-        near_depth = uniform_filter((frame.depth > 0).astype(np.float32), fixed.MOUNTED_WINDOW) > 1e-4
-        parts.append(frame.color[mask & ~near_depth])
-    colors = np.concatenate(parts)
+    depth_near = [uniform_filter((f.depth > 0).astype(np.float32), fixed.MOUNTED_WINDOW) > 1e-4 for f in frames]
+    away = [mask & ~is_near for mask, is_near in zip(counted, depth_near, strict=True)]
+    colors = np.concatenate([frame.color[mask] for frame, mask in zip(frames, away, strict=True)])
     if len(colors) < fixed.MOUNTED_BACKGROUND * sum(frame.depth.size for frame in frames):
         return (0.0, 0.0, 0.0)
     red, green, blue = (float(value) / 255.0 for value in np.median(colors, axis=0))

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -120,16 +121,12 @@ def cube_levels(
 
 def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
     """Masks (K,) per level of standing cubes: one splits while its detail exceeds `tolerance`."""
-    masks = []
-    is_reached = np.ones(len(levels[0].points), bool)
-    for level, below in zip(levels, [*levels[1:], None], strict=True):
-        if below is None:
-            masks.append(is_reached)
-            break
+    masks, is_reached = [], np.ones(len(levels[0].points), bool)
+    for level, below in pairwise(levels):
         is_split = is_reached & (level.detail > tolerance)
         masks.append(is_reached & ~is_split)
         is_reached = is_split[below.parent]
-    return masks
+    return [*masks, is_reached]
 
 
 def tolerance_for(levels: Sequence[CubeLevel], count: int) -> float:

@@ -132,8 +132,9 @@ class DeviceFit:
         row["camera"] = camera_row(camera)
         row["per"] = 1.0 / num_values, 1.0 / num_depths if num_depths else 0.0
         row["images"] = images
-        view = _DeviceView(target=target, row=row, num_values=num_values, num_depths=float(max(num_depths, 1)))
-        self.views.append(view)
+        self.views.append(
+            _DeviceView(target=target, row=row, num_values=num_values, num_depths=float(max(num_depths, 1)))
+        )
         return len(self.views) - 1
 
     def number_of(self, camera: Float64, target: TargetView) -> int:
