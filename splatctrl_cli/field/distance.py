@@ -12,7 +12,7 @@ from splatctrl_cli.config import FieldConfig, fixed
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.grid_cells import RESOLUTION
-from splatctrl_cli.field.weights import METHODS, Kernel, Matern12, SquaredExponential, share_of_loss
+from splatctrl_cli.field.weights import METHODS, Kernel, share_of_loss
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField
 from splatctrl_cli.kernels.cuda.memory import Memory
@@ -47,11 +47,11 @@ class SphereField:
 class LogSumExpField(ABC):
     """A log-sum-exp over splats, of a kernel and weights."""
 
-    kernel_type: ClassVar[type[Kernel]]
+    is_matern: ClassVar[bool]
 
     def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
         self.spheres, self._threads = spheres, threads
-        self.kernel = self.kernel_type(config.length_scale)
+        self.kernel = Kernel(length=config.length_scale, is_matern=self.is_matern)
         self.weights = METHODS[config.weights](spheres, self.kernel, config.noise, threads)
         sign = self.weights.sign
         self.sign = None if sign is None else spheres.lay_out(sign, spare=1.0).astype(np.float32)
@@ -87,7 +87,7 @@ class GpdfField(LogSumExpField):
     sign (cg) give no positive sum.
     """
 
-    kernel_type = Matern12
+    is_matern = True
 
     def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
         super().__init__(spheres, config, threads=threads)
@@ -134,7 +134,7 @@ class SeField(LogSumExpField):
     surface.
     """
 
-    kernel_type = SquaredExponential
+    is_matern = False
 
     def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
         super().__init__(spheres, config, threads=threads)

@@ -212,30 +212,21 @@ def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: 
     return csr_array(upper + upper.T + (1.0 + noise) * eye_array(len(centers), format="csr"))
 
 
-@dataclass(frozen=True)
-class Matern12:
-    """``k(d) = exp(-d / l)``, the paper's kernel: its inverse is ``r(o) = -l log o``."""
+@dataclass(frozen=True, kw_only=True)
+class Kernel:
+    """A stationary kernel of the paper, of length scale l [m], with k(0) = 1.
+
+    Matern 1/2: ``k(d) = exp(-d / l)``, its inverse is ``r(o) = -l log o``. Else Gaussian: ``k(d) = exp(-d^2 / (2
+    l^2))``, ``r(o) = sqrt(-2 l^2 log o)``.
+    """
 
     length: float
+    is_matern: bool
 
     def value(self, distance: Float64) -> Float64:
         """k(d) for distances of any shape [m]."""
-        return np.asarray(np.exp(-distance / self.length))
-
-
-@dataclass(frozen=True)
-class SquaredExponential:
-    """``k(d) = exp(-d^2 / (2 l^2))``, the paper's Gaussian kernel; inverse: ``r(o) = sqrt(-2 l^2 log o)``."""
-
-    length: float
-
-    def value(self, distance: Float64) -> Float64:
-        """k(d) for distances of any shape [m]."""
-        return np.asarray(np.exp(-0.5 * (distance / self.length) ** 2))
-
-
-Kernel = Matern12 | SquaredExponential
-"""A stationary kernel k(d) of length scale l [m] with k(0) = 1."""
+        scaled = distance / self.length
+        return np.asarray(np.exp(-scaled if self.is_matern else -0.5 * scaled**2))
 
 
 def share_of_loss(length: float, tolerance: float) -> float:
@@ -246,7 +237,7 @@ def share_of_loss(length: float, tolerance: float) -> float:
 def log_row_sums(kernel: Kernel, spheres: Spheres, *, threads: int = 0) -> Float64:
     """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
     sums = native.row_sums(
-        spheres.clusters, spheres.is_point, kernel.length, is_matern=isinstance(kernel, Matern12), threads=threads
+        spheres.clusters, spheres.is_point, kernel.length, is_matern=kernel.is_matern, threads=threads
     )
     return np.asarray(np.log(spheres.gather(sums)))
 
@@ -287,7 +278,7 @@ def process_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
     Matern: y is ``k_d(-r)``, ``w_i = M_i / k_d(-r_i)``. Gaussian: y is 1, ``w = M``: ``k_d(-r) = k_d(r)`` loses the
     radius's sign.
     """
-    log_values = spheres.radii / kernel.length if isinstance(kernel, Matern12) else np.zeros(len(spheres.radii))
+    log_values = spheres.radii / kernel.length if kernel.is_matern else np.zeros(len(spheres.radii))
     scaled, log_scale, num_iterations, residual = solve_process(
         _centers(spheres), log_values, kernel.length, kernel.value, noise
     )
