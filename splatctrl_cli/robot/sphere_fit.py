@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 from splatctrl_cli.config.fixed import DEFICIT_GAP, FIT_BISECTIONS, FIT_MIN_PATCH, FIT_ROUNDS, FIT_STEPS, FIT_TIE
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Bool, Float64, Index, SphereSet
-from splatctrl_cli.robot.coverage import areas, largest_deficit, refined
+from splatctrl_cli.robot.coverage import areas, largest_deficit, refine_triangles
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 
 DIGITS = 6  # decimals of a written sphere: micrometres
@@ -118,7 +118,7 @@ class _Link:
         if not area > 0:
             raise InputError(f"link '{name}': expected a collision surface, got none of any area")
         longest = max(FIT_MIN_PATCH, 2 * float(np.sqrt(area / options.num_patches)))
-        cut = [refined(part.surface.corners, longest)[0] for part in parts]
+        cut = [refine_triangles(part.surface.corners, longest) for part in parts]
         self._slack = np.concatenate([np.full(len(t), p.slack) for t, p in zip(cut, parts, strict=True)])
         patches = np.concatenate(cut)
         self._vertices, faces = np.unique(patches.reshape(-1, 3), axis=0, return_inverse=True)
