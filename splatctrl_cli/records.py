@@ -184,7 +184,7 @@ class RecordSource(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Arrays with one row per item (N), the first field among them, and numbers that hold for all items."""
+    """Arrays with one row per item (N), the first field too; numbers hold for all items."""
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))

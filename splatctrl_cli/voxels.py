@@ -14,9 +14,9 @@ SOLID = 0b1000  # entity bit, with a known robot: an object's pixel hit the voxe
 
 
 def voxels_at(points: Floats, origin: Float64, voxel: float, shape: tuple[int, ...]) -> tuple[Index, Bool]:
-    """Voxels (Q, 3) at points (Q, 3) [m], 0 outside, and True (Q,) inside a grid (X, Y, Z).
+    """Voxels (Q, 3) at points (Q, 3) [m], 0 outside; True (Q,) inside the grid.
 
-    Voxel (0, 0, 0) is centred at `origin` (3,) [m]; edges are `voxel` [m] long.
+    Voxel (0, 0, 0) of the grid of `shape` (X, Y, Z) is centred at `origin` (3,) [m]; edges are `voxel` [m] long.
     """
     cells = np.floor((points - origin) / voxel + 0.5)
     is_inside = np.all((cells >= 0) & (cells < shape), axis=1)

@@ -17,9 +17,10 @@ REMEDY = "see splatctrl help declare for the keys of a declaration"
 
 @dataclass(frozen=True, kw_only=True)
 class DeclaredContact:
-    """A box [m] at `link` from `start` to `end` [s after the first state]: carried, in the link's frame, or touched.
+    """A carried box or an intended contact of `link`, `start` to `end` [s after the first state].
 
-    An intended contact lies within its box in world, for a `reason`. is_learned: from an observed grasp, not a file.
+    box [m]: of what is carried, in the link's frame; or in world, around the contact, which has a `reason`.
+    is_learned: from an observed grasp, not a file.
     """
 
     link: str

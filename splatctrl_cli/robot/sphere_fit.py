@@ -242,9 +242,9 @@ class _Link:
 def _recentre(
     centers: Float64, owner: Index, places: Sequence[Float64] | Float64, costs: Sequence[Float64] | Float64
 ) -> Float64:
-    """Centres (n, 3), each at that of its places (K, 3) with the least cost for the patches that it owns.
+    """Centres (n, 3), each moved to its best place for the patches that it owns.
 
-    places, costs (K, patches): by centre.
+    places (K, 3), costs (K, patches): by centre.
     """
     moved = centers.copy()
     for ball in np.unique(owner):

@@ -141,7 +141,7 @@ def take_in_evidence(
     robot: RobotPosture | None,
     each: Each,
 ) -> None:
-    """Add a time step's depth to the occupancy, reasons of unseen voxels, lost edges, and the robot."""
+    """Add a step's depth, reasons of unseen voxels, lost edges and robot to the occupancy."""
     config = occupancy.config
     proving = [
         found.unproven(drop_pixels(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)

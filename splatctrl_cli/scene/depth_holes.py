@@ -61,9 +61,9 @@ def _wide(pixels: Bool, width: float) -> Bool:
 
 
 def points_on_rays(frame: RgbdFrame, v: Index, u: Index, end: Float32, config: OccupancyConfig) -> Iterator[Float64]:
-    """Yield points (K, 3) [m], world, half a voxel apart on rays from `min_range` to `end` (N,) [m].
+    """Yield points (K, 3) [m], world, half a voxel apart on rays up to `end` (N,) [m].
 
-    v, u (N,): the rays' pixels.
+    Rays begin at `min_range`; v, u (N,): their pixels.
     """
     depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
     rays = back_project_pixels(frame.intrinsics, u, v, np.ones(len(u)))

@@ -29,7 +29,10 @@ NO_SEEDS = Seeds(
 
 
 def world_points(frame: RgbdFrame, mask: Bool | None = None, num_threads: int = 1) -> Float64:
-    """Back-projected points [m], world: (K, 3) of a mask (H, W), else (H, W, 3), meaningless where depth is 0."""
+    """Back-projected points [m], world: (K, 3) of a mask (H, W), else (H, W, 3).
+
+    The latter are meaningless where depth is 0.
+    """
     k = frame.intrinsics
     camera = pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
     points = back_projected(camera, frame.depth, mask, num_threads)
