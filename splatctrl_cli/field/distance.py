@@ -310,11 +310,10 @@ def device_field(
 ) -> DeviceField:
     """Put the exact distance and `kernels` on a device, for ``config.distance``."""
     chosen = KERNEL_OF[config.distance]
-    choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
     return DeviceField(
         device,
         spheres.clusters,
         spheres.offsets(spheres.radii),
         {name: field.terms() for name, field in kernels.items()},
-        choice,
+        Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION),
     )

@@ -60,8 +60,7 @@ class RobotModel:
         self.sphere_set = spheres
         self.left_out = tuple(left_out)
         self.are_links_renamed = are_links_renamed
-        covered = set(spheres.links)
-        self.bare_links = tuple(link for link in urdf.solid_links if link not in covered)
+        self.bare_links = tuple(link for link in urdf.solid_links if link not in spheres.links)
         self.coverage: CoverageReport | None = None
         self.coverage_unknown = "the collision geometry was not read"
         self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)

@@ -54,9 +54,8 @@ def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> S
         fitted = [link.within(options.max_protrusion) for link in links]
     else:
         fitted = _share_out(links, options.max_spheres or 0)
-    owners = [link.name for link, (centers, _) in zip(links, fitted, strict=True) for _ in centers]
     return SphereSet(
-        links=tuple(owners),
+        links=tuple(link.name for link, (centers, _) in zip(links, fitted, strict=True) for _ in centers),
         centers=np.concatenate([centers for centers, _ in fitted]),
         radii=np.concatenate([radii for _, radii in fitted]),
     )

@@ -139,8 +139,7 @@ class DeviceFit:
 
     def number_of(self, camera: Float64, target: TargetView) -> int:
         """Number of a view, added if its target is new."""
-        known = (k for k, view in enumerate(self.views) if view.target is target)
-        number = next(known, None)
+        number = next((k for k, view in enumerate(self.views) if view.target is target), None)
         return self.add_view(camera, target) if number is None else number
 
     def keep(self, targets: Sequence[TargetView]) -> None:
