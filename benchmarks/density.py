@@ -9,13 +9,16 @@ from benchmarks.measure import Options, Result, rms, seconds
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField
-from splatctrl_cli.field.weights import Matern12, SquaredExponential, log_row_sums, voxel_row_sums
+from splatctrl_cli.field.weights import Kernel, log_row_sums, voxel_row_sums
 from splatctrl_cli.records import Float64
 
 SIZES = (5_000, 50_000, 500_000)
 NUM_QUICK = 2  # sizes of a quick run: the third takes minutes
 LENGTH = FieldConfig.length_scale
-KINDS = {"Matern": (Matern12(LENGTH), GpdfField), "Gaussian": (SquaredExponential(LENGTH), SeField)}
+KINDS = {
+    "Matern": (Kernel(length=LENGTH, is_matern=True), GpdfField),
+    "Gaussian": (Kernel(length=LENGTH, is_matern=False), SeField),
+}
 
 
 def run(options: Options) -> Result:

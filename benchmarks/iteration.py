@@ -97,7 +97,7 @@ def run(options: Options) -> Result:
     for (key, threads), case in cases.items():
         stages = {stage: statistics.median(row[stage] for row in times[key, threads]) for stage in STAGES}
         total = statistics.median(sum(row.values()) for row in times[key, threads])
-        opacity, per_tile = float(case.planes[4].mean()), case.raster.splats_per_tile()
+        opacity, per_tile = float(case.planes[4].mean()), float(case.raster.native.splats_per_tile())
         name = f"{key}_threads_{threads}"
         figures |= {f"{name}_{stage}_ms": 1e3 * value for stage, value in stages.items()}
         figures |= {f"{name}_ms": 1e3 * total, f"{name}_per_s": 1 / total, f"{key}_opacity": opacity}

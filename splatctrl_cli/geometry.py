@@ -4,9 +4,9 @@ T_world_camera maps camera to world. Quaternions are (x, y, z, w), positions (3,
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from splatctrl_cli.records import Float64, Intrinsics
+from splatctrl_cli.records import Float64, Floats, Index, Intrinsics
 
 
 def invert_transform(T: Float64) -> Float64:
@@ -17,7 +17,7 @@ def invert_transform(T: Float64) -> Float64:
     return inverse
 
 
-def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
+def transform_points(T: Float64, points: Floats) -> Float64:
     """Points (..., 3) moved by T."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3], dtype=np.float64)
 
@@ -127,7 +127,7 @@ def strided_lens(lens: Intrinsics, stride: int) -> Intrinsics:
     return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
 
-def project(intrinsics: Intrinsics, points_camera: NDArray[np.floating]) -> Float64:
+def project(intrinsics: Intrinsics, points_camera: Floats) -> Float64:
     """Pixels (..., 2) of camera-frame points (..., 3) with z > 0."""
     z = points_camera[..., 2]
     u = intrinsics.fx * points_camera[..., 0] / z + intrinsics.cx
@@ -135,15 +135,13 @@ def project(intrinsics: Intrinsics, points_camera: NDArray[np.floating]) -> Floa
     return np.stack([u, v], axis=-1).astype(np.float64)
 
 
-def back_project(intrinsics: Intrinsics, depth: NDArray[np.floating]) -> Float64:
+def back_project(intrinsics: Intrinsics, depth: Floats) -> Float64:
     """Camera-frame points (H, W, 3) of depth (H, W) [m]."""
     v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
     return back_project_pixels(intrinsics, u, v, depth)
 
 
-def back_project_pixels(
-    intrinsics: Intrinsics, u: NDArray[np.intp], v: NDArray[np.intp], depth: NDArray[np.floating]
-) -> Float64:
+def back_project_pixels(intrinsics: Intrinsics, u: Index, v: Index, depth: Floats) -> Float64:
     """Camera-frame points (..., 3) of pixels; u, v broadcast to depth (...) [m]."""
     x = (u - intrinsics.cx) / intrinsics.fx * depth
     y = (v - intrinsics.cy) / intrinsics.fy * depth

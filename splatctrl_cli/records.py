@@ -4,7 +4,7 @@ N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixels.
 """
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from operator import attrgetter
@@ -19,6 +19,7 @@ from splatctrl_cli.errors import UsageError
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
+UInt16 = NDArray[np.uint16]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.int64]
 Floats = NDArray[np.floating]
@@ -31,21 +32,15 @@ SECOND_NS = 1_000_000_000
 MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m], and [1/m]
 
 
-class FloatRows(Protocol):
+class FloatRows(Sized, Iterable[Any], Protocol):
     """Rows (T, ...) of float64 by number, slice or index (K,), in memory or a file."""
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(T, ...)."""
 
-    def __len__(self) -> int:
-        """T."""
-
     def __getitem__(self, which: Any, /) -> Any:
         """A row, or rows of a slice or an index."""
-
-    def __iter__(self) -> Iterator[Any]:
-        """Yield the rows."""
 
 
 class Label(IntEnum):
@@ -88,6 +83,11 @@ class RgbdFrame:
     T_world_camera: Float64
     human: UInt8 | None = None
     valid: Bool | None = None
+
+    @property
+    def in_view(self) -> Bool:
+        """`valid` (H, W), True everywhere if None."""
+        return np.ones(self.depth.shape, bool) if self.valid is None else self.valid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,20 +184,22 @@ class RecordSource(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Arrays with one row per item (N)."""
+    """Arrays with one row per item (N), the first field too; numbers hold for all items."""
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
     def joined(self, *others: Self) -> Self:
-        """Return these items, then the others'."""
-        names = [column.name for column in fields(self)]
-        parts = {name: [getattr(one, name) for one in (self, *others)] for name in names}
-        return replace(self, **{name: np.concatenate(arrays) for name, arrays in parts.items()})
+        """Return these items, then the others', with these numbers."""
+        names = self._names()
+        return replace(self, **{n: np.concatenate([getattr(one, n) for one in (self, *others)]) for n in names})
 
-    def select(self, which: Bool | NDArray[np.integer]) -> Self:
-        """Items of a mask (N,) or an index (K,)."""
-        return replace(self, **{column.name: getattr(self, column.name)[which] for column in fields(self)})
+    def select(self, which: Bool | NDArray[np.integer] | slice) -> Self:
+        """Items of a mask (N,), an index (K,) or a slice."""
+        return replace(self, **{name: getattr(self, name)[which] for name in self._names()})
+
+    def _names(self) -> list[str]:
+        return [column.name for column in fields(self) if np.ndim(getattr(self, column.name))]
 
 
 @dataclass(frozen=True, kw_only=True)

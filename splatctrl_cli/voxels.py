@@ -1,18 +1,26 @@
 """Voxels: state of space, age of evidence, and occupied voxels without a splat."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.records import Bool, Float32, Float64, UInt8
+from splatctrl_cli.records import Bool, Columns, Float32, Float64, Floats, Index, UInt8, UInt16
 
 MOST_VOXELS = 400_000_000  # of a grid
 FIRST_REASON = 0xF0  # in one byte (0xFFF0 in two): from here on `last_seen` is the reason of a never-seen voxel
 SWEPT = 0b100  # entity bit of a voxel that the robot occupied at some time
 SOLID = 0b1000  # entity bit, with a known robot: an object's pixel hit the voxel after its last free view
+
+
+def voxels_at(points: Floats, origin: Float64, voxel: float, shape: tuple[int, ...]) -> tuple[Index, Bool]:
+    """Voxels (Q, 3) at points (Q, 3) [m], 0 outside; True (Q,) inside the grid.
+
+    Voxel (0, 0, 0) of the grid of `shape` (X, Y, Z) is centred at `origin` (3,) [m]; edges are `voxel` [m] long.
+    """
+    cells = np.floor((points - origin) / voxel + 0.5)
+    is_inside = np.all((cells >= 0) & (cells < shape), axis=1)
+    return np.where(is_inside[:, None], cells, 0).astype(np.int64), is_inside
 
 
 class VoxelState(IntEnum):
@@ -68,7 +76,7 @@ class OccupancyGrid:
     origin: Float64
     voxel: float
     log_odds: Float32
-    num_updates: NDArray[np.uint16]
+    num_updates: UInt16
     entity: UInt8
 
     def states(self, free_below: float, occupied_above: float) -> UInt8:
@@ -102,7 +110,7 @@ class OccupancyGrid:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Balls:
+class Balls(Columns):
     """Equal balls for voxels: centers (K, 3) float32 [m], world; labels (K,) uint8 (`Label`).
 
     radius [m]: half a voxel's diagonal, to contain the voxel.
@@ -112,17 +120,10 @@ class Balls:
     radius: float
     labels: UInt8
 
-    def __len__(self) -> int:
-        return len(self.labels)
-
     @classmethod
     def of_voxels(cls, centers: Float32, voxel: float, labels: UInt8) -> "Balls":
         """Balls around voxels of edge `voxel` [m] at centers (K, 3)."""
         return cls(centers=centers, radius=0.5 * 3**0.5 * voxel, labels=labels)
-
-    def select(self, which: Bool) -> "Balls":
-        """Balls of a mask (K,)."""
-        return Balls(centers=self.centers[which], radius=self.radius, labels=self.labels[which])
 
     @property
     def volume(self) -> float:
@@ -131,7 +132,7 @@ class Balls:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LostEdges:
+class LostEdges(Columns):
     """Balls in which surfaces may extend into pixels without depth.
 
     centers (K, 3) [m], world, radii (K,) [m], float32.
@@ -140,20 +141,8 @@ class LostEdges:
     centers: Float32
     radii: Float32
 
-    @classmethod
-    def joined(cls, parts: Sequence["LostEdges"]) -> "LostEdges":
-        """All balls of the parts, perhaps none."""
-        return cls(
-            centers=np.concatenate([np.zeros((0, 3), np.float32), *(part.centers for part in parts)]),
-            radii=np.concatenate([np.zeros(0, np.float32), *(part.radii for part in parts)]),
-        )
 
-    def select(self, which: Bool) -> "LostEdges":
-        """Balls of a mask (K,)."""
-        return LostEdges(centers=self.centers[which], radii=self.radii[which])
-
-
-NO_EDGES = LostEdges.joined([])
+NO_EDGES = LostEdges(centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,20 +156,18 @@ class SeenVoxels:
 
     origin: Float64
     voxel: float
-    last_seen: NDArray[np.uint8] | NDArray[np.uint16]
-    step_stamps_ns: NDArray[np.int64]
+    last_seen: UInt8 | UInt16
+    step_stamps_ns: Index
     edges: LostEdges = NO_EDGES
     is_free: Bool | None = None
 
-    def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
+    def look(self, points: Floats) -> tuple[Index, UInt8]:
         """Stamps (Q,) [ns] of the last views, -1 for never, and `EvidenceClass` (Q,).
 
         points (Q, 3) [m], world. The class is `FREE` for every voxel ever seen.
         """
-        cell = np.floor((points - self.origin) / self.voxel + 0.5)
-        is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
-        i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
-        step = np.where(is_inside, self.last_seen[i, j, k], 0).astype(np.int64)
+        cells, is_inside = voxels_at(points, self.origin, self.voxel, self.last_seen.shape)
+        step = np.where(is_inside, self.last_seen[tuple(cells.T)], 0).astype(np.int64)
         first = int(np.iinfo(self.last_seen.dtype).max) & ~0xF
         reason = np.where(step >= first, step - first + 1, 0)
         step[reason > 0] = 0
@@ -189,15 +176,8 @@ class SeenVoxels:
         return np.concatenate([[-1], self.step_stamps_ns])[step], classes
 
 
-def _classes() -> UInt8:
-    """`EvidenceClass` by 1 + the lower four bits of `Unseen`; 0: no reason."""
-    classes = np.full(17, np.uint8(EvidenceClass.OUT_OF_VIEW))
-    for reason in Unseen:
-        classes[1 + (reason & 0xF)] = EvidenceClass[reason.name]
-    return classes
-
-
-_CLASS_OF = _classes()
+_CLASS_OF = np.full(17, np.uint8(EvidenceClass.OUT_OF_VIEW))  # by 1 + the lower four bits of `Unseen`; 0: no reason
+_CLASS_OF[[1 + (reason & 0xF) for reason in Unseen]] = [EvidenceClass[reason.name] for reason in Unseen]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,8 +188,8 @@ class KnownVoxels:
     """
 
     grid: OccupancyGrid
-    last_seen: NDArray[np.uint16]
-    step_stamps_ns: NDArray[np.int64]
+    last_seen: UInt16
+    step_stamps_ns: Index
     unrepresented: Balls
     edges: LostEdges = NO_EDGES
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import HALVED_DOWN_TO, MAX_HALVINGS
 from splatctrl_cli.kernels.chain import pair_gaps
-from splatctrl_cli.records import Bool, Float64, Floats, Index, Integers, Stamps, UInt8
+from splatctrl_cli.records import Bool, Columns, Float64, Floats, Index, Integers, Stamps, UInt8
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.voxels import voxels_at
 
 DistanceFunction = Callable[[Float64], Float64]
 """points (Q, 3) [m], world -> distance (Q,) [m], NaN where there is none."""
@@ -40,7 +41,7 @@ CHUNK = 256  # states per query
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clearance:
+class Clearance(Columns):
     """distance (T,) [m] of the nearest moving part, NaN if unknown; sphere (T,): its index.
 
     For self-collision: of the nearest pair, and its index, -1 without pairs.
@@ -120,38 +121,34 @@ def audit(
     stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Part of the states gives that part of the audit,
     to the bit.
     """
-    parts: dict[str, list[Clearance]] = {}
-    spheres: dict[str, list[Float64]] = {}
+    parts: dict[str, list[tuple[Clearance, Float64]]] = {}
     self_parts, unknown_parts = [], []
     for first, last in _runs(stamps, distances_at):
         centers = model.sphere_centers_batch(positions[first:last])
         for name, distance_to in distances_at(int(stamps[first])).items():
-            least, each = moving_clearance(model, positions[first:last], distance_to, centers)
-            parts.setdefault(name, []).append(least)
-            spheres.setdefault(name, []).append(each)
+            part = moving_clearance(model, positions[first:last], distance_to, centers)
+            parts.setdefault(name, []).append(part)
         self_parts.append(_self_clearance(model, centers))
         unknown_parts.append(_unknown_share(model, centers, observed))
     limit = np.minimum(model.upper - positions, positions - model.lower)
+    of_self = self_parts[0].joined(*self_parts[1:])
     return AuditTrace(
         stamp_ns=stamps,
         position=positions,
-        clearance={name: _joined(several) for name, several in parts.items()},
+        clearance={name: own[0][0].joined(*(least for least, _ in own[1:])) for name, own in parts.items()},
         limit_margin=limit.min(axis=1),
         limit_joint=limit.argmin(axis=1),
-        self_clearance=_joined(self_parts).distance,
-        self_pair=_joined(self_parts).sphere,
+        self_clearance=of_self.distance,
+        self_pair=of_self.sphere,
         unknown_share=np.concatenate(unknown_parts),
-        of_spheres={name: np.concatenate(several) for name, several in spheres.items()},
+        of_spheres={name: np.concatenate([each for _, each in own]) for name, own in parts.items()},
     )
 
 
 def observed_at(seen: UInt8, origin: Float64, voxel: float, points: Float64) -> UInt8:
     """Value (Q,) of the voxel of `seen` (X, Y, Z) at each point; 0 (never seen) outside."""
-    cell = np.floor((points - origin) / voxel + 0.5).astype(np.int64)
-    is_inside = np.all((cell >= 0) & (cell < seen.shape), axis=1)
-    found = np.zeros(len(points), dtype=np.uint8)
-    found[is_inside] = seen[tuple(cell[is_inside].T)]
-    return found
+    cells, is_inside = voxels_at(points, origin, voxel, seen.shape)
+    return np.where(is_inside, seen[tuple(cells.T)], np.uint8(0))
 
 
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
@@ -181,12 +178,6 @@ def _unknown_share(model: RobotModel, centers: Float64, observed: Observed | Non
     moving = centers[:, np.flatnonzero(model.moving_spheres)]
     never = observed(np.ascontiguousarray(moving.reshape(-1, 3))) == 0
     return np.asarray(never.reshape(moving.shape[:2]).mean(axis=1))
-
-
-def _joined(several: list[Clearance]) -> Clearance:
-    return Clearance(
-        distance=np.concatenate([c.distance for c in several]), sphere=np.concatenate([c.sphere for c in several])
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,9 +231,9 @@ def between_states(
 ) -> Between:
     """Bounds between states (T, J) at stamps (T,) [ns] in one scene.
 
-    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm is
-    assumed to move straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may go
-    anywhere within its velocity limits: bounded only where that stays above the margin [m].
+    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm
+    moves straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may go anywhere
+    within its velocity limits: bounded only where that stays above the margin [m].
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))

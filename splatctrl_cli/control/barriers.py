@@ -40,13 +40,13 @@ class SceneRows(BarrierTerm):
         self.names = tuple(names[s] for s in self._moving)
         self._links = np.array(model.sphere_set.links)[self._moving]
 
-    def in_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
+    def with_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
         """Rows in another field, of `balls` (None: links' surfaces do not count)."""
         other = copy(self)
         other._field, other._balls = field, balls
         return other
 
-    def by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
+    def raise_by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
         """Distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
 
         Where that gap is larger, rows G (M, J) become its rows, in place.
@@ -66,9 +66,9 @@ class SceneRows(BarrierTerm):
     def rows(self, state: State) -> Barrier:
         """Rows, by one query of distance and gradient."""
         centers, jacobians = state.spheres
-        distance, gradient = self._queried(centers)
+        distance, gradient = self._query(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
-        distance = self.by_surfaces(state.q, distance, state.by_surface, G)
+        distance = self.raise_by_surfaces(state.q, distance, state.by_surface, G)
         h = distance_bound(self._config, self._acceleration, distance, self.margin, G, state.distance_rate)
         return self._barrier(self._moving, G, h, distance)
 
@@ -83,7 +83,7 @@ class SceneRows(BarrierTerm):
         centers, jacobians = state.model.spheres_at(q)
         later, gradient = self._field.query(np.ascontiguousarray(centers[self._moving]))
         G = -external_gradient(gradient, jacobians[self._moving])
-        later = self.by_surfaces(q, later - self._radii, state.by_surface, G)
+        later = self.raise_by_surfaces(q, later - self._radii, state.by_surface, G)
         now, G = np.maximum(later + period * (G @ velocity), distance)[chosen], G[chosen]
         rate = np.broadcast_to(state.distance_rate, len(self.names))[chosen]
         h = distance_bound(self._config, self._acceleration, now, self.margin[chosen], G, rate)
@@ -97,7 +97,7 @@ class SceneRows(BarrierTerm):
         cost, weight = self._config.slack_cost, self._config.weight_slack
         return Barrier(index=index, G=G, h=h, distance=distance, slack_cost=cost, slack_weight=weight)
 
-    def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
+    def _query(self, centers: Float64) -> tuple[Float64, Float64]:
         points = np.ascontiguousarray(centers[self._moving])
         distance, gradient = self._field.query(points)
         bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
@@ -205,25 +205,15 @@ def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, ra
     return np.asarray(gain * (distance - margin) + rate)
 
 
-def fastest_approach(G: Float64, lowest: Float64, highest: Float64) -> Float64:
-    """Largest G v (M,) [m/s] over the box of joint velocities."""
-    return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1))
-
-
 def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> Bool:
     """True for rows (M,) that some velocity of the box violates; others change no solution."""
-    return np.asarray(fastest_approach(G, lowest, highest) > h)
+    return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1) > h)
 
 
 def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Float64:
     """Upper bounds (S,) [m/s] on the spheres' speeds over the box; jacobians (S, 3, J)."""
     speed = np.abs(jacobians) @ np.maximum(np.abs(lowest), np.abs(highest))
     return np.asarray(np.sqrt(np.einsum("si,si->s", speed, speed)))
-
-
-def is_immovable(G: Float64, velocity_limit: Float64) -> Bool:
-    """True for rows (M,) that no joint velocity changes: fixed spheres or flat field."""
-    return np.asarray(np.abs(G) @ velocity_limit < fixed.IMMOVABLE_ROW)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,6 +224,9 @@ class SceneStep:
     older: DistanceField
     seconds: float
 
+
+FieldAt = Callable[[int], DistanceField]
+"""Stamp [ns] -> the field known then; the same object for the same scene."""
 
 SceneStepAt = Callable[[int], SceneStep | None]
 """Stamp [ns] -> the two newest scenes known then; None if there was only one."""
@@ -280,7 +273,7 @@ class PeopleGrown:
         )
 
 
-def guarded(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
+def guard_people(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
     """Field from which a controller keeps `config.margin`.
 
     People count as nearer by `config.human_margin` less the margin.

@@ -103,39 +103,28 @@ class Event:
     obstacle: Obstacle | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class OneEach:
-    """A name of `names` per state, by index (T,)."""
-
-    names: Sequence[str]
-    index: Index
-
-    def __call__(self, i: int) -> Sequence[str]:
-        return [self.names[int(self.index[i])]]
-
-    def over(self, first: int, end: int) -> Sequence[str]:
-        found, at = np.unique(self.index[first:end], return_index=True)
-        return [self.names[int(i)] for i in found[np.argsort(at)]]
+Names = Callable[[int], Sequence[str]] | tuple[Sequence[str], Index]
+"""Names at a state, the value's own first; or names of which each state has one, by index (T,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """Source of events of one kind: is_on (T,), value (T,).
-
-    names_at: names at a state, the value's own first.
-    """
+    """Source of events of one kind: is_on (T,), value (T,); without names by default."""
 
     kind: EventKind
     is_on: Bool
     value: Float64
-    names_at: Callable[[int], Sequence[str]]
+    names: Names = lambda _: ()
     is_high_worse: bool = True
     source: str = ""
 
     def names_over(self, first: int, end: int) -> Iterable[str]:
-        if isinstance(self.names_at, OneEach):
-            return self.names_at.over(first, end)
-        return (name for i in range(first, end) for name in self.names_at(i))
+        """Names at states [first, end); some may repeat."""
+        if callable(self.names):
+            return (name for i in range(first, end) for name in self.names(i))
+        names, index = self.names
+        found, at = np.unique(index[first:end], return_index=True)
+        return [names[int(i)] for i in found[np.argsort(at)]]
 
 
 def runs_of(is_on: Bool) -> list[tuple[int, int]]:
@@ -207,7 +196,7 @@ class EventFold:
             "num_names": len(names),
         }
         if before is None or (worst > before.worst if signal.is_high_worse else worst < before.worst):
-            name = next(iter(signal.names_at(at)), "")
+            name = next(iter(signal.names_over(at, at + 1)), "")
             obstacle = None if near is None else near(signal.kind, name, at)
             grown |= {"worst": worst, "worst_s": worst_s, "state": self._num + at, "worst_name": name}
             grown["obstacle"] = obstacle
@@ -234,28 +223,24 @@ def audit_signals(
                 kind=EventKind.WITHOUT_DISTANCE,
                 is_on=is_blank,
                 value=is_blank.astype(np.float64),
-                names_at=OneEach(names=spheres, index=clearance.sphere),
+                names=(spheres, clearance.sphere),
                 source=source,
             )
         )
-    unknown = np.nan_to_num(audit.unknown_share)
-    signals.append(Signal(kind=EventKind.UNKNOWN_SPACE, is_on=unknown > 0, value=unknown, names_at=_nobody))
-    outside = audit.limit_margin
-    signals.append(
-        _low(EventKind.OUTSIDE_LIMITS, outside < 0, outside, OneEach(names=joints, index=audit.limit_joint))
-    )
-    touching = audit.self_clearance
-    signals.append(
-        _low(EventKind.SELF_COLLISION, touching < 0, touching, OneEach(names=pairs, index=audit.self_pair))
-    )
-    return signals
+    unknown, outside, touching = np.nan_to_num(audit.unknown_share), audit.limit_margin, audit.self_clearance
+    return [
+        *signals,
+        Signal(kind=EventKind.UNKNOWN_SPACE, is_on=unknown > 0, value=unknown),
+        _low(EventKind.OUTSIDE_LIMITS, outside < 0, outside, (joints, audit.limit_joint)),
+        _low(EventKind.SELF_COLLISION, touching < 0, touching, (pairs, audit.self_pair)),
+    ]
 
 
 def clearance_signals(
     source: str, distance: Float64, sphere: Index, margin: float, spheres: Sequence[str]
 ) -> list[Signal]:
     """Signals below the margin and in contact, by the nearest sphere's clearance (T,) [m]."""
-    names = OneEach(names=spheres, index=sphere)
+    names = (spheres, sphere)
     return [
         _low(kind, distance < bound, distance, names, source)
         for kind, bound in ((EventKind.BELOW_MARGIN, margin), (EventKind.IN_COLLISION, 0.0))
@@ -265,7 +250,7 @@ def clearance_signals(
 def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
     """Signals of joint velocity and acceleration above their limits."""
     return [
-        Signal(kind=kind, is_on=value > 1, value=value, names_at=OneEach(names=joints, index=joint))
+        Signal(kind=kind, is_on=value > 1, value=value, names=(joints, joint))
         for kind, value, joint in (
             (EventKind.TOO_FAST, strain.velocity, strain.velocity_joint),
             (EventKind.TOO_SUDDEN, strain.acceleration, strain.acceleration_joint),
@@ -275,32 +260,25 @@ def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
 
 def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[Signal]:
     """Signals between states: clearance bound (T,) [m] below the margin, unbounded time (T,) [s]."""
-    is_low = lower < margin
     return [
-        _low(EventKind.BETWEEN_STATES, is_low, lower, _nobody),
-        Signal(kind=EventKind.NOT_BOUNDED, is_on=unbounded > 0, value=unbounded, names_at=_nobody),
+        Signal(kind=EventKind.BETWEEN_STATES, is_on=lower < margin, value=lower, is_high_worse=False),
+        Signal(kind=EventKind.NOT_BOUNDED, is_on=unbounded > 0, value=unbounded),
     ]
 
 
 def stale_signal(age_s: Float64, max_age_s: float) -> Signal:
     """Signal of a stale scene; age_s (T,) [s], NaN for an unstamped scene."""
-    return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s), names_at=_nobody)
+    return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s))
 
 
 def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
     """Signals of the controller's steps at T states; None: no step."""
 
     def relaxed(i: int) -> Sequence[str]:
-        return [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)]
+        return [row.name for row in sorted(_taken_step(steps, i).relaxed, key=lambda row: -row.slack)]
 
-    signals = [_intervention_signal(steps, kind) for kind in RowKind]
     slack = _of(steps, lambda step: max((row.slack for row in step.relaxed), default=0.0))
     is_outside = _of(steps, lambda step: float(step.rung is Rung.OUTSIDE)) > 0
-    for kind, is_on in (
-        (EventKind.RELAXED, (slack > 0) & ~is_outside),
-        (EventKind.ROW_BROKEN, (slack > 0) & is_outside),
-    ):
-        signals.append(Signal(kind=kind, is_on=is_on, value=slack, names_at=relaxed))
     residual, clearance = _of(steps, lambda step: step.residual), _of(steps, lambda step: step.clearance)
     is_least = _of(steps, lambda step: float(step.rung is Rung.MINIMUM_VIOLATION)) > 0
     is_hold = _of(steps, lambda step: float(step.rung is Rung.HOLD)) > 0
@@ -309,15 +287,17 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
     fixed = _of(steps, lambda step: step.fixed_distance)
 
     def nearest(i: int) -> Sequence[str]:
-        return [_asked(steps, i).nearest]
+        return [_taken_step(steps, i).nearest]
 
-    signals += [
-        Signal(kind=EventKind.MINIMUM_VIOLATION, is_on=is_least, value=residual, names_at=nearest),
+    return [
+        *(_intervention_signal(steps, kind) for kind in RowKind),
+        Signal(kind=EventKind.RELAXED, is_on=(slack > 0) & ~is_outside, value=slack, names=relaxed),
+        Signal(kind=EventKind.ROW_BROKEN, is_on=(slack > 0) & is_outside, value=slack, names=relaxed),
+        Signal(kind=EventKind.MINIMUM_VIOLATION, is_on=is_least, value=residual, names=nearest),
         _low(EventKind.HOLD, is_hold, clearance, nearest),
         _low(EventKind.SCALED_BACK, (scale < 1) & ~is_hold, scale, nearest),
-        _low(EventKind.CANNOT_ACT, cannot, fixed, lambda i: _asked(steps, i).violated_fixed),
+        _low(EventKind.CANNOT_ACT, cannot, fixed, lambda i: _taken_step(steps, i).violated_fixed),
     ]
-    return signals
 
 
 def _intervention_signal(steps: Sequence[ControlStep | None], kind: RowKind) -> Signal:
@@ -325,17 +305,15 @@ def _intervention_signal(steps: Sequence[ControlStep | None], kind: RowKind) -> 
         return max((row.multiplier for row in step.interventions if row.kind is kind), default=0.0)
 
     def names_at(index: int) -> Sequence[str]:
-        rows = [row for row in _asked(steps, index).interventions if row.kind is kind]
+        rows = [row for row in _taken_step(steps, index).interventions if row.kind is kind]
         return [row.name for row in sorted(rows, key=lambda row: -row.multiplier)]
 
     value = _of(steps, largest)
-    return Signal(kind=EventKind(kind.value), is_on=value > 0, value=value, names_at=names_at)
+    return Signal(kind=EventKind(kind.value), is_on=value > 0, value=value, names=names_at)
 
 
-def _low(
-    kind: EventKind, is_on: Bool, value: Float64, names_at: Callable[[int], Sequence[str]], source: str = ""
-) -> Signal:
-    return Signal(kind=kind, is_on=is_on, value=value, names_at=names_at, is_high_worse=False, source=source)
+def _low(kind: EventKind, is_on: Bool, value: Float64, names: Names, source: str = "") -> Signal:
+    return Signal(kind=kind, is_on=is_on, value=value, names=names, is_high_worse=False, source=source)
 
 
 def _of(
@@ -344,11 +322,7 @@ def _of(
     return np.array([otherwise if step is None else value(step) for step in steps], dtype=np.float64)
 
 
-def _asked(steps: Sequence[ControlStep | None], index: int) -> ControlStep:
+def _taken_step(steps: Sequence[ControlStep | None], index: int) -> ControlStep:
     step = steps[index]
     assert step is not None
     return step
-
-
-def _nobody(_: int) -> Sequence[str]:
-    return ()

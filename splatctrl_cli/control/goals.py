@@ -44,10 +44,10 @@ def pose_error(T_world_frame: Float64, T_world_goal: Float64) -> Float64:
 def reference_velocity(error: Float64, *, gain: float, max_linear: float, max_angular: float) -> Float64:
     """Gain times the pose error (6,) [m/s, rad/s], each part capped in norm."""
     velocity = gain * error
-    return np.concatenate([_capped(velocity[:3], max_linear), _capped(velocity[3:], max_angular)])
+    return np.concatenate([_cap(velocity[:3], max_linear), _cap(velocity[3:], max_angular)])
 
 
-def _capped(vector: Float64, limit: float) -> Float64:
+def _cap(vector: Float64, limit: float) -> Float64:
     norm = float(np.linalg.norm(vector))
     return vector if norm <= limit else vector * (limit / norm)
 
@@ -80,11 +80,6 @@ class LoggedMotion:
             (1.0 - share) * values[after - 1] + share * values[after] for values in (self.position, self.velocity)
         )
         return position, velocity
-
-    def goal_at(self, model: RobotModel, frame: str, stamp_ns: int) -> tuple[Float64, Guide]:
-        """A frame's logged pose (4, 4) and motion at a stamp."""
-        position, velocity = self.at(stamp_ns)
-        return guided_goal(model, frame, position, velocity)
 
 
 def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:

@@ -1,7 +1,7 @@
 """Joint limits merged into one velocity box, never empty; and checks of motions."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,31 +27,12 @@ FR3_JOINTS = (  # v_max [rad/s], v_0 [rad/s], k [rad/s^2], q_lower [rad], q_uppe
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class VelocityLimits:
-    """Position-dependent velocity limits of J joints.
-
-    most (J,) [rad/s] everywhere; near a position limit ``sqrt(slope (limit - q)) - offset`` with slope (J,)
-    [rad/s^2], offset (J,) [rad/s]; lower, upper (J,) [rad].
-    """
-
-    most: Float64
-    offset: Float64
-    slope: Float64
-    lower: Float64
-    upper: Float64
-
-    def at(self, q: Float64) -> tuple[Float64, Float64]:
-        """Lowest and highest velocity (J,), (J,) [rad/s]; zero lies between."""
-        return -self._towards(q - self.lower), self._towards(self.upper - q)
-
-    def _towards(self, room: Float64) -> Float64:
-        speed = np.sqrt(np.maximum(self.slope * room, 0.0)) - self.offset
-        return np.minimum(self.most, np.maximum(speed, 0.0))
+VelocityLimits = Callable[[Float64], tuple[Float64, Float64]]
+"""q (J,) [rad] -> lowest and highest velocity (J,), (J,) [rad/s] there; zero lies between."""
 
 
 def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
-    """Limits of the FR3's joints, matched by the ends of their names.
+    """Limits of the FR3's joints by position, matched by the ends of their names.
 
     Raises UsageError for other names or duplicates.
     """
@@ -63,15 +44,21 @@ def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
             f"control.velocity_limits = fr3: expected names that end in joint1 to joint7, got {', '.join(odd)}",
             remedy="lock the others (--lock), or set control.velocity_limits = urdf",
         )
-    table = np.array([FR3_JOINTS[number - 1] for number in numbers]).T
-    return VelocityLimits(most=table[0], offset=table[1], slope=table[2], lower=table[3], upper=table[4])
+    most, offset, slope, lower, upper = np.array([FR3_JOINTS[number - 1] for number in numbers]).T
+
+    def limit(q: Float64) -> tuple[Float64, Float64]:
+        speeds = (np.sqrt(np.maximum(slope * room, 0.0)) - offset for room in (q - lower, upper - q))
+        down, up = (np.minimum(most, np.maximum(speed, 0.0)) for speed in speeds)
+        return -down, up
+
+    return limit
 
 
 def braking_speed(room: Float64, gain: float, deceleration: Float64, period: float) -> Float64:
     """Highest speed (M,) into room (M,) that never requires harder braking later.
 
     Up to ``v = a / alpha`` the linear bound ``alpha r`` needs at most the deceleration a (M,), inf without a limit.
-    Faster, the room must hold the way to that speed at a, and one period more:
+    Faster, the room must hold the way to that speed, and one period more:
 
         r(v) = a / alpha^2 + (v^2 - a^2 / alpha^2) / (2 a) + (v - a / alpha) dt,
 
@@ -124,14 +111,14 @@ class JointLimits:
     def box(self, q: Float64, last_velocity: Float64 | None = None) -> tuple[Float64, Float64]:
         """Lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
-        Without last_velocity no acceleration counts. An acceleration in conflict with velocity and position yields:
-        the box is never empty. From a state that this box led to it never yields, unless by_position is stricter.
+        Without last_velocity no acceleration counts. One in conflict with velocity and position yields, so that the
+        box is never empty; not from a state that this box led to, unless by_position is stricter.
         """
         lowest, highest = velocity_box(
             q, self.lower, self.upper, self.velocity, self.gain, acceleration=self.acceleration, period=self.period
         )
         if self.by_position is not None:
-            slowest, fastest = self.by_position.at(q)
+            slowest, fastest = self.by_position(q)
             lowest, highest = np.clip(lowest, slowest, fastest), np.clip(highest, slowest, fastest)
         if self.acceleration is None or last_velocity is None:
             return lowest, highest

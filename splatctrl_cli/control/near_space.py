@@ -46,9 +46,9 @@ class Account:
     shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
     unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place;
-    blind_to_surface [m]: likewise of `NOT_OCCLUDED` points, about spheres with almost only never-seen points
-    (`NEAR_BLIND`). Infinite and NaN without any. age [s]: quantile `NEAR_FRESH_SHARE` of seen points' ages; ahead
-    [s]: to the latest view. NaN without views.
+    blind_to_surface [m]: of `NOT_OCCLUDED` points, about spheres with almost only never-seen points (`NEAR_BLIND`).
+    Infinite and NaN without any. age [s]: quantile `NEAR_FRESH_SHARE` of ages; ahead [s]: to the latest view. NaN
+    without views.
     """
 
     shares: Float64
@@ -78,7 +78,7 @@ class NearSpace:
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres at the last evaluation
 
-    def due(self, stamps: Index, centers: Float64) -> dict[int, bool]:
+    def choose(self, stamps: Index, centers: Float64) -> dict[int, bool]:
         """Indices of states to evaluate; True if their ages count.
 
         A state is due once a sphere has moved by `NEAR_MOVED`, and (True) every `NEAR_EVERY_NS`. stamps (T,) [ns]
@@ -89,16 +89,12 @@ class NearSpace:
             is_timed = stamp_ns >= self._next_ns
             if is_timed:
                 self._next_ns = stamp_ns + fixed.NEAR_EVERY_NS
-            if is_timed or self._has_moved(moving[index]):
+            away = np.zeros((0, 3)) if self._looked is None else moving[index] - self._looked
+            if is_timed or np.sum(away**2, axis=1).max(initial=0.0) >= fixed.NEAR_MOVED**2:
                 chosen[index], self._looked = is_timed, moving[index]
         return chosen
 
-    def _has_moved(self, centers: Float64) -> bool:
-        if self._looked is None:
-            return False
-        return bool(np.sum((centers - self._looked) ** 2, axis=1).max(initial=0.0) >= fixed.NEAR_MOVED**2)
-
-    def on_the_way(self, first: Float64, last: Float64) -> Float64:
+    def postures_between(self, first: Float64, last: Float64) -> Float64:
         """Postures (K, J) in between, so dense that no sphere moves by `NEAR_MOVED`."""
         begin, end = self._model.sphere_centers_batch(np.stack([first, last]))[:, self._moving]
         num = int(np.ceil(np.linalg.norm(end - begin, axis=1).max(initial=0.0) / fixed.NEAR_MOVED))

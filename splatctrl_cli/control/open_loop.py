@@ -1,20 +1,17 @@
 """Open loop: the controller's command at every logged state, next to the logged one."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.barriers import SceneStepAt, rate_of
+from splatctrl_cli.control.barriers import FieldAt, SceneStepAt, rate_of
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
-from splatctrl_cli.records import Bool, DistanceField, Float64
+from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.robot.model import RobotModel
-
-FieldAt = Callable[[int], DistanceField]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,13 +63,11 @@ def open_loop(
     """
     field = field_at(int(motion.stamp_ns[0]))
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
-    steps: list[ControlStep | None] = []
-    margins: list[VelocityMargin | None] = []
+    steps: list[ControlStep | None] = [None] * len(motion.stamp_ns)
+    margins: list[VelocityMargin | None] = [None] * len(motion.stamp_ns)
     commanded = np.full(motion.velocity.shape, np.nan)
     for index, (stamp, q, v) in enumerate(zip(motion.stamp_ns, motion.position, motion.velocity, strict=True)):
         if not has_distance[index]:
-            steps.append(None)
-            margins.append(None)
             continue
         if field_at(int(stamp)) is not field:
             field = field_at(int(stamp))
@@ -83,14 +78,12 @@ def open_loop(
         elif goal is None:
             goal, guide = guided_goal(model, task.frame, q, v)
         rate = rate_of(config, model, scene_step_at, int(stamp), q)
-        margins.append(controller.margin_of(q, v, distance_rate=rate))
+        margins[index] = controller.margin_of(q, v, distance_rate=rate)
         if commander.is_over:
-            steps.append(None)
             continue
         moment = Moment(stamp_ns=int(stamp), q=q, T_world_goal=goal, guide=guide, last_velocity=v, distance_rate=rate)
-        step = commander.step(controller, moment)
+        steps[index] = step = commander.step(controller, moment)
         commanded[index] = step.velocity
-        steps.append(step)
     return OpenLoopTrace(
         logged=np.asarray(motion.velocity), commanded=commanded, steps=tuple(steps), margins=tuple(margins)
     )

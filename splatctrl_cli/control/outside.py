@@ -80,7 +80,7 @@ class Program(LineProcess):
         self.spent, has_rows = 0.0, False
         line = _line({"id": self._num} | question)
         while True:
-            answer = self._asked(line)
+            answer = self._ask(line)
             if answer.get("id") != self._num:
                 got = shown(repr(answer.get("id")))
                 raise Misbehaved(Fault.OUT_OF_TURN, f"expected the answer to id {self._num}, got one to {got}")
@@ -88,7 +88,7 @@ class Program(LineProcess):
                 return _velocity(answer, limits)
             line, has_rows = _line({"rows": rows()}), True
 
-    def _asked(self, line: bytes) -> Document:
+    def _ask(self, line: bytes) -> Document:
         if self._seconds > RUN_LIMIT:
             raise Misbehaved(Fault.OUT_OF_TIME, f"took {RUN_LIMIT:g} s for all its answers together")
         began = time.monotonic()
@@ -150,20 +150,20 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
         view = controller.view(moment)
         question = _question(self._model, self._frame, moment, view)
         try:
-            velocity = self._agreed(question, lambda: _rows(controller, view))
+            velocity = self._agree(question, lambda: _rows(controller, view))
         except Misbehaved as error:
             self.failure = Failure(fault=error.fault, sentence=error.sentence, stamp_ns=moment.stamp_ns)
             self.close()
-            return controller.given(view, None, str(error))
+            return controller.take_velocity(view, None, str(error))
         spent = max(program.spent for program in self._programs)
         self.num_answers, self.seconds, self.slowest = (
             self.num_answers + 1,
             self.seconds + spent,
             max(self.slowest, spent),
         )
-        return controller.given(view, velocity)
+        return controller.take_velocity(view, velocity)
 
-    def _agreed(self, question: Document, rows: Callable[[], list[Document]]) -> Float64:
+    def _agree(self, question: Document, rows: Callable[[], list[Document]]) -> Float64:
         limits = dict(zip(self._model.joint_names, self._model.velocity_limit.tolist(), strict=True))
         velocity, *others = [program.velocity(question, rows, limits) for program in self._programs]
         for other in others:

@@ -132,8 +132,8 @@ WasFree = Callable[[Float64], UInt8]
 class FixedParts:
     """`found`: each fixed sphere's first clearance [m], and its least, later arrivals included.
 
-    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it (MOUNTED_CHANGE near a mount). It
-    is nearer than the first clearance by as much, and the last scene had it too. Its voxel was free in a scene
+    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it (MOUNTED_CHANGE near a mount), it
+    is nearer than the first clearance by as much, the last scene had it too, and its voxel was free in a scene
     before: else it fills a hole of the map. A link's triangles count where they are farther away.
     """
 

@@ -11,7 +11,7 @@ from scipy import sparse
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.limits import box_rows
-from splatctrl_cli.control.terms import Barrier, Cost, stray_cost, summed
+from splatctrl_cli.control.terms import Barrier, Cost, stray_cost, sum_costs
 from splatctrl_cli.records import Float64
 
 
@@ -216,10 +216,10 @@ def descend(
                 solution=solution,
                 num_refused=num_refused,
             )
-    return held(J, M, solution, num_refused=2)
+    return stand_still(J, M, solution, num_refused=2)
 
 
-def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: int) -> Choice:
+def stand_still(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: int) -> Choice:
     """A standstill: no solution is usable."""
     return Choice(
         velocity=np.zeros(num_joints),
@@ -240,7 +240,7 @@ def assemble_hard(
     Rows: upper, lower box (2 J), barriers (M). If no barrier's multiplier exceeds its slack cost, it solves
     `assemble`, too: an L1 penalty above the multipliers is exact.
     """
-    H, c = summed(costs)
+    H, c = sum_costs(costs)
     G, h = box_rows(lowest, highest)
     rows = [barrier for barrier in barriers if len(barrier)]
     return QuadraticProgram(
@@ -257,7 +257,7 @@ def assemble(
     """
     J, M = len(lowest), sum(len(barrier) for barrier in barriers)
     H, c = np.zeros((J + M, J + M)), np.zeros(J + M)
-    H[:J, :J], c[:J] = summed(costs)
+    H[:J, :J], c[:J] = sum_costs(costs)
     slack = np.arange(J, J + M)
     H[slack, slack] = np.concatenate([np.full(len(b), 2.0 * b.slack_weight) for b in barriers] or [np.zeros(0)])
     c[J:] = np.concatenate([np.full(len(b), b.slack_cost) for b in barriers] or [np.zeros(0)])

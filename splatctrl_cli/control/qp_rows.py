@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind, is_immovable
+from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind
 from splatctrl_cli.control.limits import box_rows
-from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, held, is_usable
+from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, is_usable, stand_still
 from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
 from splatctrl_cli.robot.model import RobotModel
@@ -92,12 +92,13 @@ class RowBuilder:
     def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
         """Rows in another field; see `SceneRows.in_field`."""
         other = copy(self)
-        other.scene = self.scene.in_field(field, balls)
+        other.scene = self.scene.with_field(field, balls)
         return other
 
     def at(self, state: State) -> Rows:
         barriers = tuple(term.rows(state) for term in self._terms)
-        is_fixed = np.concatenate([is_immovable(b.G, self._model.velocity_limit) for b in barriers])
+        # Rows that no joint velocity changes: of fixed spheres, or in a flat field.
+        is_fixed = np.concatenate([np.abs(b.G) @ self._model.velocity_limit < fixed.IMMOVABLE_ROW for b in barriers])
         binds = np.concatenate([can_bind(b.G, b.h, *state.box) for b in barriers])
         return Rows(barriers=barriers, margin=self._margin, is_fixed=is_fixed, in_qp=binds & ~is_fixed)
 
@@ -116,7 +117,7 @@ class RowBuilder:
     def distances(self, q: Float64, by_surface: Bool = NO_SPHERE) -> Float64:
         """Every row's distance (M,) [m] at q; by_surface as in `State`."""
         centers = self._model.sphere_centers(q)
-        scene = self.scene.by_surfaces(q, self.scene.distances(centers), by_surface)
+        scene = self.scene.raise_by_surfaces(q, self.scene.distances(centers), by_surface)
         return np.concatenate([scene, *(term.distances(centers) for term in self._others)])
 
 
@@ -163,7 +164,7 @@ def solve_printed(
     J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)
     solution = solver(assemble_printed(state, configured_weights(config), posture, external, firm))
     if not is_usable(solution, config.max_residual):
-        return held(J, M + num_firm, solution, num_refused=1)
+        return stand_still(J, M + num_firm, solution, num_refused=1)
     slack = np.concatenate([np.maximum(-solution.z[J + 6 :], 0.0), np.zeros(num_firm)])
     return Choice(
         velocity=solution.z[:J],

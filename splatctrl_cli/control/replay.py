@@ -3,14 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction
-from splatctrl_cli.control.barriers import SceneStepAt, rate_of, scene_margin
-from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
+from splatctrl_cli.control.barriers import FieldAt, SceneStepAt, rate_of, scene_margin
+from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, guided_goal, pose_error
 from splatctrl_cli.control.preconditions import (
     StaticViolation,
     check_free,
@@ -23,8 +22,6 @@ from splatctrl_cli.control.preconditions import (
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController
 from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
 from splatctrl_cli.robot.model import RobotModel
-
-FieldAt = Callable[[int], DistanceField]
 
 
 class Outcome(StrEnum):
@@ -108,45 +105,30 @@ class ReplayTrace:
     by_surface: tuple[str, ...] = ()
 
 
-class StepRecord(Protocol):
-    """Storage of T steps: stamps (T,), postures (T, J) and steps."""
+class StepRecord:
+    """T steps, with their stamps and the postures before them, in memory."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, Float64, ControlStep]] = []
 
     @property
     def stamp_ns(self) -> Stamps:
         """Stamps (T,) [ns]."""
+        return np.array([stamp_ns for stamp_ns, _, _ in self._rows], dtype=np.int64)
 
     @property
     def position(self) -> FloatRows:
         """Postures (T, J) before each step."""
+        return np.array([q for _, q, _ in self._rows])
 
     @property
     def steps(self) -> Sequence[ControlStep]:
         """Steps so far."""
+        return [step for _, _, step in self._rows]
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
         """Append a step."""
-
-
-class InMemory:
-    """A `StepRecord` of lists."""
-
-    def __init__(self) -> None:
-        self._stamps: list[int] = []
-        self._positions: list[Float64] = []
-        self.steps: list[ControlStep] = []
-
-    @property
-    def stamp_ns(self) -> Stamps:
-        return np.array(self._stamps, dtype=np.int64)
-
-    @property
-    def position(self) -> Float64:
-        return np.array(self._positions)
-
-    def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
-        self._stamps.append(stamp_ns)
-        self._positions.append(q)
-        self.steps.append(step)
+        self._rows.append((stamp_ns, q, step))
 
 
 def closed_loop(
@@ -180,7 +162,7 @@ def closed_loop(
     by_surface: tuple[str, ...] = ()
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
-    kept: StepRecord = InMemory() if record is None else record
+    kept = StepRecord() if record is None else record
     changes, anchored = [], []
     outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
@@ -284,7 +266,7 @@ class _Course:
         if task.twists is not None:
             return task.twists.goal_at(self._model, self._config, task.frame, q, stamp_ns)
         if task.follow is not None:
-            return task.follow.goal_at(self._model, task.frame, stamp_ns)
+            return guided_goal(self._model, task.frame, *task.follow.at(stamp_ns))
         waypoint = self._waypoints[self.num_reached]
         if waypoint.posture is None:
             return waypoint.T_world_goal, None

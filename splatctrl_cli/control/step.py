@@ -11,7 +11,7 @@ from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
-from splatctrl_cli.control.qp import SOLVERS, Choice, QpSolver, Rung, descend, held, unsolved
+from splatctrl_cli.control.qp import SOLVERS, Choice, QpSolver, Rung, descend, stand_still, unsolved
 from splatctrl_cli.control.qp_rows import PRINTED, RowBuilder, Rows, solve_printed
 from splatctrl_cli.control.terms import (
     BarrierTerm,
@@ -23,7 +23,7 @@ from splatctrl_cli.control.terms import (
     eliminated_weight,
     reach_cost,
     standard_costs,
-    summed,
+    sum_costs,
 )
 from splatctrl_cli.records import Bool, DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel
@@ -64,10 +64,10 @@ class ControlStep:
     """The controller's decision at one configuration.
 
     velocity (J,) [rad/s], scaled by `scale` (1 unless the next distance broke a row's promise); pose_error (6,) [m,
-    rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf without
-    pairs); violated_fixed: violated rows that no joint velocity changes; fixed_distance [m]: their least distance
-    (inf without any); interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT residual
-    of the last solution, with its status; num_refused: unusable solutions; by_surface: as in `step`, from now on.
+    rad]; clearance [m] of the nearest moving sphere by the controller's field; self_clearance [m] (inf without
+    pairs); violated_fixed: rows that no joint velocity changes, fixed_distance [m]: their least (inf without any);
+    interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT residual of the last
+    solution, with its status; num_refused: unusable solutions; by_surface: as in `step`, from now on.
     """
 
     velocity: Float64
@@ -190,26 +190,28 @@ class QpIkController:
         rest = self._limits.rest(state.last_velocity)
         costs = [cost(state) for cost in self._costs]
         if config.program == PRINTED:
-            printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
-            return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
+            printed = solve_printed(self._solver, state, sum_costs(costs), rows.for_qp, config)
+            return self._report(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
         costs.append(reach_cost(state.jacobian, state.reference, self._reach_weight))
-        rows, choice, is_kept = self._descended(state, costs, rows)
+        rows, choice, is_kept = self._descend(state, costs, rows)
         while np.any(newly := self._sticking_out(state, rows, choice)):
             state = replace(state, by_surface=state.by_surface | newly)
-            rows, choice, is_kept = self._descended(state, costs, self._builder.at(state))
+            rows, choice, is_kept = self._descend(state, costs, self._builder.at(state))
         scale = 1.0 if is_kept else self._kept_scale(state, choice, rows, rest)
-        return replace(self._reported(error, rows, choice, rest, scale), by_surface=self._named(state.by_surface))
+        return replace(self._report(error, rows, choice, rest, scale), by_surface=self._named(state.by_surface))
 
     def view(self, moment: Moment) -> View:
         """A step's input at a moment. Raises as `step`."""
         q = checked_posture(self._model, moment.q)
         error = pose_error(self._model.frame_pose(q, self._frame), moment.T_world_goal)
+        linear, angular = self._config.max_linear_speed, self._config.max_angular_speed
+        reference = reference_velocity(error, gain=self._config.pose_gain, max_linear=linear, max_angular=angular)
         state = State(
             model=self._model,
             frame=self._frame,
             q=q,
             box=self._limits.box(q, moment.last_velocity),
-            reference=self._reference(error, moment.guide),
+            reference=reference if moment.guide is None else reference + moment.guide.twist,
             guide=moment.guide,
             last_velocity=moment.last_velocity,
             distance_rate=moment.distance_rate,
@@ -217,7 +219,7 @@ class QpIkController:
         )
         return View(error=error, state=state, rows=self._builder.at(state))
 
-    def given(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
+    def take_velocity(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
         """An external velocity (J,) [rad/s] as a step; slack is its row violation.
 
         None: the arm stops, with the reason in `status`.
@@ -225,14 +227,14 @@ class QpIkController:
         rest, rows = self._limits.rest(view.state.last_velocity), view.rows
         J, M = len(rest), int(rows.in_qp.sum())
         choice = replace(
-            held(J, M, unsolved(J, M, status), num_refused=0),
+            stand_still(J, M, unsolved(J, M, status), num_refused=0),
             velocity=rest if velocity is None else velocity,
             rung=Rung.HOLD if velocity is None else Rung.OUTSIDE,
         )
         if velocity is not None and M:
             broken = np.concatenate([barrier.G @ velocity - barrier.h for barrier in rows.for_qp])
             choice = replace(choice, slack=np.maximum(broken, 0.0))
-        return self._reported(view.error, rows, choice, rest, 1.0)
+        return self._report(view.error, rows, choice, rest, 1.0)
 
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
         """Room that any joint velocity (J,) [rad/s] leaves at q (J,).
@@ -252,14 +254,7 @@ class QpIkController:
             limit_row=self._limit_names[limit],
         )
 
-    def _reference(self, error: Float64, guide: Guide | None) -> Float64:
-        config = self._config
-        reference = reference_velocity(
-            error, gain=config.pose_gain, max_linear=config.max_linear_speed, max_angular=config.max_angular_speed
-        )
-        return reference if guide is None else reference + guide.twist
-
-    def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
+    def _descend(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
         """Rows, the ladder's choice, and True if the later distances keep the promise.
 
         A sphere that would meet another surface than its row's adds a row. Then the ladder runs again: cutting
@@ -284,7 +279,7 @@ class QpIkController:
         """True for spheres (M,) with relaxed rows whose links' surfaces are farther away."""
         distance, scene = rows.external.distance, self._builder.scene
         has_given_way = rows.spread(choice.slack)[: len(distance)] > self._config.slack_tolerance
-        return np.asarray(scene.by_surfaces(state.q, distance, has_given_way & ~state.by_surface) > distance)
+        return np.asarray(scene.raise_by_surfaces(state.q, distance, has_given_way & ~state.by_surface) > distance)
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
         """True for rows (M,) whose `later` distance, a period on, breaks their promise.
@@ -314,7 +309,7 @@ class QpIkController:
                 return scale
         return 0.0
 
-    def _reported(self, error: Float64, rows: Rows, choice: Choice, rest: Float64, scale: float) -> ControlStep:
+    def _report(self, error: Float64, rows: Rows, choice: Choice, rest: Float64, scale: float) -> ControlStep:
         slack = rows.spread(choice.slack)
         violated_fixed = rows.is_fixed & (rows.distance < rows.margin)
         return ControlStep(

@@ -5,7 +5,7 @@ A further term is a function from state to cost ``(H, c)``, or a `BarrierTerm` w
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property, partial
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.goals import Guide
-from splatctrl_cli.records import Bool, Float64, Integers
+from splatctrl_cli.records import Bool, Columns, Float64, Integers
 from splatctrl_cli.robot.model import RobotModel
 
 Cost = tuple[Float64, Float64]
@@ -107,7 +107,7 @@ def stray_cost(velocity: Float64, weight: float) -> Cost:
     return 2.0 * weight * np.eye(len(velocity)), -2.0 * weight * velocity
 
 
-def summed(costs: Sequence[Cost]) -> Cost:
+def sum_costs(costs: Sequence[Cost]) -> Cost:
     H, c = np.zeros_like(costs[0][0]), np.zeros_like(costs[0][1])
     for cost_H, cost_c in costs:
         H += cost_H
@@ -124,7 +124,7 @@ class RowKind(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Barrier:
+class Barrier(Columns):
     """M barrier rows ``G v - s <= h``, with ``G = -dd/dq`` (M, J).
 
     ``h = alpha (d - epsilon) + dd/dt`` (M,), less where joints cannot stop at once (`barriers.distance_bound`);
@@ -138,23 +138,6 @@ class Barrier:
     distance: Float64
     slack_cost: float
     slack_weight: float
-
-    def __len__(self) -> int:
-        return len(self.h)
-
-    def select(self, rows: Bool) -> "Barrier":
-        """Rows of a mask (M,)."""
-        return replace(self, index=self.index[rows], G=self.G[rows], h=self.h[rows], distance=self.distance[rows])
-
-    def joined(self, other: "Barrier") -> "Barrier":
-        """Return these rows, then the other's, at this cost of slack."""
-        return replace(
-            self,
-            index=np.concatenate([self.index, other.index]),
-            G=np.concatenate([self.G, other.G]),
-            h=np.concatenate([self.h, other.h]),
-            distance=np.concatenate([self.distance, other.distance]),
-        )
 
 
 class BarrierTerm(ABC):

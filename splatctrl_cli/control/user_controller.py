@@ -98,6 +98,9 @@ class Controller(Protocol):
         """Joint velocities (J,) [rad/s] for a period."""
 
 
+ARRAYS = ("q", "dq", "goal", "goal_twist", "goal_posture", "goal_velocity", "pose", "error", "jacobian")
+
+
 def serve(target: str) -> None:
     """Answer lines on stdin with the class ``module:Class``; its prints go to stderr."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
@@ -126,10 +129,12 @@ def serve(target: str) -> None:
         def rows(number: int = asked["id"], known: list[Sequence[ClearanceRow]] = known) -> Sequence[ClearanceRow]:
             if not known:
                 answer(id=number, ask="rows")
-                known.append([_row(row) for row in line()["rows"]])
+                known.append([ClearanceRow(**{**row, "G": _array(row["G"])}) for row in line()["rows"]])
             return known[0]
 
-        answer(id=asked["id"], velocity=_velocities(target, controller.step(_input(asked, rows))))
+        arrays = {name: _array(asked[name]) for name in ARRAYS}
+        now = ControllerInput(stamp_ns=asked["stamp_ns"], ask_rows=rows, **arrays)
+        answer(id=asked["id"], velocity=_velocities(target, controller.step(now)))
 
 
 def class_named(target: str) -> Callable[[ControllerStart], Controller]:
@@ -146,17 +151,6 @@ def class_named(target: str) -> Callable[[ControllerStart], Controller]:
     if not callable(made):
         sys.exit(f"module {module_name} ({module.__file__}) has no class {name}")
     return made
-
-
-def _input(asked: Mapping[str, Any], rows: Callable[[], Sequence[ClearanceRow]]) -> ControllerInput:
-    arrays = ("q", "dq", "goal", "goal_twist", "goal_posture", "goal_velocity", "pose", "error", "jacobian")
-    return ControllerInput(
-        stamp_ns=asked["stamp_ns"], ask_rows=rows, **{name: _array(asked[name]) for name in arrays}
-    )
-
-
-def _row(document: Mapping[str, Any]) -> ClearanceRow:
-    return ClearanceRow(**{**document, "G": np.array(document["G"], np.float64)})
 
 
 def _array(values: Sequence[Any] | None) -> Any:

@@ -16,7 +16,7 @@ from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
-from splatctrl_cli.records import Bool, Float32, SplatSet, UInt8
+from splatctrl_cli.records import Bool, Float32, Index, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid
 
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
@@ -125,25 +125,21 @@ class Baker:
         if self.probability is not None:
             whole = np.zeros(span.shape_of_channel, np.float32)
             whole[... if where is None else where] = made["sdf"]
-            made["probability"] = _picked(self.probability.baked(span, whole, threads=self.threads), cells)
+            made["probability"] = _pick(self.probability.baked(span, whole, threads=self.threads), cells)
         if entry is not None:
             made["label"] = self.labels[self.spheres.source[entry]]
         if "observed" in self.channels:
             observed = observed_planes(self._occupancy, self.layout, self._thresholds, span.first, span.last)
-            made["observed"] = _picked(observed, cells)
+            made["observed"] = _pick(observed, cells)
         return made
 
-    def _by_processor(self, span: GridSpan, cells: NDArray[np.int64] | None) -> _Made:
-        exact, exact_gradient, entry = self._hard(span)
-        hard = _picked(exact, cells)
-        gradient = None if exact_gradient is None else _picked(exact_gradient, cells)
-        kernels: dict[str, tuple[Float32, Float32 | None]] = {}
-        for name in self.kernels:
-            distance, slope = self._kernel(name, span)
-            kernels[name] = (_picked(distance, cells), None if slope is None else _picked(slope, cells))
-            self.counts[f"{name}_without_value"] += int(np.count_nonzero(np.isnan(kernels[name][0])))
-            self.counts[f"{name}_over_estimates"] += int(np.count_nonzero(kernels[name][0] > hard + RESOLUTION))
-        sdf, gradient = self._chosen(hard, gradient, kernels)
+    def _by_processor(self, span: GridSpan, cells: Index | None) -> _Made:
+        hard, gradient, entry = self._hard(span, cells)
+        kernels = {name: self._kernel(name, span, cells) for name in self.kernels}
+        for name, (distance, _) in kernels.items():
+            self.counts[f"{name}_without_value"] += int(np.count_nonzero(np.isnan(distance)))
+            self.counts[f"{name}_over_estimates"] += int(np.count_nonzero(distance > hard + RESOLUTION))
+        sdf, gradient = self._choose(hard, gradient, kernels)
         made: Planes = {"sdf": sdf, "hard": hard}
         if gradient is not None:
             made["gradient"] = gradient
@@ -151,7 +147,7 @@ class Baker:
             made["bound"] = (hard.astype(np.float64) - self.bound_margin).astype(np.float32)
         for name, (distance, _) in kernels.items():
             made[name] = np.where(np.isnan(distance), hard, distance)
-        return made, None if entry is None else _picked(entry, cells)
+        return made, entry
 
     def _by_device(self, span: GridSpan) -> _Made:
         assert self.on_device is not None
@@ -164,21 +160,25 @@ class Baker:
         made: Planes = {name: values for name, values in channels.items() if values is not None}
         return {**made, **found.kernels}, found.entry
 
-    def _hard(self, span: GridSpan) -> tuple[Float32, Float32 | None, NDArray[np.int32] | None]:
+    def _hard(self, span: GridSpan, cells: Index | None) -> tuple[Float32, Float32 | None, NDArray[np.int32] | None]:
         hard = np.zeros(span.shape_of_channel, np.float32)
         gradient = np.zeros((*hard.shape, 3), np.float32) if "gradient" in self.channels else None
         entry = np.zeros(hard.shape, np.int32) if "label" in self.channels else None
         native.bake_hard(self.spheres.clusters, self.exact.radii, span, hard, gradient, entry, threads=self.threads)
-        return hard, gradient, entry
+        return (
+            _pick(hard, cells),
+            None if gradient is None else _pick(gradient, cells),
+            None if entry is None else _pick(entry, cells),
+        )
 
-    def _kernel(self, name: str, span: GridSpan) -> tuple[Float32, Float32 | None]:
+    def _kernel(self, name: str, span: GridSpan, cells: Index | None) -> tuple[Float32, Float32 | None]:
         distance = np.zeros(span.shape_of_channel, np.float32)
         has_gradient = "gradient" in self.channels and name == self.kernel_name
         gradient = np.zeros((*distance.shape, 3), np.float32) if has_gradient else None
         self.kernels[name].bake_raw(span, distance, gradient, threads=self.threads)
-        return distance, gradient
+        return _pick(distance, cells), None if gradient is None else _pick(gradient, cells)
 
-    def _chosen(
+    def _choose(
         self, hard: Float32, gradient: Float32 | None, kernels: Mapping[str, tuple[Float32, Float32 | None]]
     ) -> tuple[Float32, Float32 | None]:
         if self.kernel_name is None:
@@ -191,7 +191,7 @@ class Baker:
         return sdf, np.where(is_smooth[..., None], smooth_gradient, gradient)
 
 
-def _picked(values: NDArray[T], cells: NDArray[np.int64] | None) -> NDArray[T]:
+def _pick(values: NDArray[T], cells: Index | None) -> NDArray[T]:
     return values if cells is None else values.reshape(-1, *values.shape[3:])[cells]
 
 

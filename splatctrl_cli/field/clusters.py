@@ -37,7 +37,7 @@ class Spheres:
         and coordinates. Raises NotEvaluableError without any, InputError for a wrong shape, a non-finite value, or a
         negative radius.
         """
-        points, radius_array = _checked(centers, radii)
+        points, radius_array = _check(centers, radii)
         lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
         anchor = 0.5 * (lower + upper)
         codes = _hilbert_codes(points, lower, float((upper - lower).max()))
@@ -62,11 +62,11 @@ class Spheres:
         """World points (Q, 3) relative to the anchor."""
         return np.ascontiguousarray(points_world - self.anchor, dtype=np.float32)
 
-    def laid_out(self, values: Floats, *, spare: float) -> Float64:
+    def lay_out(self, values: Floats, *, spare: float) -> Float64:
         """Values (N,) -> (16 C,), `spare` without a point."""
         return np.where(self.is_point, np.asarray(values, dtype=np.float64)[self.source], spare)
 
-    def gathered(self, values: Float64) -> Float64:
+    def gather(self, values: Float64) -> Float64:
         """Values (16 C,) -> (N,)."""
         result = np.empty(self.num_points)
         is_point = self.is_point.view(np.bool_)
@@ -75,7 +75,7 @@ class Spheres:
 
     def offsets(self, values: Floats, *, spare: float = SPARE_OFFSET) -> Offsets:
         """Lay out offsets (N,), with each cluster's and group's largest."""
-        laid_out = self.laid_out(values, spare=spare).astype(np.float32)
+        laid_out = self.lay_out(values, spare=spare).astype(np.float32)
         by_cluster = laid_out.reshape(-1, LANES).max(axis=1)
         by_group = np.full(_padded(len(by_cluster) // LANES, _GROUPS), spare, np.float32)
         by_group[: len(by_cluster) // LANES] = by_cluster.reshape(-1, LANES).max(axis=1)
@@ -148,7 +148,7 @@ def not_finite(points: Float64) -> InputError:
     return InputError(f"query point {i}: expected finite coordinates, got {points[i].tolist()}")
 
 
-def _checked(centers: ArrayLike, radii: ArrayLike) -> tuple[Float64, Float64]:
+def _check(centers: ArrayLike, radii: ArrayLike) -> tuple[Float64, Float64]:
     center_array, radius_array = np.asarray(centers, dtype=np.float64), np.asarray(radii, dtype=np.float64)
     if center_array.ndim != 2 or center_array.shape[1] != 3 or radius_array.shape != center_array.shape[:1]:
         raise InputError(

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import FieldConfig, fixed
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.grid_cells import RESOLUTION
-from splatctrl_cli.field.weights import METHODS, Kernel, Matern12, SquaredExponential, share_of_loss
+from splatctrl_cli.field.weights import METHODS, Kernel, share_of_loss
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField
 from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import GridSpan, LogSumExp
-from splatctrl_cli.records import DistanceField, Float32, Float64
+from splatctrl_cli.records import DistanceField, Float32, Float64, Index
 
 DEFAULT = FieldConfig()
 
@@ -38,7 +38,7 @@ class SphereField:
         score, gradient, _ = native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
 
-    def nearest(self, points: Float64) -> NDArray[np.int64]:
+    def nearest(self, points: Float64) -> Index:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the distance."""
         local = self.spheres.relative(checked_points(points))
         return self.spheres.source[native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]]
@@ -47,14 +47,14 @@ class SphereField:
 class LogSumExpField(ABC):
     """A log-sum-exp over splats, of a kernel and weights."""
 
-    kernel_type: ClassVar[type[Kernel]]
+    is_matern: ClassVar[bool]
 
     def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
         self.spheres, self._threads = spheres, threads
-        self.kernel = self.kernel_type(config.length_scale)
+        self.kernel = Kernel(length=config.length_scale, is_matern=self.is_matern)
         self.weights = METHODS[config.weights](spheres, self.kernel, config.noise, threads)
         sign = self.weights.sign
-        self.sign = None if sign is None else spheres.laid_out(sign, spare=1.0).astype(np.float32)
+        self.sign = None if sign is None else spheres.lay_out(sign, spare=1.0).astype(np.float32)
         self.tolerance = config.truncation * (1.0 if sign is None else fixed.SIGNED_CARE)
 
     @abstractmethod
@@ -67,9 +67,7 @@ class LogSumExpField(ABC):
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
         """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
-        terms = self.terms()
-        bake = native.bake_matern if terms.is_matern else native.bake_gaussian
-        bake(self.spheres.clusters, terms, span, distance, gradient, threads=threads)
+        native.bake_kernel(self.spheres.clusters, self.terms(), span, distance, gradient, threads=threads)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient as in `query_raw`, or the exact ones where undefined."""
@@ -89,7 +87,7 @@ class GpdfField(LogSumExpField):
     sign (cg) give no positive sum.
     """
 
-    kernel_type = Matern12
+    is_matern = True
 
     def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
         super().__init__(spheres, config, threads=threads)
@@ -103,7 +101,7 @@ class GpdfField(LogSumExpField):
         """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined.
 
         ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this,
-        normalised (`normalised`).
+        normalised (`normalise`).
         """
         score, gradient = native.matern(
             self.spheres.clusters,
@@ -120,8 +118,8 @@ class GpdfField(LogSumExpField):
         return LogSumExp(
             is_matern=True,
             offsets=self.spheres.offsets(self.offsets),
-            exact=self.spheres.laid_out(self.offsets, spare=native.SPARE_OFFSET),
-            radii=self.spheres.laid_out(self.spheres.radii, spare=0.0).astype(np.float32),
+            exact=self.spheres.lay_out(self.offsets, spare=native.SPARE_OFFSET),
+            radii=self.spheres.lay_out(self.spheres.radii, spare=0.0).astype(np.float32),
             sign=self.sign,
             length=self.kernel.length,
             tolerance=self.share,
@@ -136,7 +134,7 @@ class SeField(LogSumExpField):
     surface.
     """
 
-    kernel_type = SquaredExponential
+    is_matern = False
 
     def __init__(self, spheres: Spheres, config: FieldConfig = DEFAULT, *, threads: int = 1) -> None:
         super().__init__(spheres, config, threads=threads)
@@ -185,7 +183,7 @@ class SeField(LogSumExpField):
         return LogSumExp(
             is_matern=False,
             offsets=self.spheres.offsets(self.unit * log_size),
-            exact=self.spheres.laid_out(log_size, spare=native.SPARE_OFFSET),
+            exact=self.spheres.lay_out(log_size, spare=native.SPARE_OFFSET),
             radii=self.radii.values,
             sign=self.sign,
             length=self.kernel.length,
@@ -214,7 +212,7 @@ class SafeField:
         return np.where(is_less, smooth, distance), np.where(is_less[:, None], smooth_gradient, gradient)
 
 
-def normalised(gradient: Float64) -> Float64:
+def normalise(gradient: Float64) -> Float64:
     """Unit gradients (Q, 3), eq. 11 with its sign corrected; 0 stays 0."""
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
@@ -249,8 +247,8 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
     Each of the `steps` goes against the local gradient, as far as the field reads, at most the `exact` distance: it
-    crosses no sphere. The Matern field's zero level stands before the spheres (`slabs.planar_zero_level`). Points at
-    or behind it stay. Raises UsageError for less than one step.
+    crosses no sphere. Points at or behind the zero level, which Matern's field has before the spheres
+    (`slabs.planar_zero_level`), stay. Raises UsageError for less than one step.
     """
     if steps < 1:
         raise UsageError(f"marching: expected at least 1 step, got {steps}")
@@ -259,7 +257,7 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
     rest, gradient = field.query(hit)
     for _ in range(steps):
         length = np.clip(np.minimum(rest, exact.query(hit)[0]), 0.0, None)
-        direction = normalised(gradient)
+        direction = normalise(gradient)
         hit -= length[:, None] * direction
         walked += np.where(direction.any(axis=1), length, 0.0)  # without a slope there is nowhere to go
         rest, gradient = field.query(hit)
@@ -292,7 +290,7 @@ class OnDevice:
         """points (Q, 3) [m] -> distance (Q,) [m]."""
         return self._answer(points).distance.astype(np.float64) if len(points) else np.zeros(0)
 
-    def nearest(self, points: Float64) -> NDArray[np.int64]:
+    def nearest(self, points: Float64) -> Index:
         """points (Q, 3) [m] -> index (Q,) of the sphere that gives the exact distance."""
         if not len(points):
             return np.zeros(0, np.int64)
@@ -312,11 +310,10 @@ def device_field(
 ) -> DeviceField:
     """Put the exact distance and `kernels` on a device, for ``config.distance``."""
     chosen = KERNEL_OF[config.distance]
-    choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
     return DeviceField(
         device,
         spheres.clusters,
         spheres.offsets(spheres.radii),
         {name: field.terms() for name, field in kernels.items()},
-        choice,
+        Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION),
     )

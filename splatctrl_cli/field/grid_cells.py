@@ -67,8 +67,8 @@ def check_loss(voxel: float, max_loss: float) -> None:
     """Raise UsageError if cells of `voxel` [m] may lose more than max_loss [m] of distance.
 
     The certified distance is ``max_c (hard(c) - |x - c|)`` over eight centres c around x. One is within half a
-    diagonal, and ``hard(c) >= hard(x) - |x - c|``: the loss is at most a diagonal, ``sqrt(3) voxel``. Interpolation
-    errs by at most half of that.
+    diagonal, and ``hard(c) >= hard(x) - |x - c|``: it loses at most a diagonal, ``sqrt(3) voxel``, interpolation
+    half.
     """
     loss = LOSS * voxel
     if loss > max_loss:

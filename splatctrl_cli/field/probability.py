@@ -76,7 +76,7 @@ class PaperProbability:
             places.relative(checked_points(points)),
             threads=self._threads,
         )
-        return self._combined(self._gpdf.query_raw(points)[0], half.astype(np.float64))
+        return self._combine(self._gpdf.query_raw(points)[0], half.astype(np.float64))
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
         """Probability (X, Y, Z), whatever the sdf."""
@@ -86,18 +86,18 @@ class PaperProbability:
         terms = replace(
             self._gpdf.terms(),
             offsets=places.offsets(self._offsets),
-            exact=places.laid_out(self._offsets, spare=native.SPARE_OFFSET),
+            exact=places.lay_out(self._offsets, spare=native.SPARE_OFFSET),
             sign=None,
             length=self._half,
             tolerance=self._share,
         )
-        native.bake_matern(places.clusters, terms, span, half, threads=threads)
-        return self._combined(gpdf.astype(np.float64), half.astype(np.float64)).astype(np.float32)
+        native.bake_kernel(places.clusters, terms, span, half, threads=threads)
+        return self._combine(gpdf.astype(np.float64), half.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:
         return {"meaning": "eq. 13 and 14 with lumped weights: a score", "variance_divisor": fixed.VARIANCE_DIVISOR}
 
-    def _combined(self, gpdf: Float64, half: Float64) -> Float64:
+    def _combine(self, gpdf: Float64, half: Float64) -> Float64:
         explained = np.exp(np.minimum(-half / self._half, 0.0))  # the sum never exceeds 1 but by rounding
         occupancy = np.exp(np.minimum(-gpdf / self._gpdf.kernel.length, fixed.CERTAIN_OCCUPANCY))
         return probability_of_occupancy(occupancy, explained)

@@ -74,7 +74,7 @@ def grid_statistics(grid: DistanceGrid) -> GridStatistics:
     """Statistics of a grid, a few planes at a time: channels may be memory maps."""
     sums, most = dict[str, Any](), dict[str, float]()
     for part in _parts(grid):
-        counted, largest = _measured(part)
+        counted, largest = _measure(part)
         sums |= {name: value + sums.get(name, 0) for name, value in counted.items()}
         most |= {name: max(value, most.get(name, -np.inf)) for name, value in largest.items()}
     num, num_lengths = sums["cells"], 0 if "lengths" not in sums else int(sums["lengths"].sum())
@@ -105,7 +105,7 @@ def grid_statistics(grid: DistanceGrid) -> GridStatistics:
     )
 
 
-def _measured(part: DistanceGrid) -> tuple[dict[str, Any], dict[str, float]]:
+def _measure(part: DistanceGrid) -> tuple[dict[str, Any], dict[str, float]]:
     """Counts and sums of some planes, and their largest values; lowest: negative."""
     channels, sdf = part.channels, _floats(part, "sdf")
     known = sdf[np.isfinite(sdf)]

@@ -6,8 +6,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import FieldConfig, OccupancyConfig
-from splatctrl_cli.config.fixed import MAX_RADIUS_SPREAD, ROUGH_LENGTH
+from splatctrl_cli.config import FieldConfig, OccupancyConfig, fixed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker, Planes
 from splatctrl_cli.field.grid_cells import GridLayout, check_memory, check_room, observed_planes
@@ -81,10 +80,10 @@ def _set_warnings(centers: Floats, radii: Floats, length: float, *, has_kernel: 
             f"the length scale {length:g} m exceeds the extent of the splats, {extent:.3g} m: "
             "the kernel field cannot tell them apart; give a smaller --length-scale"
         )
-    if has_kernel and length >= ROUGH_LENGTH:
+    if has_kernel and length >= fixed.ROUGH_LENGTH:
         yield f"the length scale {length:g} m is so large that rounding shows in the fields; give a smaller one"
     thick = radii[radii > 0]
-    if len(thick) and thick.max() > MAX_RADIUS_SPREAD * thick.min():
+    if len(thick) and thick.max() > fixed.MAX_RADIUS_SPREAD * thick.min():
         yield (
             f"radii from {thick.min() * 1e3:.3g} to {thick.max() * 1e3:.3g} mm in one set: "
             "the median radius and its ratios stand for neither end; check the splats' unit, metres"
@@ -255,7 +254,7 @@ class UnknownSpace:
             return blank(planes, is_unknown)
         if self._cubes is None:
             return planes
-        treated, num_changed = self._cubes.planes(first, last).joined(planes, bound_margin)
+        treated, num_changed = self._cubes.select(slice(first, last)).join(planes, bound_margin)
         self.num_changed += num_changed
         return treated
 
@@ -268,7 +267,7 @@ class UnknownSpace:
         }
 
 
-def baked_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
+def bake_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
     """Channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
     planes = baker.allocate(last - first)
     if kept is None:
@@ -306,7 +305,7 @@ def bake(
     baker = Baker(
         chosen, layout, config, channels=channels, occupancy=occupancy, thresholds=thresholds, threads=threads
     )
-    planes = baked_planes(baker, 0, layout.shape[0])
+    planes = bake_planes(baker, 0, layout.shape[0])
     header = field_header(splats, chosen, labels, baker, has_occupancy=occupancy is not None)
     if config.unknown != "free":
         unknown = UnknownSpace(layout, config, occupancy, thresholds or OccupancyConfig())

@@ -1,14 +1,14 @@
 """Spheres of a scene's field, and the treatment of never-seen space."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import distance_transform_cdt, distance_transform_edt
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL
-from splatctrl_cli.records import Bool, Float32, Index, Label, SplatSet, Values
+from splatctrl_cli.records import Bool, Columns, Float32, Index, Label, SplatSet, Values
 from splatctrl_cli.voxels import Balls
 
 DEFAULT_LABELS = frozenset({Label.OBJECT, Label.HUMAN})
@@ -100,7 +100,7 @@ def blank(channels: Mapping[str, Values], is_unknown: Bool) -> Channels:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cubes:
+class Cubes(Columns):
     """The never-seen cells (X, Y, Z) of a grid as solid cubes.
 
     distance: lower bound [m] of the signed distance from cell centres; away (..., 3): unit vectors of its growth.
@@ -131,15 +131,7 @@ class Cubes:
             away=np.moveaxis(away, 0, -1),
         )
 
-    def planes(self, first: int, last: int) -> "Cubes":
-        return replace(
-            self,
-            is_unknown=self.is_unknown[first:last],
-            distance=self.distance[first:last],
-            away=self.away[first:last],
-        )
-
-    def joined(self, channels: Mapping[str, Values], bound_margin: float) -> tuple[Channels, int]:
+    def join(self, channels: Mapping[str, Values], bound_margin: float) -> tuple[Channels, int]:
         """Channels of the nearer of field and cubes, and the number of changed cells."""
         joined = dict(channels)
         is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))

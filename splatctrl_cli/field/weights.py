@@ -34,10 +34,9 @@ MAX_BLOCKS = 2000
 def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Float64:
     """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
-    Each centre spreads one unit over eight nodes (trilinear), these are convolved, and it reads them back. Its own
-    term becomes k(0) = 1. Spreading and reading blur by h^2 / 3 per axis (h: node spacing); convolving with
-    ``2 k - (mean of k at the six neighbours)`` undoes it to second order. Raises UsageError for over `MAX_BLOCKS`
-    blocks.
+    Each centre spreads one unit over eight nodes (trilinear), and reads their convolution. Its own term becomes k(0)
+    = 1. Spreading and reading blur by h^2 / 3 per axis (h: node spacing), which convolving with ``2 k - (mean of k at
+    the six neighbours)`` undoes to second order. Raises UsageError for over `MAX_BLOCKS` blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
     nodes = (centers - centers.min(axis=0)) / voxel
@@ -213,30 +212,21 @@ def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: 
     return csr_array(upper + upper.T + (1.0 + noise) * eye_array(len(centers), format="csr"))
 
 
-@dataclass(frozen=True)
-class Matern12:
-    """``k(d) = exp(-d / l)``, the paper's kernel: its inverse is ``r(o) = -l log o``."""
+@dataclass(frozen=True, kw_only=True)
+class Kernel:
+    """A stationary kernel of the paper, of length scale l [m], with k(0) = 1.
+
+    Matern 1/2: ``k(d) = exp(-d / l)``, its inverse is ``r(o) = -l log o``. Else Gaussian: ``k(d) = exp(-d^2 / (2
+    l^2))``, ``r(o) = sqrt(-2 l^2 log o)``.
+    """
 
     length: float
+    is_matern: bool
 
     def value(self, distance: Float64) -> Float64:
         """k(d) for distances of any shape [m]."""
-        return np.asarray(np.exp(-distance / self.length))
-
-
-@dataclass(frozen=True)
-class SquaredExponential:
-    """``k(d) = exp(-d^2 / (2 l^2))``, the paper's Gaussian kernel; inverse: ``r(o) = sqrt(-2 l^2 log o)``."""
-
-    length: float
-
-    def value(self, distance: Float64) -> Float64:
-        """k(d) for distances of any shape [m]."""
-        return np.asarray(np.exp(-0.5 * (distance / self.length) ** 2))
-
-
-Kernel = Matern12 | SquaredExponential
-"""A stationary kernel k(d) of length scale l [m] with k(0) = 1."""
+        scaled = distance / self.length
+        return np.asarray(np.exp(-scaled if self.is_matern else -0.5 * scaled**2))
 
 
 def share_of_loss(length: float, tolerance: float) -> float:
@@ -247,9 +237,9 @@ def share_of_loss(length: float, tolerance: float) -> float:
 def log_row_sums(kernel: Kernel, spheres: Spheres, *, threads: int = 0) -> Float64:
     """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
     sums = native.row_sums(
-        spheres.clusters, spheres.is_point, kernel.length, is_matern=isinstance(kernel, Matern12), threads=threads
+        spheres.clusters, spheres.is_point, kernel.length, is_matern=kernel.is_matern, threads=threads
     )
-    return np.asarray(np.log(spheres.gathered(sums)))
+    return np.asarray(np.log(spheres.gather(sums)))
 
 
 NO_LOG = -1e4  # for a weight of zero: negligible, and finite
@@ -274,12 +264,12 @@ def row_sum_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
 
     M of eq. 12 is ``w_i k_d(-r_i)``.
     """
-    return _lumped(log_row_sums(kernel, spheres, threads=threads), noise)
+    return _lump(log_row_sums(kernel, spheres, threads=threads), noise)
 
 
 def voxel_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
     """`row_sum_weights` from a voxel grid (III-D)."""
-    return _lumped(np.log(voxel_row_sums(_centers(spheres), kernel.length, kernel.value)), noise)
+    return _lump(np.log(voxel_row_sums(_centers(spheres), kernel.length, kernel.value)), noise)
 
 
 def process_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
@@ -288,7 +278,7 @@ def process_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
     Matern: y is ``k_d(-r)``, ``w_i = M_i / k_d(-r_i)``. Gaussian: y is 1, ``w = M``: ``k_d(-r) = k_d(r)`` loses the
     radius's sign.
     """
-    log_values = spheres.radii / kernel.length if isinstance(kernel, Matern12) else np.zeros(len(spheres.radii))
+    log_values = spheres.radii / kernel.length if kernel.is_matern else np.zeros(len(spheres.radii))
     scaled, log_scale, num_iterations, residual = solve_process(
         _centers(spheres), log_values, kernel.length, kernel.value, noise
     )
@@ -306,10 +296,10 @@ Method = Callable[[Spheres, Kernel, float, int], Weights]
 METHODS: Mapping[str, Method] = {"rowsum": row_sum_weights, "voxel": voxel_weights, "cg": process_weights}
 
 
-def _lumped(log_sums: Float64, noise: float) -> Weights:
+def _lump(log_sums: Float64, noise: float) -> Weights:
     with np.errstate(divide="ignore"):  # noise 0 gives log 0 = -inf, rightly
         return Weights(log_size=np.asarray(-np.logaddexp(log_sums, np.log(noise))), sign=None)
 
 
 def _centers(spheres: Spheres) -> Float64:
-    return np.stack([spheres.gathered(axis.astype(np.float64)) for axis in spheres.clusters.centers], axis=1)
+    return np.stack([spheres.gather(axis.astype(np.float64)) for axis in spheres.clusters.centers], axis=1)

@@ -19,6 +19,7 @@ Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 Floats = NDArray[np.floating]
 UInt8 = NDArray[np.uint8]
+UInt16 = NDArray[np.uint16]
 
 
 def _best() -> Any:

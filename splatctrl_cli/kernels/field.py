@@ -204,7 +204,7 @@ def bake_hard(
     native.field_bake_hard(*spheres, *radii, *span.arrays, num_threads(threads), distance, gradient, entry)
 
 
-def bake_gaussian(
+def bake_kernel(
     spheres: Clusters,
     terms: LogSumExp,
     span: GridSpan,
@@ -213,36 +213,16 @@ def bake_gaussian(
     *,
     threads: int = 0,
 ) -> None:
-    """Write `gaussian` at the cells of `span`; exact: ``log |w_i|``, offsets: ``2 l^2 log |w_i|``."""
-    native.field_bake_gaussian(
+    """Write `matern` or `gaussian` at the cells of `span`.
+
+    Matern: exact are offsets in float64. Gaussian: exact are ``log |w_i|``, offsets ``2 l^2 log |w_i|``.
+    """
+    bake = native.field_bake_matern if terms.is_matern else native.field_bake_gaussian
+    bake(
         *spheres,
         *terms.offsets,
         terms.exact,
-        terms.radii,
-        terms.sign,
-        terms.length,
-        terms.tolerance,
-        *span.arrays,
-        num_threads(threads),
-        distance,
-        gradient,
-    )
-
-
-def bake_matern(
-    spheres: Clusters,
-    terms: LogSumExp,
-    span: GridSpan,
-    distance: Float32,
-    gradient: Float32 | None = None,
-    *,
-    threads: int = 0,
-) -> None:
-    """Write `matern` at the cells of `span`; exact: offsets in float64."""
-    native.field_bake_matern(
-        *spheres,
-        *terms.offsets,
-        terms.exact,
+        *(() if terms.is_matern else (terms.radii,)),
         terms.sign,
         terms.length,
         terms.tolerance,
@@ -265,7 +245,7 @@ def touched_blocks(
 ) -> None:
     """Set is_touched (blocks) to 1 where spheres in `changed` (16 C,) can matter.
 
-    For `bake_hard` if `length` is None (offsets: radii), else `bake_gaussian` (``2 l^2 log |w_i|``).
+    For `bake_hard` if `length` is None (offsets: radii), else for a Gaussian `bake_kernel` (``2 l^2 log |w_i|``).
     """
     native.field_touched(
         *spheres,

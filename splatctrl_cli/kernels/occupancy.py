@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import Float64, UInt8, native
+from splatctrl_cli.kernels import Float32, Float64, UInt8, UInt16, native
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +16,7 @@ class DepthImage:
 
     intrinsics: Float64
     T_world_camera: Float64
-    depth: NDArray[np.float32]
+    depth: Float32
     min_range: float
     max_range: float
 
@@ -29,9 +28,9 @@ def pack_grid(origin: Float64, voxel: float, shape: tuple[int, ...]) -> Float64:
 
 def integrate_depth(
     grid: Float64,
-    log_odds: NDArray[np.float32],
-    num_updates: NDArray[np.uint16],
-    last_seen: NDArray[np.uint16],
+    log_odds: Float32,
+    num_updates: UInt16,
+    last_seen: UInt16,
     hits: UInt8,
     image: DepthImage,
     *,

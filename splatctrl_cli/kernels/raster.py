@@ -75,9 +75,6 @@ class Rasteriser(PreparedView):
         self.native.visible(out)
         return out.astype(bool)
 
-    def splats_per_tile(self) -> float:
-        return float(self.native.splats_per_tile())
-
 
 @dataclass(frozen=True, kw_only=True)
 class LossTerms:

@@ -16,7 +16,7 @@ from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import Bool, DistanceGrid, Float32, Float64, UInt8
-from splatctrl_cli.robot.coverage import areas, refined
+from splatctrl_cli.robot.coverage import areas, refine_triangles
 from splatctrl_cli.voxels import VoxelState
 
 WIDTH = 12.0  # inches; at DPI 100 the width is 1200 pixels
@@ -289,7 +289,7 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
 
     surfaces: triangles (F, 3, 3) [m]; centers (S, 3), radii (S,) [m], in one frame.
     """
-    triangles = np.concatenate([refined(surface, 0.01)[0] for surface in surfaces])
+    triangles = np.concatenate([refine_triangles(surface, 0.01) for surface in surfaces])
     triangles = triangles[areas(triangles) > 0]
     is_bare = _is_outside(triangles.mean(axis=1), centers, radii)
     corners = [triangles.reshape(-1, 3), centers - radii[:, None], centers + radii[:, None]]

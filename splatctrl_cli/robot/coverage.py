@@ -210,16 +210,15 @@ def areas(triangles: Float64) -> Float64:
     return np.asarray(0.5 * np.linalg.norm(face_normals(triangles), axis=1))
 
 
-def refined(triangles: Float64, longest: float) -> tuple[Float64, Float64]:
-    """Surface in triangles with edges up to `longest` [m], and their areas."""
+def refine_triangles(triangles: Float64, longest: float) -> Float64:
+    """Surface in triangles (F, 3, 3) with edges up to `longest` [m]."""
     parts = []
     pending = triangles
     while len(pending):
         is_small = _longest_edges(pending)[0] <= longest
         parts.append(pending[is_small])
         pending = _halves(pending[~is_small])
-    done = np.concatenate(parts)
-    return done, areas(done)
+    return np.concatenate(parts)
 
 
 def _of_link(

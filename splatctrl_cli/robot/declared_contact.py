@@ -16,19 +16,10 @@ REMEDY = "see splatctrl help declare for the keys of a declaration"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Carried:
-    """A carried box in the frame of `link` [m], `start` to `end` [s after the first state]."""
+class DeclaredContact:
+    """A carried box or an intended contact of `link`, `start` to `end` [s after the first state].
 
-    link: str
-    box: Box
-    start: float
-    end: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExpectedContact:
-    """An intended contact of `link` within a world box [m], `start` to `end` [s after the first state].
-
+    box [m]: of what is carried, in the link's frame; or in world, around the contact, which has a `reason`.
     is_learned: from an observed grasp, not a file.
     """
 
@@ -36,7 +27,7 @@ class ExpectedContact:
     box: Box
     start: float
     end: float
-    reason: str
+    reason: str = ""
     is_learned: bool = False
 
 
@@ -47,8 +38,8 @@ class Declarations:
     num_uses: by (table, index), how often an entry changed a label or excused a contact.
     """
 
-    carried: tuple[Carried, ...] = ()
-    expected_contact: tuple[ExpectedContact, ...] = ()
+    carried: tuple[DeclaredContact, ...] = ()
+    expected_contact: tuple[DeclaredContact, ...] = ()
     num_uses: dict[tuple[str, int], int] = field(default_factory=dict)
 
     def carried_at(self, time_s: float) -> list[tuple[str, Box]]:
@@ -61,19 +52,19 @@ class Declarations:
         for index, entry in enumerate(self.carried):
             if entry.link == link and entry.start <= time_s <= entry.end:
                 its = entry.box.contains(points_link)
-                self.used("carried", index, int(its.sum()))
+                self.count_use("carried", index, int(its.sum()))
                 inside |= its
         return inside
 
-    def expects(self, link: str, point_world: Floats, time_s: float) -> ExpectedContact | None:
+    def find_expected(self, link: str, point_world: Floats, time_s: float) -> DeclaredContact | None:
         """First entry for a contact at a point (3,) [m]; counts its use."""
         for index, entry in enumerate(self.expected_contact):
             if link == entry.link and entry.start <= time_s <= entry.end and entry.box.contains(point_world):
-                self.used("expected_contact", index, 1)
+                self.count_use("expected_contact", index, 1)
                 return entry
         return None
 
-    def used(self, table: str, index: int, count: int) -> None:
+    def count_use(self, table: str, index: int, count: int) -> None:
         if count:
             self.num_uses[table, index] = self.num_uses.get((table, index), 0) + count
 
@@ -115,9 +106,11 @@ def read_declarations(path: Path, links: Collection[str] | None = None) -> Decla
     unknown = sorted(set(document) - {"carried", "expected_contact"})
     if unknown:
         raise InputError(f"{path}: expected [[carried]] and [[expected_contact]], got {unknown[0]}", remedy=REMEDY)
-    carried = [Carried(**entry) for entry in _entries(path, document, "carried", links)]
-    expected = [ExpectedContact(**entry) for entry in _entries(path, document, "expected_contact", links)]
-    return Declarations(carried=tuple(carried), expected_contact=tuple(expected))
+    carried, expected = (
+        tuple(DeclaredContact(**entry) for entry in _entries(path, document, table, links))
+        for table in ("carried", "expected_contact")
+    )
+    return Declarations(carried=carried, expected_contact=expected)
 
 
 def _entries(

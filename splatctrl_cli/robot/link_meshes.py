@@ -189,7 +189,7 @@ def _primitive(shape: Shape) -> Solid:
     )
 
 
-def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
+def place_mesh(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
     """Mesh in the link's frame. Raises InputError for an implausible length (another unit)."""
     vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
     length = float(np.ptp(vertices, axis=0).max())
@@ -217,7 +217,7 @@ def _unit_words(shape: MeshShape, length: float) -> str:
 
 def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
     """Mesh's solids, link frame; an open mesh as closed pieces and rest."""
-    whole = placed(shape, mesh)
+    whole = place_mesh(shape, mesh)
     pieces = [whole] if whole.is_closed else _taken_apart(whole)
     return [
         Solid(link=shape.link, surface=piece, slack=0.0, body=piece if piece.is_closed else _hull(piece.vertices))

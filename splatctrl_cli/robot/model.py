@@ -21,7 +21,7 @@ from splatctrl_cli.robot.sphere_files import (
     RENAMED,
     are_links_renamed,
     lever_arms,
-    matched_links,
+    match_links,
     read_spheres,
     spheres_of,
     with_boxes,
@@ -60,8 +60,7 @@ class RobotModel:
         self.sphere_set = spheres
         self.left_out = tuple(left_out)
         self.are_links_renamed = are_links_renamed
-        covered = set(spheres.links)
-        self.bare_links = tuple(link for link in urdf.solid_links if link not in covered)
+        self.bare_links = tuple(link for link in urdf.solid_links if link not in spheres.links)
         self.coverage: CoverageReport | None = None
         self.coverage_unknown = "the collision geometry was not read"
         self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)
@@ -88,7 +87,7 @@ class RobotModel:
         self.frame_names = tuple(link for link in urdf.links if link in self._frames)
         self._sphere_joint, self._sphere_offset = self._joint_offsets()
         self.chain = self._as_chain()
-        self.moving_spheres: Bool = self._moved()
+        self.moving_spheres: Bool = self._find_moving()
 
     @classmethod
     def from_urdf(
@@ -113,7 +112,7 @@ class RobotModel:
         if spheres is None:
             spheres = spheres_of(file)
         asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
-        sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
+        sphere_set, left_out = match_links(asked, file, "sphere set" if asked is spheres else str(spheres))
         return cls(
             file, model, sphere_set, T, left_out, are_links_renamed=are_links_renamed(asked, file), packages=packages
         )
@@ -160,7 +159,7 @@ class RobotModel:
         deficit = np.full(len(self.sphere_set.radii), np.nan)
         if coverage is not None:
             deficit = deficit_by_sphere(self.urdf, self.sphere_set, coverage)
-        return self._changed(coverage=coverage, coverage_unknown=unknown, sphere_deficit=deficit)
+        return self._change(coverage=coverage, coverage_unknown=unknown, sphere_deficit=deficit)
 
     @property
     def surface(self) -> RobotSurface:
@@ -171,7 +170,7 @@ class RobotModel:
 
     def with_self_model(self, found: SelfModel) -> "RobotModel":
         """Robot with a self-model's permanent parts; `surface_at` adds temporary ones."""
-        return self._changed(_surface=self.surface.joined(found.pieces()), self_model=found, _surfaces={})
+        return self._change(_surface=self.surface.joined(found.pieces()), self_model=found, _surfaces={})
 
     @property
     def changes(self) -> list[int]:
@@ -189,7 +188,7 @@ class RobotModel:
 
     def at(self, stamp_ns: int) -> "RobotModel":
         """Robot with its surface of a stamp [ns] for all times."""
-        return self._changed(_surface=self.surface_at(stamp_ns), self_model=None) if self.changes else self
+        return self._change(_surface=self.surface_at(stamp_ns), self_model=None) if self.changes else self
 
     def extents(self) -> dict[str, list[float]]:
         """`RobotSurface.extents` of each link in one bent posture."""
@@ -198,17 +197,17 @@ class RobotModel:
         return surface.extents(surface.poses({link: self.frame_pose(q, link) for link in surface.links}))
 
     def with_self_pairs(self, pairs: Index) -> "RobotModel":
-        return self._changed(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2), _allowance=None)
+        return self._change(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2), _allowance=None)
 
     def with_self_allowance(self, allowance: Float64) -> "RobotModel":
-        return self._changed(_allowance=allowance)
+        return self._change(_allowance=allowance)
 
     @property
     def self_allowance(self) -> Float64:
         """Shortfall (P,) [m] of each pair from the configured margin (`robot.self_margins`)."""
         return np.zeros(len(self.self_pairs())) if self._allowance is None else self._allowance
 
-    def _changed(self, **attributes: object) -> "RobotModel":
+    def _change(self, **attributes: object) -> "RobotModel":
         other = copy(self)
         other.__dict__.update(attributes)
         return other
@@ -249,7 +248,7 @@ class RobotModel:
 
     def sphere_centers(self, q: Float64) -> Float64:
         """Centres (S, 3) at q (J,)."""
-        return np.asarray(self.chain.centers(self._checked(q)[None])[0])
+        return np.asarray(self.chain.centers(self._check(q)[None])[0])
 
     def sphere_centers_batch(self, q: Float64, *, threads: int = 1) -> Float64:
         """Centres (T, S, 3) at q (T, J)."""
@@ -260,7 +259,7 @@ class RobotModel:
 
     def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
         """Centres (S, 3) and Jacobians (S, 3, J) at q (J,)."""
-        return self.chain.jacobians(self._checked(q))
+        return self.chain.jacobians(self._check(q))
 
     def frame_pose(self, q: Float64, frame: str) -> Float64:
         """T_world_frame (4, 4) of a link at q (J,). Raises InputError for an unknown link."""
@@ -300,7 +299,7 @@ class RobotModel:
     def _framed(self, q: Float64, frame: str) -> tuple[Float64, Float64]:
         there = self._model.frames[self._frame(frame)]
         return self.chain.frame(
-            self._checked(q), there.parentJoint, np.ascontiguousarray(there.placement.homogeneous[:3])
+            self._check(q), there.parentJoint, np.ascontiguousarray(there.placement.homogeneous[:3])
         )
 
     def lever_arms(self) -> Float64:
@@ -353,7 +352,7 @@ class RobotModel:
         order, factor, offset = self.joint_columns(log_joint_names)
         return np.asarray(position[..., order] * factor + offset)
 
-    def _checked(self, q: Float64) -> Float64:
+    def _check(self, q: Float64) -> Float64:
         if np.shape(q) != (self.num_joints,):
             raise InputError(f"joint positions: expected shape ({self.num_joints},), got {np.shape(q)}")
         return np.asarray(q, dtype=np.float64)
@@ -368,19 +367,18 @@ class RobotModel:
         placement = np.array([self.T_world_base, *(p.homogeneous for p in list(self._model.jointPlacements)[1:])])
         data = self._model.createData()
         pinocchio.computeJointJacobians(self._model, data, self._configuration(self.middle))
-        kind, axis = [REVOLUTE], [np.array([0.0, 0.0, 1.0])]
-        for body in range(1, self.num_joints + 1):
-            local = pinocchio.getJointJacobian(self._model, data, body, pinocchio.ReferenceFrame.LOCAL)
-            column = np.asarray(local).reshape(6, -1)[:, body - 1]
-            linear, angular = column[:3], column[3:]
-            is_turn = bool(np.linalg.norm(angular) > 0.5)
-            kind.append(REVOLUTE if is_turn else PRISMATIC)
-            axis.append(angular if is_turn else linear)
+        local = [
+            np.asarray(pinocchio.getJointJacobian(self._model, data, body, pinocchio.ReferenceFrame.LOCAL))
+            for body in range(1, self.num_joints + 1)
+        ]
+        columns = np.array([J.reshape(6, -1)[:, joint] for joint, J in enumerate(local)])
+        is_turn = np.linalg.norm(columns[:, 3:], axis=1) > 0.5
+        axis = np.where(is_turn[:, None], columns[:, 3:], columns[:, :3])
         return Chain(
             parent=np.array(self._model.parents, dtype=np.int64),
-            kind=np.array(kind, dtype=np.int64),
+            kind=np.append(REVOLUTE, np.where(is_turn, REVOLUTE, PRISMATIC)).astype(np.int64),
             placement=np.ascontiguousarray(placement[:, :3, :]),
-            axis=np.array(axis, dtype=np.float64),
+            axis=np.vstack([[0.0, 0.0, 1.0], axis]),
             sphere_body=self._sphere_joint,
             offset=np.ascontiguousarray(self._sphere_offset).reshape(-1, 3),
         )
@@ -393,7 +391,7 @@ class RobotModel:
         ]
         return np.array([f.parentJoint for f in frames], dtype=np.int64), np.array(offsets, dtype=np.float64)
 
-    def _moved(self) -> Bool:
+    def _find_moving(self) -> Bool:
         """Spheres on the base, or centred on their only axes, never move."""
         postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
         return np.asarray(np.max([np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures], axis=0) > 1e-9)

@@ -104,19 +104,17 @@ def self_collision_pairs(
     num_postures = 0 if disabled else num_postures
     a, b = np.triu_indices(len(links), k=1)
     gaps = _gaps(model, owner, np.stack([a, b], axis=1), num_postures, seed)
-    pairs = []
-    for index, (i, j) in enumerate(zip(a, b, strict=True)):
-        column = gaps[:, index]
-        pairs.append(
-            LinkPair(
-                links=(links[i], links[j]),
-                left_out=known.get(frozenset((links[i], links[j]))) or _sampled_reason(column, drop_never),
-                num_sphere_pairs=int((owner == i).sum() * (owner == j).sum()),
-                least_gap=float(column.min()) if len(column) else np.nan,
-                largest_gap=float(column.max()) if len(column) else np.nan,
-                hit_share=float(np.mean(column <= 0)) if len(column) else np.nan,
-            )
+    pairs = [
+        LinkPair(
+            links=(links[i], links[j]),
+            left_out=known.get(frozenset((links[i], links[j]))) or _sampled_reason(column, drop_never),
+            num_sphere_pairs=int((owner == i).sum() * (owner == j).sum()),
+            least_gap=float(column.min()) if len(column) else np.nan,
+            largest_gap=float(column.max()) if len(column) else np.nan,
+            hit_share=float(np.mean(column <= 0)) if len(column) else np.nan,
         )
+        for i, j, column in zip(a, b, gaps.T, strict=True)
+    ]
     keep = np.zeros((len(links), len(links)), dtype=bool)
     keep[a, b] = keep[b, a] = [pair.left_out is None for pair in pairs]
     first, second = np.triu_indices(len(owner), k=1)

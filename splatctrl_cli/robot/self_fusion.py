@@ -4,7 +4,7 @@ Projective signed distances (Curless and Levoy, A volumetric method for building
 1996). L links, V views, K configurations of a link, N cells, F triangles.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +52,7 @@ def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOS
     Farthest-point sampling by places and ways in between. T_world_link: (M, L, 4, 4).
     """
     corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
-    placed = _moved(T_world_link, corners).reshape(len(T_world_link), -1, 3)
+    placed = _move(T_world_link, corners).reshape(len(T_world_link), -1, 3)
     steps = np.linalg.norm(np.diff(placed, axis=0), axis=2).max(axis=1)
     path = PATH_SHARE * np.append(0.0, np.cumsum(steps))
     chosen, gap = [0], np.full(len(placed), np.inf)
@@ -78,19 +78,21 @@ def learn(
 
     T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
     link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
-    `NUM_CONFIGURATIONS` show it as a surface, and at most `FREE_SHARE` see through it; most views of one decide. It
-    must also leave its place in the world with the link, and move against each nearer link. Raises InputError where
-    no link can be learned.
+    `NUM_CONFIGURATIONS` show it as a surface, at most `FREE_SHARE` see through it (most views of one decide), it
+    leaves its place in the world with the link, and moves against each nearer link. Raises InputError where no link
+    can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
-    placed = _moved(T_world_link, corners)
-    views = _views(
-        surface,
-        frames,
-        T_world_link,
-        np.stack([placed.min(axis=2), placed.max(axis=2)], axis=2),
-        max(reach, MOST_REACH),
+    placed = _move(T_world_link, corners)
+    views = list(
+        _views(
+            surface,
+            frames,
+            T_world_link,
+            np.stack([placed.min(axis=2), placed.max(axis=2)], axis=2),
+            max(reach, MOST_REACH),
+        )
     )
     learned: list[LearnedLink] = []
     unknown = {}
@@ -133,12 +135,12 @@ class _View:
 
 def _views(
     surface: RobotSurface, frames: Sequence[RgbdFrame], T_world_link: Float64, boxes: Float64, reach: float
-) -> list[_View]:
-    """Compare frames with the rendered robot, which explains pixels within the recording's noise.
+) -> Iterator[_View]:
+    """Yield frames, compared with the rendered robot, which explains pixels within the recording's noise.
 
     Unexplained points within `reach` of the boxes (V, L, 2, 3) stay.
     """
-    thinned, ratios, views = [], [np.zeros(1)], []
+    thinned, ratios = [], [np.zeros(1)]
     for frame, T in zip(frames, T_world_link, strict=True):
         stride = max(1, round(frame.depth.shape[1] / WIDE))
         lens, depth = strided_lens(frame.intrinsics, stride), np.ascontiguousarray(frame.depth[::stride, ::stride])
@@ -158,12 +160,10 @@ def _views(
         points = points[is_near]
         is_own = surface.distance(T, points, within=tolerance[v, u]) <= tolerance[v, u]
         links[v[is_own], u[is_own]] = EXPLAINED
-        view = _View(
+        yield _View(
             stamp_ns=frame.stamp_ns, stride=stride, lens=frame.intrinsics, links=links, points_world=points[~is_own],
             T_camera_world=invert_transform(frame.T_world_camera), T_world_link=T, depth=frame.depth,
         )  # fmt: skip
-        views.append(view)
-    return views
 
 
 def _grow_link(
@@ -184,7 +184,7 @@ def _learn_link(
     at = np.array([k for _, k in used])
     origin, mask = _candidates(np.concatenate(points), at.repeat([len(part) for part in points]))
     cells = origin + VOXEL * np.argwhere(mask)
-    gap = _own_distance(surface, number, cells, reach)
+    gap = surface.distance_to(surface.links[number], cells, within=reach)
     is_near = (gap <= reach) & (gap > -TRUNCATION)
     mask[mask], cells, gap = is_near, cells[is_near], gap[is_near]
     in_order = [used[int(np.argmax(at == k))][0] for k in range(at.max() + 1)]
@@ -215,24 +215,25 @@ def _learn_link(
             place = cells[is_part][heights.argmax()]
             known = np.argmax(np.cumsum(seen[:, is_part], axis=0) >= NUM_CONFIGURATIONS, axis=0)
             since = 1e-9 * float(np.median(stamps[run][known]) - stamps.min())
-        part = LearnedLink(
-            link=surface.links[number],
-            origin=origin,
-            voxel=VOXEL,
-            distance=np.where(spread_cells(mask, (seen | free).sum(axis=0), 0) > 0, grid, np.float32(np.nan)),
-            configurations=spread_cells(mask, seen.sum(axis=0), 0).astype(np.uint8),
-            triangles=_triangles(grid, origin),
-            outside_95=float(np.quantile(heights, 0.95)),
-            outside_most=float(heights.max()),
-            place=place,
-            since=since,
-            num_pixels=int(num_own.sum()) + sum(map(len, points)),
-            num_configurations=len(in_order),
-            start_ns=interval.start_ns,
-            end_ns=interval.end_ns,
-            first_ns=int(stamps.min()),
+        found.append(
+            LearnedLink(
+                link=surface.links[number],
+                origin=origin,
+                voxel=VOXEL,
+                distance=np.where(spread_cells(mask, (seen | free).sum(axis=0), 0) > 0, grid, np.float32(np.nan)),
+                configurations=spread_cells(mask, seen.sum(axis=0), 0).astype(np.uint8),
+                triangles=_triangles(grid, origin),
+                outside_95=float(np.quantile(heights, 0.95)),
+                outside_most=float(heights.max()),
+                place=place,
+                since=since,
+                num_pixels=int(num_own.sum()) + sum(map(len, points)),
+                num_configurations=len(in_order),
+                start_ns=interval.start_ns,
+                end_ns=interval.end_ns,
+                first_ns=int(stamps.min()),
+            )
         )
-        found.append(part)
     return found
 
 
@@ -263,7 +264,7 @@ def _stays_in_world(
 
     A cell stays if views show a surface at its old place, `AWAY` from the new one, as often as they see through it.
     """
-    places, votes = _moved(poses, cells), np.zeros(len(cells), np.int64)
+    places, votes = _move(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:
         for m in spread(range(len(poses)), MOST_ASKED):
             asked = np.flatnonzero(seen[m] & (np.linalg.norm(places[m] - places[k], axis=1) >= AWAY))
@@ -290,16 +291,16 @@ def _is_on_other_link(
 ) -> Bool:
     """True for cells nearer to a link against which they move less than `STEP`."""
     found = np.zeros(len(cells), bool)
-    for other in range(len(surface.links)):
-        places = _moved(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
+    for other, link in enumerate(surface.links):
+        places = _move(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
         if other != number and len(cells):
             is_still = _span(places, seen) < STEP
             at = places[seen.argmax(axis=0), np.arange(len(cells))]
-            found |= is_still & (_own_distance(surface, other, at, reach) < gap)
+            found |= is_still & (surface.distance_to(link, at, within=reach) < gap)
     return found
 
 
-def _moved(T: Float64, points: Float64) -> Float64:
+def _move(T: Float64, points: Float64) -> Float64:
     return np.asarray(np.einsum("...ij,...nj->...ni", T[..., :3, :3], points) + T[..., None, :3, 3])
 
 
@@ -337,12 +338,6 @@ def _triangles(distance: Float32, origin: Float64) -> Float64:
         return np.zeros((0, 3, 3))
     vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="ascent")
     return np.asarray(origin + VOXEL * vertices[faces], np.float64)
-
-
-def _own_distance(surface: RobotSurface, number: int, points: Float64, within: float) -> Float64:
-    others = [link for k, link in enumerate(surface.links) if k != number]
-    still = np.tile(np.eye(4), (len(surface.links), 1, 1))
-    return surface.distance(still, points, without=others, within=within)
 
 
 def _boxes(surface: RobotSurface) -> Float64:

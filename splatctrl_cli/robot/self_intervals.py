@@ -120,13 +120,14 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
         is_gone = min(side.max() for side in sides) >= GONE
         if is_gone and np.bincount(pieces[pieces > 0]).max(initial=0) >= LEAST_CELLS:
             free_before, free_after = int(before[its].max()), int(after[its].min())
-            interval = Interval(
-                first=run[0],
-                last=run[1],
-                start_ns=ALWAYS[0] if free_before < 0 else int(stamps[free_before] + stamps[run[0]]) // 2,
-                end_ns=ALWAYS[1] if free_after == num else int(stamps[run[1]] + stamps[free_after]) // 2,
+            found.append(
+                Interval(
+                    first=run[0],
+                    last=run[1],
+                    start_ns=ALWAYS[0] if free_before < 0 else int(stamps[free_before] + stamps[run[0]]) // 2,
+                    end_ns=ALWAYS[1] if free_after == num else int(stamps[run[1]] + stamps[free_after]) // 2,
+                )
             )
-            found.append(interval)
     return found
 
 

@@ -192,10 +192,9 @@ class SelfSurfaces:
 class KeptMargin:
     """Two links whose spheres keep `margin` [m] instead of the configured one.
 
-    margin: negative if the spheres may overlap; None: inseparable, so the configured margin stays. apart: least gap
-    [m] of their surfaces (of their spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one is in
-    `fixtures`. surface_gap: least gap [m] of their surfaces in sampled postures that keep the margin, None if
-    unknown.
+    margin: negative if the spheres may overlap; None: inseparable, the configured one stays. apart: least gap [m] of
+    their surfaces (spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one is in `fixtures`.
+    surface_gap: least gap [m] of their surfaces in sampled postures that keep the margin, None if unknown.
     """
 
     links: tuple[str, str]
@@ -210,21 +209,27 @@ def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) ->
 
     They keep `margin` [m], or a share of their largest gap if that is less.
     """
-    standing = fixtures(model)
-    postures, found = random_postures(model, SELF_TOUCHING, seed=0), []
-    for pair in (pair for pair in surfaces.pairs if not standing.isdisjoint(pair)):
-        apart = min(margin, SELF_SHARE * max(surfaces.gap(q, pair) for q in postures))
-        found.append(KeptMargin(links=pair, margin=None, apart=apart, surface_gap=None, is_fixture=True))
-    return tuple(found)
+    standing, postures = fixtures(model), random_postures(model, SELF_TOUCHING, seed=0)
+    return tuple(
+        KeptMargin(
+            links=pair,
+            margin=None,
+            apart=min(margin, SELF_SHARE * max(surfaces.gap(q, pair) for q in postures)),
+            surface_gap=None,
+            is_fixture=True,
+        )
+        for pair in surfaces.pairs
+        if not standing.isdisjoint(pair)
+    )
 
 
 def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None) -> tuple[KeptMargin, ...]:
     """Pairs whose spheres often break `margin` [m], with the margin they keep.
 
     Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are within the
-    margin or half their largest gap, whichever is less. The pair keeps the largest sphere gap of the near postures if
-    most others keep more. With too coarse spheres or unknown surfaces, it keeps what nearly all other postures keep;
-    in the latter case at least 0.
+    lesser of the margin and half their largest gap. The pair keeps the largest sphere gap of the near postures if
+    most others keep more. With too coarse spheres it keeps what nearly all other postures keep; with unknown
+    surfaces, at least 0.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]

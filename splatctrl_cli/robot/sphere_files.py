@@ -65,7 +65,7 @@ def with_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSe
     return SphereSet(links=tuple(links), centers=np.concatenate(centers), radii=np.concatenate(radii))
 
 
-def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:
+def match_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:
     """Spheres by the URDF's link names, and the links missing there.
 
     Those are left out. If no name agrees, names are compared without their first part: `panda_link1` fits
@@ -148,7 +148,7 @@ def read_sphere_file(path: Path) -> SphereFile:
     section = _xrdf(path, tree) if is_xrdf else _section(tree)
     table = section.get("collision_spheres")
     is_lula = isinstance(table, list) and all(isinstance(entry, dict) for entry in table)
-    table = _joined(path, table or []) if is_lula else table
+    table = _join(path, table or []) if is_lula else table
     source = path
     if isinstance(table, str):
         source = path.parent / table
@@ -161,7 +161,7 @@ def read_sphere_file(path: Path) -> SphereFile:
     rows = [
         (str(link), _sphere(f"{source}: link '{link}': sphere {index}", sphere), buffers.get(str(link), 0.0))
         for link, spheres in table.items()
-        for index, sphere in enumerate(_listed(source, link, spheres))
+        for index, sphere in enumerate(_check_list(source, link, spheres))
     ]
     on = [(link, (*row[:3], row[3] + buffer)) for link, row, buffer in rows if row[3] + buffer > 0]
     if not on:
@@ -203,11 +203,11 @@ def _section(tree: Any) -> dict[Any, Any]:
     return tree if isinstance(tree, dict) else {}
 
 
-def _joined(path: Path, entries: list[dict[Any, Any]]) -> dict[Any, Any]:
+def _join(path: Path, entries: list[dict[Any, Any]]) -> dict[Any, Any]:
     table: dict[Any, Any] = {}
     for entry in entries:
         for link, spheres in entry.items():
-            table[link] = [*table.get(link, []), *_listed(path, link, spheres)]
+            table[link] = [*table.get(link, []), *_check_list(path, link, spheres)]
     return table
 
 
@@ -239,7 +239,7 @@ def _buffers(path: Path, buffer: Any, table: dict[Any, Any]) -> dict[str, float]
     return buffers
 
 
-def _listed(path: Path, link: object, spheres: Any) -> list[Any]:
+def _check_list(path: Path, link: object, spheres: Any) -> list[Any]:
     if not isinstance(spheres, list):
         raise InputError(f"{path}: link '{link}': expected a list of spheres, got {spheres!r}", remedy=LAYOUT)
     return spheres

@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 from splatctrl_cli.config.fixed import DEFICIT_GAP, FIT_BISECTIONS, FIT_MIN_PATCH, FIT_ROUNDS, FIT_STEPS, FIT_TIE
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Bool, Float64, Index, SphereSet
-from splatctrl_cli.robot.coverage import areas, largest_deficit, refined
+from splatctrl_cli.robot.coverage import areas, largest_deficit, refine_triangles
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 
 DIGITS = 6  # decimals of a written sphere: micrometres
@@ -53,10 +53,9 @@ def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> S
     if options.max_protrusion is not None:
         fitted = [link.within(options.max_protrusion) for link in links]
     else:
-        fitted = _shared_out(links, options.max_spheres or 0)
-    owners = [link.name for link, (centers, _) in zip(links, fitted, strict=True) for _ in centers]
+        fitted = _share_out(links, options.max_spheres or 0)
     return SphereSet(
-        links=tuple(owners),
+        links=tuple(link.name for link, (centers, _) in zip(links, fitted, strict=True) for _ in centers),
         centers=np.concatenate([centers for centers, _ in fitted]),
         radii=np.concatenate([radii for _, radii in fitted]),
     )
@@ -75,7 +74,7 @@ def _check(options: FitOptions, num_links: int) -> None:
             raise UsageError(f"sphere fit: largest {name}: expected 0 m or more, got {value:g}")
 
 
-def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Float64]]:
+def _share_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Float64]]:
     """Distribute `budget` spheres: one t for all links, the rest to the most protruding."""
     low, high = 0.0, max(link.single for link in links)
     chosen = [np.array([link.middle]) for link in links]
@@ -87,12 +86,12 @@ def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Fl
         else:
             high, chosen = t, covers
     counts = [len(cover) for cover in chosen]
-    states = [link.improved(cover) for link, cover in zip(links, chosen, strict=True)]
+    states = [link.improve(cover) for link, cover in zip(links, chosen, strict=True)]
     for _ in range(budget - sum(counts)):
         worst = int(np.argmax([protrusion for _, protrusion in states]))
         counts[worst] += 1
-        states[worst] = links[worst].best(counts[worst], states[worst])
-    return [link.rounded(*state) for link, state in zip(links, states, strict=True)]
+        states[worst] = links[worst].refine(counts[worst], states[worst])
+    return [link.round_outward(*state) for link, state in zip(links, states, strict=True)]
 
 
 def _covers(links: Sequence["_Link"], t: float, budget: int) -> list[Index] | None:
@@ -118,7 +117,7 @@ class _Link:
         if not area > 0:
             raise InputError(f"link '{name}': expected a collision surface, got none of any area")
         longest = max(FIT_MIN_PATCH, 2 * float(np.sqrt(area / options.num_patches)))
-        cut = [refined(part.surface.corners, longest)[0] for part in parts]
+        cut = [refine_triangles(part.surface.corners, longest) for part in parts]
         self._slack = np.concatenate([np.full(len(t), p.slack) for t, p in zip(cut, parts, strict=True)])
         patches = np.concatenate(cut)
         self._vertices, faces = np.unique(patches.reshape(-1, 3), axis=0, return_inverse=True)
@@ -156,9 +155,9 @@ class _Link:
                 f"got {1e3 * max_protrusion:g} mm",
                 remedy="allow more",
             )
-        return self.rounded(*self.improved(cover))
+        return self.round_outward(*self.improve(cover))
 
-    def best(self, count: int, state: tuple[Float64, float]) -> tuple[Float64, float]:
+    def refine(self, count: int, state: tuple[Float64, float]) -> tuple[Float64, float]:
         """Best centres (n, 3), n <= count, and their protrusion, not worse than `state`."""
         low, high = 0.0, state[1]
         for _ in range(FIT_BISECTIONS // 2):
@@ -167,32 +166,28 @@ class _Link:
             if cover is None:
                 low = t
                 continue
-            found = self.improved(cover)
+            found = self.improve(cover)
             high = min(t, found[1])
             if found[1] < state[1]:
                 state = found
         return state
 
-    def improved(self, chosen: Index) -> tuple[Float64, float]:
+    def improve(self, chosen: Index) -> tuple[Float64, float]:
         """Centres (n, 3) and protrusion [m] after alternating assignment and recentring."""
         centers = self._candidates[chosen]
         for _ in range(FIT_ROUNDS):
-            owner, worst = self._assigned(centers)
-            moved = centers.copy()
-            for ball in range(len(centers)):
-                mine = owner == ball
-                if mine.any():
-                    moved[ball] = self._candidates[int(np.argmin(self._cost[:, mine].max(axis=1)))]
-            if self._assigned(moved)[1] >= worst:
+            owner, worst = self._assign(centers)
+            moved = _recentre(centers, owner, [self._candidates] * len(centers), [self._cost] * len(centers))
+            if self._assign(moved)[1] >= worst:
                 break
             centers = moved
-        return self._polished(centers)
+        return self._polish(centers)
 
-    def rounded(self, centers: Float64, _protrusion: float) -> tuple[Float64, Float64]:
+    def round_outward(self, centers: Float64, _protrusion: float) -> tuple[Float64, Float64]:
         """Spheres at rounded centres, as small as patches and then the whole surface allow."""
-        owner, _ = self._assigned(centers)
+        owner, _ = self._assign(centers)
         centers = centers[np.unique(owner)].round(DIGITS)
-        owner, _ = self._assigned(centers)
+        owner, _ = self._assign(centers)
         reach = self._reach(centers)
         radii = np.array(
             [reach[k, owner == k].max(initial=0.0) for k in range(len(centers))]
@@ -205,24 +200,19 @@ class _Link:
         radii = np.maximum(radii - max(spare, 0.0) - allowed, 10**-DIGITS)
         return centers, np.ceil(radii * 10**DIGITS + 1e-3) / 10**DIGITS
 
-    def _polished(self, centers: Float64) -> tuple[Float64, float]:
+    def _polish(self, centers: Float64) -> tuple[Float64, float]:
         """Move centres by fractions of the lattice spacing while that lowers their patches' need."""
         offsets = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.float64)
         for step in FIT_STEPS:
-            owner, worst = self._assigned(centers)
+            owner, worst = self._assign(centers)
             tried = (centers[:, None] + step * self._spacing * offsets).reshape(-1, 3)
             cost = (self._reach(tried) + self._distance(tried)[:, None]).reshape(len(centers), len(offsets), -1)
-            moved = centers.copy()
-            for ball in range(len(centers)):
-                mine = owner == ball
-                if mine.any():
-                    needed = cost[ball][:, mine].max(axis=1)
-                    moved[ball] = tried.reshape(len(centers), -1, 3)[ball, int(np.argmin(needed))]
-            if self._assigned(moved)[1] < worst:
+            moved = _recentre(centers, owner, tried.reshape(len(centers), -1, 3), cost)
+            if self._assign(moved)[1] < worst:
                 centers = moved
-        return centers, self._assigned(centers)[1]
+        return centers, self._assign(centers)[1]
 
-    def _assigned(self, centers: Float64) -> tuple[Index, float]:
+    def _assign(self, centers: Float64) -> tuple[Index, float]:
         cost = self._reach(centers) + self._distance(centers)[:, None]
         owner = cost.argmin(axis=0)
         return owner.astype(np.int64), float(cost[owner, np.arange(cost.shape[1])].max())
@@ -246,6 +236,19 @@ class _Link:
         if len(inside) < wanted // 20:
             inside = np.concatenate([inside, patches.mean(axis=1)])
         return inside, spacing
+
+
+def _recentre(
+    centers: Float64, owner: Index, places: Sequence[Float64] | Float64, costs: Sequence[Float64] | Float64
+) -> Float64:
+    """Centres (n, 3), each moved to its best place for the patches that it owns.
+
+    places (K, 3), costs (K, patches): by centre.
+    """
+    moved = centers.copy()
+    for ball in np.unique(owner):
+        moved[ball] = places[ball][np.argmin(costs[ball][:, owner == ball].max(axis=1))]
+    return moved
 
 
 def _greedy(by_patch: Bool, rng: np.random.Generator | None, at_most: int) -> list[int] | None:

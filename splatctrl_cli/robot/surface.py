@@ -25,7 +25,7 @@ from splatctrl_cli.kernels.surface_image import (
     render_surface,
 )
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Floats, Intrinsics, SphereSet
-from splatctrl_cli.robot.link_meshes import mesh_path, placed
+from splatctrl_cli.robot.link_meshes import mesh_path, place_mesh
 from splatctrl_cli.robot.urdf import Shape, UrdfFile, visual_urdf
 
 KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
@@ -243,13 +243,15 @@ class RobotSurface:
         )  # fmt: skip
         return least
 
-    def distance_to(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:
+    def distance_to(
+        self, link: str, points: Float64, outside: Bool | None = None, *, within: float = np.inf
+    ) -> Float64:
         """Signed distances (Q,) [m] of points (Q, 3), link frame, to one link.
 
-        Carried boxes count. outside (Q,): known outside.
+        Carried boxes count. outside (Q,): known outside; within [m]: as in `distance`.
         """
-        still = np.tile(np.eye(4), (len(self.links), 1, 1))
-        return self.distance(still, points, without=[name for name in self.links if name != link], outside=outside)
+        still, others = np.tile(np.eye(4), (len(self.links), 1, 1)), [name for name in self.links if name != link]
+        return self.distance(still, points, without=others, within=within, outside=outside)
 
     def gaps(self, link: str, T_world_link: Float64, centers: Floats, radii: Floats) -> Float64:
         """A link's signed gap (T,) [m] to the nearest ball; infinite without balls.
@@ -293,7 +295,7 @@ def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Floa
         except InputError as error:
             unread.setdefault(mesh.link, error.message)
         else:
-            pieces.append((mesh.link, placed(mesh, loaded).corners))
+            pieces.append((mesh.link, place_mesh(mesh, loaded).corners))
     return [(link, corners) for link, corners in pieces if link not in unread], unread
 
 

@@ -164,7 +164,12 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
 
     Raises InputError for no URDF, several roots, missing limits, a zero axis, or no movable joint.
     """
-    text, root = _parse(path, _read(path) if text is None else text)
+    text = _read(path) if text is None else text
+    # ValueError: what defusedxml forbids
+    with refuse_faults(f"{path}: expected a URDF, got broken XML", ElementTree.ParseError, ValueError):
+        root = ElementTree.fromstring(text)
+    if root.tag != "robot":
+        raise InputError(f"{path}: expected a URDF with root <robot>, got <{root.tag}>")
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
     if len(set(links)) < len(links):
         twice = next(link for link in links if links.count(link) > 1)
@@ -217,15 +222,6 @@ def _read(path: Path) -> str:
         return read_text(path, "give the robot's URDF file")
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected a URDF, got bytes that are not text") from None
-
-
-def _parse(path: Path, text: str) -> tuple[str, Any]:
-    # ValueError: what defusedxml forbids
-    with refuse_faults(f"{path}: expected a URDF, got broken XML", ElementTree.ParseError, ValueError):
-        root = ElementTree.fromstring(text)
-    if root.tag != "robot":
-        raise InputError(f"{path}: expected a URDF with root <robot>, got <{root.tag}>")
-    return text, root
 
 
 def _check_tree(path: Path, links: tuple[str, ...], joints: list[Any]) -> None:

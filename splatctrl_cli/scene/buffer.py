@@ -3,18 +3,32 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import DEAD_LOGIT
 from splatctrl_cli.kernels.raster import Moments, unpack_parameters
-from splatctrl_cli.records import Bool, Columns, Float32, Float64, Label, SplatSet
+from splatctrl_cli.records import (
+    Bool,
+    Columns,
+    Float32,
+    Float64,
+    Floats,
+    Index,
+    Label,
+    SplatSet,
+    UInt8,
+    UInt16,
+    Values,
+)
 
 CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
 
 
 @dataclass(frozen=True, kw_only=True)
 class Seeds(Columns):
-    """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1]."""
+    """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1].
+
+    Candidates for them have the size D/f [m] of their pixels as radii.
+    """
 
     centers: Float32
     radii: Float32
@@ -48,8 +62,8 @@ class SplatBuffer:
         )
         self.is_alive: Bool = np.zeros(max_splats, bool)
         self.was_used: Bool = np.zeros(max_splats, bool)
-        self.labels: NDArray[np.uint8] = np.zeros(max_splats, np.uint8)
-        self.num_uncertain: NDArray[np.uint16] = np.zeros(max_splats, np.uint16)
+        self.labels: UInt8 = np.zeros(max_splats, np.uint8)
+        self.num_uncertain: UInt16 = np.zeros(max_splats, np.uint16)
 
     @property
     def centers(self) -> Float32:
@@ -66,14 +80,15 @@ class SplatBuffer:
         """(M,) [m]."""
         return np.asarray(np.exp(self.parameters[:, LOG_RADIUS]), np.float32)
 
-    def kill(self, slots: Bool) -> None:
-        """Make slots of a mask (M,) dead: transparent, without moments, reusable."""
+    def kill(self, slots: Bool) -> int:
+        """Make slots of a mask (M,) dead: transparent, without moments, reusable; return their number."""
         self.is_alive[slots] = False
         self.parameters[slots, LOGIT] = DEAD_LOGIT
         self.labels[slots] = Label.OBJECT
         self._reset(np.flatnonzero(slots))
+        return int(np.count_nonzero(slots))
 
-    def set_radius(self, slots: NDArray[np.intp], radius: NDArray[np.floating] | float) -> None:
+    def set_radius(self, slots: Index, radius: Floats | float) -> None:
         """Set radii (K,) [m] of slots (K,)."""
         self.parameters[slots, LOG_RADIUS] = np.log(radius)
 
@@ -96,7 +111,7 @@ class SplatBuffer:
         self._reset(slots)
         return Filled(added=count - num_reused, relocated=num_reused, unmet=len(seeds) - count)
 
-    def copy(self, sources: NDArray[np.intp], opacities: Float64, radii: Float64) -> int:
+    def copy(self, sources: Index, opacities: Float64, radii: Float64) -> int:
         """Copy slots `sources` (K,), with repetitions, into available dead slots; return how many.
 
         opacities (M,), radii (M,) [m]: of sources and copies. Labels are copied; moments restart.
@@ -113,7 +128,7 @@ class SplatBuffer:
         self._reset(np.concatenate([changed, slots]))
         return len(slots)
 
-    def _reset(self, slots: NDArray[np.intp]) -> None:
+    def _reset(self, slots: Index) -> None:
         self.moments.first[slots] = 0.0
         self.moments.second[slots] = 0.0
         self.moments.num_steps[slots] = 0
@@ -132,7 +147,7 @@ class SplatBuffer:
             density=np.zeros(int(alive.sum()), np.float32),
         )
 
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
+    def arrays(self) -> dict[str, Values]:
         return {
             "parameters": self.parameters,
             "first_moment": self.moments.first,

@@ -5,9 +5,8 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.records import Box, Intrinsics, RgbdFrame
+from splatctrl_cli.records import Box, Intrinsics, RgbdFrame, Values
 from splatctrl_cli.scene.buffer import Filled
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import Window
@@ -18,7 +17,7 @@ from splatctrl_cli.scene.self_mask import object_mask
 from splatctrl_cli.scene.time_steps import Refined
 from splatctrl_cli.voxels import Balls, LostEdges
 
-Arrays = Mapping[str, NDArray[np.generic]]
+Arrays = Mapping[str, Values]
 
 GRID_NAMES = ("log_odds", "num_updates", "entity", "last_seen")
 DENSITY_NAMES = ("edge", "tolerance", "num_candidates")
@@ -26,12 +25,12 @@ FILLED_NAMES = ("added", "relocated", "unmet")
 FRAME_NAMES = tuple(field.name for field in fields(RgbdFrame))
 
 
-def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
+def fitter_state(fitter: SceneFitter) -> dict[str, Values]:
     """Splats, moments, occupancy, frames and counters: views, not copies.
 
     There is no random state: steps and blocks seed generators by number.
     """
-    arrays: dict[str, NDArray[np.generic]] = dict(fitter.buffer.arrays())
+    arrays: dict[str, Values] = dict(fitter.buffer.arrays())
     arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
     arrays["step_stamps_ns"] = np.array(fitter.occupancy.step_stamps_ns, np.int64)
     arrays["workspace"] = np.array([fitter.workspace.lower, fitter.workspace.upper])
@@ -39,7 +38,9 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     arrays |= {"people/voxels": fitter.people.voxels, "people/stamps_ns": fitter.people.stamps_ns}
     for camera, edges in fitter.occupancy.edges.items():
         arrays[f"edges/{camera}"] = np.column_stack([edges.centers, edges.radii])
-    arrays["refined"] = _refined_array(fitter.refined)
+    filled = [getattr(fitter.refined.filled, name) for name in FILLED_NAMES]
+    removed = [fitter.refined.removed[reason] for reason in REASONS]
+    arrays["refined"] = np.array([fitter.refined.num_blocks, *filled, *removed], np.int64)
     arrays |= {f"objects/{camera}": pixels for camera, pixels in fitter.objects.items()}
     arrays |= {f"mounted/{camera}": mask for camera, mask in fitter.mounted.items()}
     if fitter.shell is not None:
@@ -77,7 +78,12 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
         for name, a in arrays.items()
         if name.startswith("edges/")
     }
-    fitter.refined = _refined(arrays["refined"])
+    num_blocks, added, relocated, unmet, *removed = (int(n) for n in arrays["refined"])
+    fitter.refined = Refined(
+        num_blocks=num_blocks,
+        filled=Filled(added=added, relocated=relocated, unmet=unmet),
+        removed=dict(zip(REASONS, removed, strict=True)),
+    )
     fitter.mounted, fitter.objects = (
         {name.removeprefix(kind): np.asarray(mask, bool) for name, mask in arrays.items() if name.startswith(kind)}
         for kind in ("mounted/", "objects/")
@@ -120,21 +126,7 @@ def workspace_of(arrays: Arrays) -> Box:
     return Box(lower=lower, upper=upper)
 
 
-def _refined_array(refined: Refined) -> NDArray[np.generic]:
-    filled = [getattr(refined.filled, name) for name in FILLED_NAMES]
-    return np.array([refined.num_blocks, *filled, *(refined.removed[reason] for reason in REASONS)], np.int64)
-
-
-def _refined(array: NDArray[np.generic]) -> Refined:
-    num_blocks, added, relocated, unmet, *removed = (int(n) for n in array)
-    return Refined(
-        num_blocks=num_blocks,
-        filled=Filled(added=added, relocated=relocated, unmet=unmet),
-        removed=dict(zip(REASONS, removed, strict=True)),
-    )
-
-
-def _frame_arrays(frame: RgbdFrame) -> dict[str, NDArray[np.generic]]:
+def _frame_arrays(frame: RgbdFrame) -> dict[str, Values]:
     values = {name: getattr(frame, name) for name in FRAME_NAMES}
     k = frame.intrinsics
     values["intrinsics"] = [k.fx, k.fy, k.cx, k.cy, k.width, k.height]

@@ -4,17 +4,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.geometry import invert_transform, transform_points
-from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Float32, Index, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.labels import Seen, shown_kinds
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.seeding import Each, gap_seeds, world_points_at
+from splatctrl_cli.scene.seeding import Each, gap_seeds, world_points
 from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
@@ -26,11 +25,6 @@ from splatctrl_cli.scene.self_mask import (
 )
 
 
-def is_in_contact(points_world: NDArray[np.floating], robot: RobotPosture) -> Bool:
-    """True for points (N, 3) [m] within `CONTACT_REACH` of moving links."""
-    return np.asarray(robot.distance_to_moving(points_world) < fixed.CONTACT_REACH)
-
-
 def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Bool:
     """Pixels (H, W) of objects within `CONTACT_REACH` of moving links."""
     is_robot: Bool = mask.robot_depth > 0
@@ -40,7 +34,7 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
     shown, reach = mask.robot_depth, pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
     chosen &= frame.depth > nearest_within(shown, is_robot, reach) - fixed.CONTACT_REACH  # a quick superset
     chosen &= frame.depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS
-    chosen[chosen] = is_in_contact(world_points_at(frame, chosen), robot)
+    chosen[chosen] = robot.distance_to_moving(world_points(frame, chosen)) < fixed.CONTACT_REACH
     return chosen
 
 
@@ -53,7 +47,7 @@ def count_carried(
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     poses = dict(zip(surface.links, T_world_link, strict=True))
-    points = world_points_at(frame, mask.kinds == PixelKind.ROBOT)
+    points = world_points(frame, mask.kinds == PixelKind.ROBOT)
     is_own = bare.distance(bare.poses(poses), points) < fixed.CONTACT_REACH / 2
     for link in dict.fromkeys(link for link, _ in declared.carried_at(time_s)):
         declared.is_carried(link, transform_points(invert_transform(poses[link]), points[~is_own]), time_s)
@@ -109,9 +103,7 @@ def lasts_at_fixed_links(
     return np.asarray(is_kept)
 
 
-def hidden_objects(
-    buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig
-) -> NDArray[np.intp]:
+def hidden_objects(buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig) -> Index:
     """Slots (K,) of objects within `ROBOT_REACH` of the robot or base that no pixel shows.
 
     Fitting would pull them out of their object.

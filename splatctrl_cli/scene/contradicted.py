@@ -1,29 +1,43 @@
-"""Rays through a surface that another camera measures: shiny or dark objects.
+"""Evidence of a time step: masks of its frames, rays that frames contradict, and what the occupancy takes in.
 
-Depth of such an object is far too large, or missing.
+Rays go through a surface that another camera measures if an object is shiny or dark: its depth is far too large, or
+missing.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import (
-    CONTRADICTED,
-    CONTRADICTING_COLUMNS,
-    CONTRADICTING_PIXELS,
-    MASK_STEP,
-    SEEN_THROUGH_PIXELS,
-)
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
-from splatctrl_cli.scene.depth_holes import shadowed
+from splatctrl_cli.scene.depth_holes import (
+    explain_unseen,
+    find_shadows,
+    lost_edges,
+    points_on_rays,
+    unanswered_points,
+)
 from splatctrl_cli.scene.labels import Seen
-from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
+from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
+from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.seeding import Each
+from splatctrl_cli.scene.self_mask import (
+    PixelKind,
+    SelfMask,
+    drop_pixels,
+    object_mask,
+    outvote_objects,
+    pixels_at,
+    self_mask,
+    settle_pieces,
+)
+from splatctrl_cli.voxels import Unseen
 
 T = TypeVar("T", bound=np.generic)
 BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
@@ -52,18 +66,15 @@ class Contradicted:
         is_through = self._spread(self.through > 0, frame.depth.shape)
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
-    def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Points (K, 3) [m], world, half a voxel apart on its rays up to `until` or `through`.
+    def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Iterator[Float64]:
+        """`points_on_rays` of its blocks up to `until` or `through`.
 
         is_blank: from blocks without depth, or with it.
         """
         end = np.maximum(self.until, self.through)
         v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
-        depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
         middle = self.side // 2
-        rays = back_project_pixels(frame.intrinsics, self.side * u + middle, self.side * v + middle, np.ones(len(u)))
-        is_before = depths < end[v, u][:, None]
-        return transform_points(frame.T_world_camera, (rays[:, None] * depths[:, None])[is_before])
+        return points_on_rays(frame, self.side * v + middle, self.side * u + middle, end[v, u], config)
 
     def _spread(self, blocks: Bool, shape: tuple[int, ...]) -> Bool:
         out = np.zeros(shape, bool)
@@ -72,71 +83,99 @@ class Contradicted:
         return out
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Surface:
-    """Object points (K, 3) [m], world, away from depth edges, with block indices (K,) and depth (K,) [m]."""
-
-    points: Float64
-    v: Index
-    u: Index
-    depth: Float32
-
-
-def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
+def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
     """Yield what other frames or the drawn robot contradict in each frame of a step.
 
     All rays of a contradicted block and its neighbours cross another frame's surface. They end more than
-    `CONTRADICTED` [m] behind it, or have no return, in range and outside stereo shadows. No return from the drawn
-    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Where others' rays cross at least
-    `SEEN_THROUGH_PIXELS` adjacent blocks, these prove no space free.
+    `CONTRADICTED` [m] behind it, or have no return, in range and outside stereo shadows, or none from the drawn
+    robot. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks that
+    others' rays cross prove no space free.
     """
-    surfaces = [_surface(*one) for one in seen]
-    through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
+    views = [_BlockView.of(*one) for one in seen]
+    through = [np.zeros_like(view.surely) for view in views]
     until = []
-    for index, (frame, mask) in enumerate(seen):
-        rays, depths = _Rays.of(frame, mask), np.zeros_like(through[index])
-        for number, surface in enumerate(surfaces):
-            if number != index:
-                is_passed = rays.run_through(surface, depths)
-                through[number][surface.v[is_passed], surface.u[is_passed]] = surface.depth[is_passed]
-        robot = _blocks(mask.robot_depth, rays.side).min(axis=2)
-        is_before = rays.is_blank & (robot > 0) & is_drawn
+    for (_, mask), view in zip(seen, views, strict=True):
+        depths = np.zeros_like(view.surely)
+        for other, passed in zip(views, through, strict=True):
+            if other is not view:
+                is_passed = view.run_through(other, depths)
+                passed[other.v[is_passed], other.u[is_passed]] = other.depth[is_passed]
+        robot = _blocks(mask.robot_depth, view.side).min(axis=2)
+        is_before = view.is_lost & (robot > 0) & is_drawn
         depths[is_before] = robot[is_before]
-        until.append(_side_by_side(depths, CONTRADICTING_PIXELS))
-    for (frame, _), end, passed in zip(seen, until, through, strict=True):
-        side = _side(frame)
+        until.append(_side_by_side(depths, fixed.CONTRADICTING_PIXELS))
+    for view, end, passed in zip(views, until, through, strict=True):
         yield Contradicted(
-            side=side,
+            side=view.side,
             until=end,
-            is_blank=np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2)),
-            through=_side_by_side(passed, SEEN_THROUGH_PIXELS),
+            is_blank=np.asarray((_blocks(view.frame.depth, view.side) <= 0).all(axis=2)),
+            through=_side_by_side(passed, fixed.SEEN_THROUGH_PIXELS),
         )
 
 
-def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
+def mask_frames(
+    frames: Sequence[RgbdFrame], robot: RobotPosture | None, last: Seen, occupancy: OccupancyMap, each: Each
+) -> tuple[list[RgbdFrame], list[SelfMask], list[Contradicted]]:
+    """Frames of a time step without mixed depth, their masks, and what other frames contradict.
+
+    last: frames and masks of the last time step; each: a `map` over frames.
+    """
+    config = occupancy.config
+    masks = [object_mask(frame) for frame in frames]
+    if robot is not None:
+        seen = list(zip(frames, each(lambda frame: self_mask(frame, robot, config), frames), strict=True))
+        others = [[*(other for other in seen if other is not one), *last] for one in seen]
+        masks = [settle_pieces(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
+        masks = outvote_objects(list(zip(frames, masks, strict=True)), occupancy.origin, config.voxel)
+    is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
+    rays = list(find_contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
+    masks = list(map(mark_contradicted, masks, rays))
+    return [drop_pixels(*one, PixelKind.MIXED) for one in zip(frames, masks, strict=True)], masks, rays
+
+
+def take_in_evidence(
+    occupancy: OccupancyMap,
+    people: PeopleMemory,
+    seen: Seen,
+    rays: Sequence[Contradicted],
+    robot: RobotPosture | None,
+    each: Each,
+    last: Mapping[str, tuple[RgbdFrame, SelfMask]],
+) -> None:
+    """Add a step's depth, reasons of unseen voxels, lost edges and robot to the occupancy.
+
+    last: by camera, its last frame and mask.
+    """
+    config = occupancy.config
+    proving = [
+        found.unproven(drop_pixels(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
+    ]
+    people.take_in(occupancy, proving)
+    unanswered = each(
+        lambda one: unanswered_points(one[0], one[1].robot_depth, config, last.get(one[0].camera)), seen
+    )
+    for (frame, _), found in zip(seen, rays, strict=True):
+        for reason, is_blank in ((Unseen.CONTRADICTED, False), (Unseen.UNANSWERED, True)):
+            for points in found.points(frame, config, is_blank=is_blank):
+                occupancy.mark_unseen(points, reason)
+    for points in chain.from_iterable(unanswered):
+        occupancy.mark_unseen(points, Unseen.UNANSWERED)
+    occupancy.keep_edges(lost_edges(seen, robot, config))
+    if robot is not None:
+        pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
+        occupancy.label_robot(robot.centers, robot.radii, pixels)
+        occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
+        explain_unseen(occupancy, seen, robot)
+
+
+def mark_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
     return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
-
-
-def _side(frame: RgbdFrame) -> int:
-    return max(1, frame.intrinsics.width // CONTRADICTING_COLUMNS)
 
 
 def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
     """Pixels (h, w, side^2) of an image's blocks, without incomplete ones at its ends."""
     h, w = (size // side for size in image.shape)
     return image[: h * side, : w * side].reshape(h, side, w, side).swapaxes(1, 2).reshape(h, w, side * side)
-
-
-def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
-    side = _side(frame)
-    depth = _blocks(frame.depth, side)
-    nearest, farthest = depth.min(axis=2), depth.max(axis=2)
-    is_flat = (cv2.erode(nearest, BESIDE) > 0) & _is_plane(nearest) & _is_plane(farthest)
-    is_object = _blocks(mask.kinds == PixelKind.OBJECT, side).all(axis=2)
-    v, u = np.nonzero(is_flat & is_object)
-    middle, mean = side // 2, depth.mean(axis=2)[v, u]
-    points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
-    return _Surface(points=transform_points(frame.T_world_camera, points), v=v, u=u, depth=mean)
 
 
 def _is_plane(depth: Float32) -> Bool:
@@ -146,29 +185,52 @@ def _is_plane(depth: Float32) -> Bool:
     """
     inverse = 1 / np.maximum(depth, np.float32(1e-3))
     bend = [cv2.filter2D(inverse, -1, line, borderType=cv2.BORDER_REPLICATE) for line in (ALONG, ALONG.T)]
-    return np.asarray(np.maximum(*map(np.abs, bend)) * depth**2 < 2 * MASK_STEP)
+    return np.asarray(np.maximum(*map(np.abs, bend)) * depth**2 < 2 * fixed.MASK_STEP)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Rays:
-    """Depth (h, w) [m] that all rays of a block and its neighbours reach; blocks that unexpectedly return none."""
+class _BlockView:
+    """A frame in blocks of `side` pixels (h, w): its rays, and the surface that they hit.
+
+    surely (h, w) [m]: depth that all rays of a block and its neighbours reach; is_lost (h, w): they unexpectedly
+    return none. points (K, 3) [m], world: of objects away from depth edges, with block indices (K,), depth (K,) [m].
+    """
 
     frame: RgbdFrame
     side: int
     surely: Float32
-    is_blank: Bool
+    is_lost: Bool
+    points: Float64
+    v: Index
+    u: Index
+    depth: Float32
 
     @classmethod
-    def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_Rays":
-        side = _side(frame)
-        surely = cv2.erode(_blocks(frame.depth, side).min(axis=2), BESIDE)  # 0 next to lost pixels
-        is_lost = (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~shadowed(frame.depth, frame.intrinsics.fx)
-        if frame.valid is not None:
-            is_lost &= frame.valid
-        is_blank = cv2.erode(_blocks(is_lost, side).all(axis=2).view(np.uint8), BESIDE) > 0
-        return cls(frame=frame, side=side, surely=surely, is_blank=np.asarray(is_blank))
+    def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_BlockView":
+        side = max(1, frame.intrinsics.width // fixed.CONTRADICTING_COLUMNS)
+        depth = _blocks(frame.depth, side)
+        nearest, farthest = depth.min(axis=2), depth.max(axis=2)
+        surely = cv2.erode(nearest, BESIDE)  # 0 next to lost pixels
+        is_object = _blocks(mask.kinds == PixelKind.OBJECT, side).all(axis=2)
+        v, u = np.nonzero((surely > 0) & _is_plane(nearest) & _is_plane(farthest) & is_object)
+        middle, mean = side // 2, depth.mean(axis=2)[v, u]
+        points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
+        is_lost = (
+            (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~find_shadows(frame.depth, frame.intrinsics.fx)
+        )
+        is_lost = cv2.erode(_blocks(is_lost & frame.in_view, side).all(axis=2).view(np.uint8), BESIDE) > 0
+        return cls(
+            frame=frame,
+            side=side,
+            surely=surely,
+            is_lost=np.asarray(is_lost),
+            points=transform_points(frame.T_world_camera, points),
+            v=v,
+            u=u,
+            depth=mean,
+        )
 
-    def run_through(self, surface: _Surface, until: Float32) -> Index:
+    def run_through(self, surface: "_BlockView", until: Float32) -> Index:
         """Write the depth of crossed surface points into `until` (h, w).
 
         Return indices of points behind which a ray measures depth.
@@ -178,8 +240,8 @@ class _Rays:
         v, u = pixel // width // self.side, pixel % width // self.side
         asked = np.flatnonzero((pixel >= 0) & (v < self.surely.shape[0]) & (u < self.surely.shape[1]))
         v, u, z = v[asked], u[asked], z[asked]
-        is_behind = self.surely[v, u] > z + CONTRADICTED
-        is_through = is_behind | (self.is_blank[v, u] & (z < self.frame.depth.max() + CONTRADICTED))
+        is_behind = self.surely[v, u] > z + fixed.CONTRADICTED
+        is_through = is_behind | (self.is_lost[v, u] & (z < self.frame.depth.max() + fixed.CONTRADICTED))
         until[v[is_through], u[is_through]] = z[is_through]
         return asked[is_behind]
 

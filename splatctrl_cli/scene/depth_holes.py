@@ -1,20 +1,18 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
-An object in a hole is on its rays, which rays of other cameras and later images clear. At depth edges without depth,
-the nearer surface may extend. Voxels near the robot that no camera ever saw get a reason.
+An object in a hole is on its rays, until other rays clear them. At depth edges without depth, the nearer surface may
+extend. Voxels near the robot that no camera ever saw get a reason.
 """
 
 from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, fixed
-from splatctrl_cli.config.fixed import ASKED_REACH, MASK_EDGE, SHADOW_BASELINE, SHADOW_STEP
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.kernels import points
-from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame, UInt16
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
@@ -32,9 +30,9 @@ def unanswered_points(
 ) -> Iterator[Float64]:
     """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
-    Some repeat. Rays are about a voxel apart, from `min_range` to the depth of the nearest pixel with depth. Holes
-    up to `NARROW_HOLE` voxels wide do not count, nor those that a still camera did not show before. robot_depth
-    (H, W) [m]: rendered, 0 = none; before: the camera's last frame and its mask.
+    Some repeat. Rays about a voxel apart end at the depth of the nearest pixel with depth. Holes up to `NARROW_HOLE`
+    voxels wide do not count, nor those that a still camera did not show before. robot_depth (H, W) [m]: rendered,
+    0 = none; before: the camera's last frame and its mask.
     """
     holes = _holes(frame, robot_depth)
     if before is not None and holes.any() and np.array_equal(before[0].T_world_camera, frame.T_world_camera):
@@ -44,7 +42,9 @@ def unanswered_points(
         return iter(())
     behind = _nearest_depth(frame.depth)
     width = config.voxel * frame.intrinsics.fx / float(np.median(behind[holes]))
-    return _on_rays(frame, _wide(holes, fixed.NARROW_HOLE * width), behind, max(int(width), 1), config)
+    apart = max(int(width), 1)
+    v, u = np.nonzero(_wide(holes, fixed.NARROW_HOLE * width)[::apart, ::apart])
+    return points_on_rays(frame, v * apart, u * apart, behind[v * apart, u * apart], config)
 
 
 def _holes(frame: RgbdFrame, robot_depth: Float32) -> Bool:
@@ -52,11 +52,9 @@ def _holes(frame: RgbdFrame, robot_depth: Float32) -> Bool:
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return np.zeros_like(is_blank)
-    is_shadow = is_blank & shadowed(frame.depth, frame.intrinsics.fx)
+    is_shadow = is_blank & find_shadows(frame.depth, frame.intrinsics.fx)
     is_blank &= ~is_shadow
-    is_end = _with_shadow(cv2.dilate(robot_depth, BESIDE_ROBOT) > 0, is_shadow)
-    if frame.valid is not None:
-        is_end |= ~frame.valid
+    is_end = _with_shadow(cv2.dilate(robot_depth, BESIDE_ROBOT) > 0, is_shadow) | ~frame.in_view
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
@@ -75,16 +73,16 @@ def _wide(pixels: Bool, width: float) -> Bool:
     return np.asarray(opened.view(bool))
 
 
-def _on_rays(
-    frame: RgbdFrame, pixels: Bool, behind: Float32, apart: int, config: OccupancyConfig
-) -> Iterator[Float64]:
-    v, u = np.nonzero(pixels[::apart, ::apart])
-    v, u = v * apart, u * apart
-    depths = np.arange(config.min_range, behind[v, u].max(initial=config.min_range), 0.5 * config.voxel)
+def points_on_rays(frame: RgbdFrame, v: Index, u: Index, end: Float32, config: OccupancyConfig) -> Iterator[Float64]:
+    """Yield points (K, 3) [m], world, half a voxel apart on rays up to `end` (N,) [m].
+
+    Rays begin at `min_range`; v, u (N,): their pixels.
+    """
+    depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
     rays = back_project_pixels(frame.intrinsics, u, v, np.ones(len(u)))
     num = max(MOST_POINTS // max(len(depths), 1), 1)  # rays at a time
     for some in (slice(first, first + num) for first in range(0, len(u), num)):
-        is_before = depths < behind[v[some], u[some]][:, None]
+        is_before = depths < end[some, None]
         yield transform_points(frame.T_world_camera, (rays[some, None] * depths[:, None])[is_before])
 
 
@@ -131,22 +129,19 @@ def _of_frame(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> Lost
         cv2.dilate(pixels.view(np.uint8), reach) > 0
         for pixels, reach in ((is_object, BESIDE), (is_robot, NEAR_ROBOT))
     )
-    is_lost = (frame.depth <= 0) & is_beside & ~is_outline
-    if frame.valid is not None:
-        is_lost &= frame.valid
-    v, u = np.nonzero(is_lost)
+    v, u = np.nonzero((frame.depth <= 0) & is_beside & ~is_outline & frame.in_view)
     depths = beside[v, u]
     places = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depths))
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))
 
 
-def shadowed(depth: Float32, focal: float) -> Bool:
+def find_shadows(depth: Float32, focal: float) -> Bool:
     """Pixels (H, W) without depth in the shadow of something nearer in their row.
 
     depth (H, W) [m], 0 = none; focal [px]. With baseline B, an object at z hides B focal (1/z - 1/z_behind) pixels
     behind it, always on the same side. The image gives side and baseline (`_baseline`), and z_behind (`_behind`).
     """
-    is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
+    is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / fixed.MASK_EDGE, 1.0)
     for turn in (1, -1):  # the nearer object is right of its shadow, then left
         image = np.ascontiguousarray(depth[:, ::turn])
         column = np.arange(image.shape[1], dtype=np.int32)
@@ -171,14 +166,14 @@ def _baseline(depth: Float32, following: Index, focal: float) -> float:
     following = following[:, 1:]
     before = depth[:, :-1]
     after = np.take_along_axis(depth, np.minimum(following, depth.shape[1] - 1), axis=1)
-    is_step = (before > 0) & (after > 0) & (SHADOW_STEP * before * after <= focal * (before - after))
+    is_step = (before > 0) & (after > 0) & (fixed.SHADOW_STEP * before * after <= focal * (before - after))
     columns = np.nonzero(is_step)[1]
     if not len(columns):
         return 0.0
     height = focal * (1.0 / after[is_step] - 1.0 / before[is_step])
     baselines = (following[is_step] - 1 - columns) / height
     higher = height >= _median(height, height)
-    return min(_median(baselines[higher], height[higher]), SHADOW_BASELINE)
+    return min(_median(baselines[higher], height[higher]), fixed.SHADOW_BASELINE)
 
 
 def _median(values: Float64, weights: Float64) -> float:
@@ -203,24 +198,22 @@ OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
 
 def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> None:
     """Note why (`Unseen`) no camera ever saw voxels within `ASKED_REACH` of the robot."""
-    voxels = occupancy.unexplained(robot.centers, robot.radii + ASKED_REACH)
+    voxels = occupancy.unexplained(robot.centers, robot.radii + fixed.ASKED_REACH)
     points = occupancy.centers_of(voxels)
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
     for frame, mask in seen:
         np.maximum(reasons, _in_frame(points, frame, mask), out=reasons)
     reasons[robot.distance(points) <= 0] = Unseen.SWEPT
-    occupancy.explain(voxels, reasons)
+    occupancy.last_seen.reshape(-1)[voxels] = reasons
 
 
-def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> NDArray[np.uint16]:
+def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> UInt16:
     """Reason `Unseen` (K,) why a frame does not show points (K, 3) [m]."""
     pixel, z = pixels_at(frame, points)
-    is_in_view = pixel >= 0
-    if frame.valid is not None:
-        is_in_view &= frame.valid.reshape(-1)[pixel]
+    is_in_view = (pixel >= 0) & frame.in_view.reshape(-1)[pixel]
     robot = cv2.dilate(mask.robot_depth, OUTLINE).reshape(-1)[pixel]
     depth = frame.depth.reshape(-1)[pixel]
-    is_lost = (frame.depth <= 0) & ~shadowed(frame.depth, frame.intrinsics.fx)
+    is_lost = (frame.depth <= 0) & ~find_shadows(frame.depth, frame.intrinsics.fx)
     behind = np.where(is_lost.reshape(-1)[pixel], np.uint16(Unseen.NO_RETURN), np.uint16(Unseen.HIDDEN_BY_THING))
     is_arm = (robot > 0) & ((robot < z) | (depth <= 0)) & (mask.kinds.reshape(-1)[pixel] != PixelKind.OBJECT)
     behind[is_arm] = Unseen.HIDDEN_BY_ARM

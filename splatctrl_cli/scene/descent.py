@@ -48,7 +48,7 @@ class Descent:
 
         depth: factor of the depth loss.
         """
-        weights = self._weights()
+        weights = loss_weights(self._config, self.background or BLACK)
         weights = replace(weights, depth=depth * weights.depth)
         if self.device is not None and views:
             return self._run_on(self.device, views, weights, settings)
@@ -64,7 +64,7 @@ class Descent:
                 self._buffer.parameters,
                 self._buffer.moments,
                 settings,
-                self._step_seed(),
+                (self._seed << 32) + self.num_iterations,
             )
             self.num_iterations += 1
             self.heard()
@@ -81,15 +81,13 @@ class Descent:
         different = {id(view): view for view in views}
         numbers = {key: device.number_of(view.camera, view.target) for key, view in different.items()}
         device.put(self._buffer.parameters, self._buffer.moments)
-        terms = device.run([numbers[id(view)] for view in views], weights, settings, self._step_seed())
+        seed = (self._seed << 32) + self.num_iterations
+        terms = device.run([numbers[id(view)] for view in views], weights, settings, seed)
         device.take(self._buffer.parameters, self._buffer.moments)
         for _ in views:
             self.num_iterations += 1
             self.heard()
         return {key: terms[number] for key, number in numbers.items()}
-
-    def _step_seed(self) -> int:
-        return (self._seed << 32) + self.num_iterations
 
     def planes(self, view: View) -> Float32:
         """Planes (5, H, W) of a view, as in `kernels.raster`."""
@@ -106,12 +104,8 @@ class Descent:
         return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
 
     def evaluate(self, view: View) -> LossTerms:
-        return self._loss.evaluate(
-            self.planes(view), view.target, self._weights(), empty_planes(*view.target.depth.shape)
-        )
-
-    def _weights(self) -> LossWeights:
-        return loss_weights(self._config, self.background or BLACK)
+        weights = loss_weights(self._config, self.background or BLACK)
+        return self._loss.evaluate(self.planes(view), view.target, weights, empty_planes(*view.target.depth.shape))
 
     def settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
         """Learning rates times `rate`, of centre and radius times `geometry`."""
@@ -135,12 +129,13 @@ class Descent:
         The derivative of a summed colour plane by a splat's colour is that sum.
         """
         background = np.array(self.background, np.float32)[:, None, None]
-        misfits, shown = [], np.zeros(self._config.max_splats)
+        misfits: list[Misfit] = []
+        shown = np.zeros(self._config.max_splats)
         for view in views:
             planes = self.planes(view)
             color = planes[:3] + (1.0 - planes[4]) * background
             error = np.abs(color - view.target.color / np.float32(255.0)).mean(axis=0)
-            misfits.append(Misfit(frame=view.frame, error=np.where(view.mappable, error, np.float32(0.0))))
+            misfits.append((view.frame, np.where(view.mappable, error, np.float32(0.0))))
             ones = np.zeros_like(planes)
             ones[0] = view.target.counted
             self._raster.backward(planes, ones, self._gradients)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 
 import numpy as np
 
@@ -13,20 +12,18 @@ from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
-from splatctrl_cli.scene.buffer import Filled, SplatBuffer
-from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact, lasts_at_fixed_links
-from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
-from splatctrl_cli.scene.depth_holes import explain_unseen, lost_edges, unanswered_points
+from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
+from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, lasts_at_fixed_links
+from splatctrl_cli.scene.contradicted import mask_frames, take_in_evidence
 from splatctrl_cli.scene.descent import Descent
-from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface, seen_through
+from splatctrl_cli.scene.keyframes import View, Window, make_view, move_to_surface, seen_through, shrink_radii
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
-from splatctrl_cli.scene.posture import RobotPosture, carried
+from splatctrl_cli.scene.posture import RobotPosture, carry_splats
 from splatctrl_cli.scene.removal import REASONS, removals, room_for, use_idle
 from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
-    Candidates,
     SeedDensity,
     add_mask,
     candidates,
@@ -34,26 +31,22 @@ from splatctrl_cli.scene.seeding import (
     gap_seeds,
     inside_workspace,
     seeds_at,
-    thinned,
+    thin_mask,
     thinning,
     world_points,
 )
 from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
-    audited,
+    audit_masks,
+    label_pixels,
     object_mask,
-    of_label,
-    self_mask,
-    settled,
-    voted,
-    without,
 )
 from splatctrl_cli.scene.shell import Shell
-from splatctrl_cli.scene.steady_depth import object_twice, steadied
+from splatctrl_cli.scene.surface_depth import object_twice, steady_depth
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
-from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
-from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
+from splatctrl_cli.scene.unrepresented import bare_voxels, confirm_bare, unrepresented_voxels
+from splatctrl_cli.voxels import Balls, KnownVoxels
 
 
 class SceneFitter:
@@ -92,7 +85,7 @@ class SceneFitter:
         self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) of what it carries
         self.refined = Refined(num_blocks=0, filled=Filled(), removed=dict.fromkeys(REASONS, 0))
         self._unrepresented: Balls | None = None
-        self.bare: Balls | None = None  # of the last time step, before `confirmed`
+        self.bare: Balls | None = None  # of the last time step, before `confirm_bare`
         self.seen: Seen = ()  # frames of the last time step, as in its newest views, with masks
         self.objects: dict[str, Bool] = {}  # by camera, object pixels (H, W) of its newest frame
 
@@ -102,27 +95,14 @@ class SceneFitter:
         robot = robot and replace(robot, num_threads=self.num_threads)
         self._find_mounted(frames)
         config = self.occupancy.config
-        masks = [object_mask(frame) for frame in frames]
-        if robot is not None:
-            seen = list(zip(frames, self._each(lambda f: self_mask(f, robot, config), frames), strict=True))
-            others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
-            masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
-            masks = voted(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
-        rays = list(
-            contradicted(
-                list(zip(frames, masks, strict=True)),
-                is_drawn=robot is not None and robot.surface is not None and robot.surface.is_drawn,
-            )
-        )
-        masks = list(map(without_contradicted, masks, rays))
-        frames = [without(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
+        frames, masks, rays = mask_frames(frames, robot, self.seen, self.occupancy, self._each)
         known = {view.frame.camera: view.frame for view in self.window.newest if view.frame.camera in self.objects}
         before = {camera: (frame, self.objects[camera]) for camera, frame in known.items()}
         objects = [mask.kinds == PixelKind.OBJECT for mask in masks]
         self.objects |= {frame.camera: pixels for frame, pixels in zip(frames, objects, strict=True)}
         frames, steady = zip(
             *(
-                steadied(frame, before.get(frame.camera), pixels, config)
+                steady_depth(frame, before.get(frame.camera), pixels, config)
                 for frame, pixels in zip(frames, objects, strict=True)
             ),
             strict=True,
@@ -132,25 +112,8 @@ class SceneFitter:
         seen = self.seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
             self.descent.background = self._behind(views)
-        proving = [
-            found.unproven(without(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
-        ]
-        self.people.take_in(self.occupancy, proving)
-        unanswered = self._each(
-            lambda one: unanswered_points(one[0], one[1].robot_depth, config, last.get(one[0].camera)), seen
-        )
-        for frame, found in zip(frames, rays, strict=True):
-            self.occupancy.mark_unseen(found.points(frame, config, is_blank=False), Unseen.CONTRADICTED)
-            self.occupancy.mark_unseen(found.points(frame, config, is_blank=True), Unseen.UNANSWERED)
-        for points in chain.from_iterable(unanswered):
-            self.occupancy.mark_unseen(points, Unseen.UNANSWERED)
-        self.occupancy.keep_edges(lost_edges(seen, robot, config))
+        take_in_evidence(self.occupancy, self.people, seen, rays, robot, self._each, last)
         self._carry(robot)
-        if robot is not None:
-            pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
-            self.occupancy.label_robot(robot.centers, robot.radii, pixels)
-            self.occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
-            explain_unseen(self.occupancy, seen, robot)
         removed = self._remove(self._relabel(robot, seen), self._floating(views))
         filled = self._seed(views, masks)
         is_first = self.descent.num_iterations == 0 and bool(self.buffer.is_alive.any())
@@ -174,11 +137,11 @@ class SceneFitter:
         if self.shell is not None:
             self.shell.step(self.window, self.mounted, self.descent.background)
         self.num_steps += 1
-        return replace(self._audit(views, filled, removed, terms), **audited(masks))
+        return replace(self._audit(views, filled, removed, terms), **audit_masks(masks))
 
     def plant(self, cloud: PointCloud) -> Filled:
         """Start from coloured points, seeded with at most a share `fill` of the budget."""
-        source = Candidates(points=cloud.points, colors=cloud.colors, pixels=np.zeros(len(cloud), np.float32))
+        source = Seeds(centers=cloud.points, radii=np.zeros(len(cloud), np.float32), colors=cloud.colors)
         count = max(int(self.config.fill * self.config.max_splats), 1)
         self.density = density_for([source], count, self.config)
         seeds = seeds_at([source], self.buffer.centers[self.buffer.is_alive], self.density, self.config)
@@ -241,7 +204,7 @@ class SceneFitter:
             found = unrepresented_voxels(self.occupancy, self.splats(), self.config, error)
             if self.posture is not None:
                 found = found.select(~self.posture.holds(found.centers, fixed.WELL_INSIDE))
-            self._unrepresented, self.bare = confirmed(found, self.bare), found
+            self._unrepresented, self.bare = confirm_bare(found, self.bare), found
         return self._unrepresented
 
     @unrepresented.setter
@@ -287,7 +250,7 @@ class SceneFitter:
         if before is None or robot is None:
             return
         slots = np.flatnonzero(self.buffer.is_alive & (self.buffer.labels == Label.ROBOT))
-        self.buffer.centers[slots] = carried(self.buffer.centers[slots], before, robot)
+        self.buffer.centers[slots] = carry_splats(self.buffer.centers[slots], before, robot)
 
     def _floating(self, views: Sequence[View]) -> Bool:
         is_floating = np.zeros(len(self.buffer.centers), bool)
@@ -301,17 +264,11 @@ class SceneFitter:
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into air or out, or made faint; count it in `removed`."""
-        drifted = self._relabel(robot, seen)
-        self.buffer.kill(drifted)
-        floating = self._floating(views)
-        self.buffer.kill(floating)
-        outside = self.buffer.is_alive & ~self.workspace.contains(self.buffer.centers)
-        self.buffer.kill(outside)
-        faint = self.buffer.is_alive & (self.buffer.opacities < self.config.min_opacity)
-        self.buffer.kill(faint)
-        reasons = {"robot": drifted, "seen_through": floating, "workspace": outside, "opacity": faint}
-        for reason, mask in reasons.items():
-            removed[reason] += int(mask.sum())
+        buffer = self.buffer
+        removed["robot"] += buffer.kill(self._relabel(robot, seen))
+        removed["seen_through"] += buffer.kill(self._floating(views))
+        removed["workspace"] += buffer.kill(buffer.is_alive & ~self.workspace.contains(buffer.centers))
+        removed["opacity"] += buffer.kill(buffer.is_alive & (buffer.opacities < self.config.min_opacity))
 
     def _remove(self, is_trail: Bool, is_floating: Bool, *, counts_time: bool = True) -> dict[str, int]:
         reasons = removals(
@@ -323,23 +280,21 @@ class SceneFitter:
             is_floating=is_floating,
             counts_time=counts_time,
         )
-        for mask in reasons.values():
-            self.buffer.kill(mask)
-        return {reason: int(mask.sum()) for reason, mask in reasons.items()}
+        return {reason: self.buffer.kill(mask) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
         """Fill dead slots at pixels of M_add; the first full view sets the density."""
-        found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
+        found: dict[Label, list[Seeds]] = {Label.OBJECT: [], Label.ROBOT: []}
         added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
         every = thinning(added)
 
-        def offered(index: int) -> list[Candidates]:
+        def offered(index: int) -> list[Seeds]:
             view, others = views[index], spread(range(len(views)), fixed.SEED_ASKED_VIEWS)
             asked = [views[(index + k) % len(views)] for k in others]
-            wanted = (thinned(added[index] & of_label(masks[index], label), every) for label in found)
+            wanted = (thin_mask(added[index] & label_pixels(masks[index], label), every) for label in found)
             sources = (candidates(view.frame, pixels, self.num_threads) for pixels in wanted)
             return [
-                source.select(self._is_grounded(source.points, asked, label))
+                source.select(self._is_grounded(source.centers, asked, label))
                 for label, source in zip(found, sources, strict=True)
             ]
 
@@ -385,7 +340,7 @@ class SceneFitter:
             if label == Label.OBJECT:
                 bare = bare_voxels(self.occupancy, splats, self.workspace, self.config, half)
             seeds = gap_seeds(
-                [(v.frame, v.mappable & of_label(m, label)) for v, m in zip(views, masks, strict=True)],
+                [(v.frame, v.mappable & label_pixels(m, label)) for v, m in zip(views, masks, strict=True)],
                 bare,
                 self.occupancy.config.voxel,
                 splats,
@@ -401,8 +356,7 @@ class SceneFitter:
             if label == Label.OBJECT and num_missing > 0 and self.num_steps % fixed.EVICT_EVERY == 0:
                 shown, gap = self.descent.misfits(views)[1], self.config.max_gap
                 is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, gap)
-                self.buffer.kill(is_evicted)
-                removed["evicted"] += int(is_evicted.sum())
+                removed["evicted"] += self.buffer.kill(is_evicted)
             filled += self.buffer.fill(seeds, self.config.initial_opacity, label=label)
         return filled
 
@@ -421,7 +375,8 @@ class SceneFitter:
             return Filled()
         radius, is_object = 0.5 * self.config.contact_radius, self._standing_for(Label.OBJECT)
         slots = np.flatnonzero(is_object)
-        self.buffer.set_radius(slots[is_in_contact(self.buffer.centers[slots], robot)], radius)
+        is_near = robot.distance_to_moving(self.buffer.centers[slots]) < fixed.CONTACT_REACH
+        self.buffer.set_radius(slots[is_near], radius)
         splats = self.splats().select(is_object[self.buffer.is_alive])
         mappable = [view.mappable & pixels for view, pixels in zip(views, steady, strict=True)]
         seeds = contact_seeds(
@@ -441,9 +396,9 @@ class SceneFitter:
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
         slots = slots[robot.distance(self.buffer.centers[slots]) < fixed.ROBOT_REACH]
-        self.buffer.centers[slots] = on_surface(self.buffer.centers[slots], views, config.see_through)
+        self.buffer.centers[slots] = move_to_surface(self.buffer.centers[slots], views, config.see_through)
         error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
-        radii = kept_radii(
+        radii = shrink_radii(
             self.buffer.centers[slots], self.buffer.radii[slots], views, error, least, self.num_threads
         )
         is_hidden = np.isin(slots, hidden_objects(self.buffer, robot, seen, config))

@@ -10,9 +10,9 @@ from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.kernels import points
 from splatctrl_cli.kernels.raster import TargetView
 from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame
-from splatctrl_cli.scene.removal import least_around, nearest_depth
+from splatctrl_cli.scene.removal import nearest_depth
 from splatctrl_cli.scene.render import camera_array
-from splatctrl_cli.scene.self_mask import pixels_at
+from splatctrl_cli.scene.self_mask import least_within, pixels_at
 
 _STEPS = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)], np.float32) - 1
 DIRECTIONS = _STEPS / np.linalg.norm(_STEPS, axis=1, keepdims=True)  # (26, 3), of the points of a sphere's edge
@@ -50,8 +50,7 @@ def make_view(
     The colour loss counts pixels without depth, but none that are invalid, `mounted`, or outside the workspace.
     """
     counted = mappable | (frame.depth <= 0)
-    if frame.valid is not None:
-        counted &= frame.valid
+    counted &= frame.in_view
     if mounted is not None:
         counted &= ~mounted
     target = TargetView(
@@ -82,17 +81,16 @@ def seen_through(
     return points.seen_through(centers, cameras, nearest, tolerance, num_threads)
 
 
-def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
+def move_to_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
     """Move centres (N, 3) [m], world, floating up to `most` [m], onto the measured surface.
 
-    A centre floats if all views that see it measure more depth at its pixel and around it. It moves to the least of
-    these depths, along the ray with the smallest step. Views that measure depth more than `most` before it do not see
-    it.
+    A centre floats if all views that see it measure more depth at and around its pixel. It moves to the least of
+    these depths, along the ray with the smallest step. Views with depth more than `most` before it do not see it.
     """
     least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
     for view in views:
         pixel, z = pixels_at(view.frame, centers)
-        depth = least_around(np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)), 1).ravel()[pixel]
+        depth = least_within(np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)), 1).ravel()[pixel]
         step = np.where((pixel >= 0) & (depth >= z - most), depth - z, np.inf).astype(np.float32)
         is_less = step < least
         least[is_less] = step[is_less]
@@ -102,17 +100,17 @@ def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
     return np.asarray(centers + np.where(is_off, least, np.float32(0.0))[:, None] * towards, np.float32)
 
 
-def kept_radii(
+def shrink_radii(
     centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
 ) -> Float32:
     """Radii (N,) [m] that keep spheres within measured depth, `least` [m] or more.
 
-    A sphere shrinks while a point of its edge floats by more than `tolerance` [m] before depth around its pixel in
-    some view. So it does while its nearest point floats before its pixel's depth.
+    A sphere shrinks while, in some view, a point of its edge floats by more than `tolerance` [m] before depth around
+    its pixel, or its nearest point before its pixel's depth.
     """
     cameras = [view.camera for view in views]
     depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]
-    nearest = [least_around(depth, 1) for depth in depths]
+    nearest = [least_within(depth, 1) for depth in depths]
     places = np.array([view.frame.T_world_camera[:3, 3] for view in views], np.float32).reshape(-1, 3)
     towards = places - centers[:, None]
     towards /= np.linalg.norm(towards, axis=2, keepdims=True)

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import WELL_INSIDE
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -52,9 +51,9 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
     is_robot = alive & (kind == PixelKind.ROBOT)
     unseen = np.flatnonzero(alive & (kind == PixelKind.NOTHING) & (was_robot | ~is_solid))
     depth = -robot.distance(buffer.centers[unseen])
-    is_robot[unseen] = np.where(was_robot[unseen], depth > -config.see_through, depth > WELL_INSIDE)
+    is_robot[unseen] = np.where(was_robot[unseen], depth > -config.see_through, depth > fixed.WELL_INSIDE)
     solid = np.flatnonzero(alive & (kind == PixelKind.NOTHING) & ~was_robot & is_solid)
-    is_robot[solid] = robot.holds(buffer.centers[solid], WELL_INSIDE)
+    is_robot[solid] = robot.holds(buffer.centers[solid], fixed.WELL_INSIDE)
     return is_robot, np.asarray(alive & (kind == PixelKind.OBJECT))
 
 

@@ -9,18 +9,16 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, label, uniform_filter
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float64, RgbdFrame
 
 
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     """The first frames, at most `MOUNTED_MAX_VIEWS`, over `MOUNTED_APART` [m] apart."""
     chosen: list[RgbdFrame] = []
-    places: list[Float64] = []
     for frame in frames:
-        place = frame.T_world_camera[:3, 3]
-        if all(np.linalg.norm(place - other) > fixed.MOUNTED_APART for other in places):
+        away = [np.linalg.norm(frame.T_world_camera[:3, 3] - other.T_world_camera[:3, 3]) for other in chosen]
+        if min(away, default=np.inf) > fixed.MOUNTED_APART:
             chosen.append(frame)
-            places.append(place)
     return chosen[: fixed.MOUNTED_MAX_VIEWS]
 
 
@@ -31,7 +29,8 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
     """
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None
-    colors = np.stack([_blurred(frame) for frame in frames])
+    sigmas = (fixed.MOUNTED_BLUR, fixed.MOUNTED_BLUR, 0)
+    colors = np.stack([gaussian_filter(frame.color.astype(np.float32) / 255.0, sigmas) for frame in frames])
     deviation = np.median(np.abs(colors - np.median(colors, axis=0)), axis=0).max(axis=-1)
     has_depth = np.mean([frame.depth >= min_range for frame in frames], axis=0, dtype=np.float64)
     depth_share = uniform_filter(has_depth, fixed.MOUNTED_WINDOW)
@@ -46,11 +45,9 @@ def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tu
 
     Surroundings lose depth in whole areas; a hole has depth around it.
     """
-    parts = []
-    for frame, mask in zip(frames, counted, strict=True):
-        near_depth = uniform_filter((frame.depth > 0).astype(np.float32), fixed.MOUNTED_WINDOW) > 1e-4
-        parts.append(frame.color[mask & ~near_depth])
-    colors = np.concatenate(parts)
+    depth_near = [uniform_filter((f.depth > 0).astype(np.float32), fixed.MOUNTED_WINDOW) > 1e-4 for f in frames]
+    away = [mask & ~is_near for mask, is_near in zip(counted, depth_near, strict=True)]
+    colors = np.concatenate([frame.color[mask] for frame, mask in zip(frames, away, strict=True)])
     if len(colors) < fixed.MOUNTED_BACKGROUND * sum(frame.depth.size for frame in frames):
         return (0.0, 0.0, 0.0)
     red, green, blue = (float(value) / 255.0 for value in np.median(colors, axis=0))
@@ -62,11 +59,6 @@ def _entering(mask: Bool) -> Bool:
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     area = np.bincount(parts.ravel())
     return np.isin(parts, [part for part in border if part and area[part] >= fixed.MOUNTED_AREA * mask.size])
-
-
-def _blurred(frame: RgbdFrame) -> Float32:
-    sigma = fixed.MOUNTED_BLUR
-    return np.asarray(gaussian_filter(frame.color.astype(np.float32) / 255.0, (sigma, sigma, 0)), np.float32)
 
 
 def _texture(frame: RgbdFrame) -> Float64:

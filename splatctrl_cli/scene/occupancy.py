@@ -4,15 +4,24 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import HIDDEN
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
-from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, Balls, KnownVoxels, LostEdges, OccupancyGrid, Unseen
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Index, Label, RgbdFrame, UInt8, UInt16
+from splatctrl_cli.voxels import (
+    MOST_VOXELS,
+    NO_EDGES,
+    SOLID,
+    SWEPT,
+    Balls,
+    KnownVoxels,
+    LostEdges,
+    OccupancyGrid,
+    Unseen,
+    voxels_at,
+)
 
 MAX_STEPS = min(Unseen) - 1  # distinct time steps in `last_seen`
 
@@ -33,12 +42,12 @@ class OccupancyMap:
             )
         self.origin: Float64 = workspace.lower + 0.5 * config.voxel
         self.log_odds: Float32 = np.zeros(shape, np.float32)
-        self.num_updates: NDArray[np.uint16] = np.zeros(shape, np.uint16)
-        self.entity: NDArray[np.uint8] = np.zeros(shape, np.uint8)
-        self.last_seen: NDArray[np.uint16] = np.zeros(shape, np.uint16)
+        self.num_updates: UInt16 = np.zeros(shape, np.uint16)
+        self.entity: UInt8 = np.zeros(shape, np.uint8)
+        self.last_seen: UInt16 = np.zeros(shape, np.uint16)
         self.step_stamps_ns: list[int] = []  # of the time steps that `last_seen` counts, from 1
         self.edges: dict[str, LostEdges] = {}  # of the newest image of each camera
-        self._hits: NDArray[np.uint8] = np.zeros(shape, np.uint8)
+        self._hits: UInt8 = np.zeros(shape, np.uint8)
         self._was_free: Bool = np.zeros(shape, bool)  # before this time step
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
@@ -101,13 +110,13 @@ class OccupancyMap:
 
         Seen, contradicted and unanswered voxels keep their value.
         """
-        cells = np.floor((points - self.origin) / self.config.voxel + 0.5).astype(np.int64)
-        i, j, k = cells[np.all((cells >= 0) & (cells < self.last_seen.shape), axis=1)].T
+        cells, is_inside = voxels_at(points, self.origin, self.config.voxel, self.last_seen.shape)
+        i, j, k = cells[is_inside].T
         before = self.last_seen[i, j, k]
         is_never = (before == 0) | (before >= min(Unseen)) & (before < Unseen.CONTRADICTED)
         self.last_seen[i[is_never], j[is_never], k[is_never]] = reason
 
-    def unexplained(self, centers: Float64, radii: Float64) -> NDArray[np.intp]:
+    def unexplained(self, centers: Float64, radii: Float64) -> Index:
         """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] with changeable reasons."""
         is_near = np.zeros_like(self.entity)
         mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
@@ -115,10 +124,6 @@ class OccupancyMap:
         last = self.last_seen.reshape(-1)[voxels]
         is_open = (last == 0) | (last >= Unseen.OUT_OF_VIEW) & (last < Unseen.CONTRADICTED)
         return np.asarray(voxels[is_open])
-
-    def explain(self, voxels: NDArray[np.intp], reasons: NDArray[np.uint16]) -> None:
-        """Set the `Unseen` reasons (K,) of voxels (K,)."""
-        self.last_seen.reshape(-1)[voxels] = reasons
 
     def keep_edges(self, edges: Mapping[str, LostEdges]) -> None:
         """Replace these cameras' lost edges, within the grid."""
@@ -130,8 +135,7 @@ class OccupancyMap:
         """Set the robot bit only where spheres (S, 3), (S,) [m] or pixels show the robot.
 
         seen: frames of one time step, pixels (H, W) of robot and objects. A voxel that an object pixel hits is solid,
-        not robot, until rays pass or robot pixels alone hit. A swept voxel that becomes solid falls to the log-odds
-        of one hit.
+        not robot, until rays pass or robot pixels alone hit; a swept one falls to the log-odds of one hit.
         """
         was_solid = self.entity & SOLID > 0
         self.mark_robot(centers, radii)
@@ -146,12 +150,12 @@ class OccupancyMap:
         arrived = np.argwhere(self._was_free & (self.entity & SOLID > 0))
         self._hide_beside(arrived, math.ceil(len(self.edges) / max(len(seen), 1)))
 
-    def _hide_beside(self, arrived: NDArray[np.intp], num_steps: int) -> None:
+    def _hide_beside(self, arrived: Index, num_steps: int) -> None:
         """Forget views of space within `HIDDEN` of voxels (K, 3), before the last `num_steps` steps.
 
         The unseen side of an object that arrived may fill that space.
         """
-        reach = math.ceil(HIDDEN / self.config.voxel)
+        reach = math.ceil(fixed.HIDDEN / self.config.voxel)
         around = (arrived[:, None] + np.argwhere(np.ones(3 * [2 * reach + 1])) - reach).reshape(-1, 3)
         i, j, k = around[np.all((around >= 0) & (around < self.last_seen.shape), axis=1)].T
         last = self.last_seen[i, j, k]
@@ -193,14 +197,12 @@ class OccupancyMap:
             num_threads=self.num_threads,
         )
 
-    def entity_at(self, points_world: Float32) -> NDArray[np.uint8]:
+    def entity_at(self, points_world: Float32) -> UInt8:
         """Entity bits (N,) at points (N, 3); 0 outside."""
-        cell = np.floor((points_world - self.origin) / self.config.voxel + 0.5)
-        is_inside = np.all((cell >= 0) & (cell < self.entity.shape), axis=1)
-        i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
-        return np.where(is_inside, self.entity[i, j, k], np.uint8(0))
+        cells, is_inside = voxels_at(points_world, self.origin, self.config.voxel, self.entity.shape)
+        return np.where(is_inside, self.entity[tuple(cells.T)], np.uint8(0))
 
-    def entity_around(self, points_world: Float32) -> NDArray[np.uint8]:
+    def entity_around(self, points_world: Float32) -> UInt8:
         """Entity bits (N,) of the eight nearest voxels, ORed."""
         bits = np.zeros(len(points_world), np.uint8)
         for corner in np.ndindex(2, 2, 2):
@@ -224,16 +226,13 @@ class OccupancyMap:
         log_odds = np.where(is_observed, largest, np.float32(0.0))
         return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32), is_observed
 
-    def occupied_voxels(self) -> NDArray[np.intp]:
+    def occupied_voxels(self) -> Index:
         """Flat indices (K,) of voxels hit more than once, except the robot's."""
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
         voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))
-        return voxels[~self._may_be_robot(voxels)]
-
-    def _may_be_robot(self, voxels: NDArray[np.intp]) -> Bool:
-        """True for voxels (K,) swept, without an object since."""
-        return np.asarray(self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) == SWEPT)
+        # Those swept, without an object since, may be the robot's.
+        return np.asarray(voxels[self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) != SWEPT])
 
     def swept_box(self) -> Box | None:
         """Box of the robot's path so far; None without any."""
@@ -244,7 +243,7 @@ class OccupancyMap:
         lower, upper = (np.array([indices[end] for indices in found]) for end in (0, -1))
         return Box(lower=self.origin + self.config.voxel * lower, upper=self.origin + self.config.voxel * upper)
 
-    def centers_of(self, voxels: NDArray[np.intp]) -> Float32:
+    def centers_of(self, voxels: Index) -> Float32:
         """Centres (K, 3) [m], world, of flat indices (K,)."""
         cells = np.stack(np.unravel_index(voxels, self.log_odds.shape), axis=1)
         return (self.origin + self.config.voxel * cells).astype(np.float32)
@@ -268,7 +267,7 @@ class OccupancyMap:
             last_seen=self.last_seen.copy(),
             step_stamps_ns=np.array(self.step_stamps_ns, np.int64),
             unrepresented=unrepresented,
-            edges=LostEdges.joined([self.edges[camera] for camera in sorted(self.edges)]),
+            edges=NO_EDGES.joined(*(self.edges[camera] for camera in sorted(self.edges))),
         )
 
 
@@ -280,8 +279,8 @@ class PeopleMemory:
 
     def __init__(self, memory: float) -> None:
         self.memory = memory
-        self.voxels: NDArray[np.int64] = np.zeros(0, np.int64)
-        self.stamps_ns: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.voxels: Index = np.zeros(0, np.int64)
+        self.stamps_ns: Index = np.zeros(0, np.int64)
 
     def take_in(self, occupancy: OccupancyMap, frames: Sequence[RgbdFrame]) -> None:
         """Add a time step's depth images, and forget people unobserved for too long."""

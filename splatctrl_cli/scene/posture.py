@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import ROBOT_REACH
-from splatctrl_cli.records import Bool, Box, Float32, Float64
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Floats
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.surface import RobotSurface
 
@@ -34,7 +33,7 @@ class RobotPosture:
             return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]
 
-    def distance(self, points_world: NDArray[np.floating], without: Sequence[str] = ()) -> Float64:
+    def distance(self, points_world: Floats, without: Sequence[str] = ()) -> Float64:
         """Signed distance (N,) [m] of points (N, 3) to the robot at the newest stamp, negative inside.
 
         Exact up to `ROBOT_REACH`.
@@ -42,13 +41,13 @@ class RobotPosture:
         surface, T = self.seen_at(max(self.T_world_surface, default=0))
         return surface.distance(T, points_world, without=without, within=ROBOT_REACH, num_threads=self.num_threads)
 
-    def holds(self, points_world: NDArray[np.floating], depth: float) -> Bool:
+    def holds(self, points_world: Floats, depth: float) -> Bool:
         """Points (N, 3) [m] over `depth` [m] inside a fully drawn robot: no object is there."""
         if self.surface is None or not self.surface.is_drawn:
             return np.zeros(len(points_world), bool)
         return np.asarray(self.distance(points_world) < -depth)
 
-    def distance_to_moving(self, points_world: NDArray[np.floating]) -> Float64:
+    def distance_to_moving(self, points_world: Floats) -> Float64:
         """Signed distance (N,) [m] to links that joints move."""
         return self.distance(points_world, () if self.surface is None else self.surface.fixed)
 
@@ -79,7 +78,7 @@ def posture_of(
 POSTURE_NAMES = ("centers", "radii", "T_world_link")  # kept for the next time step
 
 
-def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
+def carry_splats(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
     """Move points (N, 3) [m], world, with the link of the nearest sphere surface.
 
     Splats left behind would become trails. The paper does not move them.

@@ -10,7 +10,7 @@ import numpy as np
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, project, transform_points
 from splatctrl_cli.records import Float64, RgbdFrame, spread
-from splatctrl_cli.scene.seeding import world_points_at
+from splatctrl_cli.scene.seeding import world_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ def differences(a: RgbdFrame, b: RgbdFrame, min_range: float, max_range: float) 
     is_used = np.zeros(a.depth.shape, bool)
     is_used[::stride, ::stride] = True
     is_used &= (a.depth >= min_range) & (a.depth <= max_range)
-    points = transform_points(invert_transform(b.T_world_camera), world_points_at(a, is_used))
+    points = transform_points(invert_transform(b.T_world_camera), world_points(a, is_used))
     points = points[points[:, 2] > 0]
     pixels = np.floor(project(b.intrinsics, points) + 0.5)
     is_inside = np.all((pixels >= 0) & (pixels < [b.intrinsics.width, b.intrinsics.height]), axis=1)

@@ -1,19 +1,18 @@
 """Removal of splats, by reason (III-C), eviction for bare surface, and use of idle slots."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame, SplatSet
+from splatctrl_cli.config import SceneConfig, fixed
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Index, Label, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thinned, thinning
+from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thin_mask, thinning
+from splatctrl_cli.scene.self_mask import least_within
 
 REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak", "evicted")
 
@@ -29,14 +28,8 @@ def nearest_depth(frame: RgbdFrame, reach: float = fixed.NEAREST_REACH, is_robot
         return depth
     half = max(1, round(reach * frame.intrinsics.fx / float(np.median(valid))))
     if is_robot is None or not is_robot.any():
-        return least_around(depth, half)
-    return np.minimum(least_around(np.where(is_robot, np.float32(np.inf), depth), half), least_around(depth, 1))
-
-
-def least_around(depth: Float32, half: int) -> Float32:
-    """Least value (H, W) in the square of 2 half + 1 pixels around each."""
-    window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
-    return np.asarray(cv2.erode(depth, window, borderType=cv2.BORDER_REPLICATE), np.float32)
+        return least_within(depth, half)
+    return np.minimum(least_within(np.where(is_robot, np.float32(np.inf), depth), half), least_within(depth, 1))
 
 
 def removals(
@@ -53,16 +46,16 @@ def removals(
 
     broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
     seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: no longer
-    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
-
-    Splats in never-seen surroundings stay, unless the rule is "literal". counts_time: count this step towards the
-    patience.
+    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail). Splats in
+    never-seen surroundings stay, unless the rule is "literal". counts_time: towards the patience.
     """
     config = occupancy.config
     centers = buffer.centers
     is_broken: Bool = ~np.all(np.isfinite(buffer.parameters), axis=1)
     value, is_observed = occupancy.occupancy_around(np.where(is_broken[:, None], np.float32(0), centers))
-    is_free, is_uncertain = _verdict(value, is_observed, config)
+    is_known = is_observed | (config.rule == "literal")
+    is_free = is_known & (value < config.free_below)
+    is_uncertain = is_known & (value >= config.free_below) & (value < config.occupied_above)
     if counts_time:
         buffer.num_uncertain[:] = np.where(is_uncertain, buffer.num_uncertain + 1, 0)
     masks = {
@@ -85,29 +78,20 @@ def removals(
     return reasons
 
 
-def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tuple[Bool, Bool]:
-    if config.rule == "literal":
-        return value < config.free_below, (value >= config.free_below) & (value < config.occupied_above)
-    return (
-        is_observed & (value < config.free_below),
-        is_observed & (value >= config.free_below) & (value < config.occupied_above),
-    )
-
-
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
     """Slots (M,) of at most `num` splats to evict, and the seeds in order of service.
 
     Only object splats go: redundant ones that show least, then, for seeds near the robot's path, far ones. shown
-    (M,): how much slots show; tolerance [m]: of `redundant`.
+    (M,): by slot; tolerance [m]: of `find_redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
     others, may_go = live[stands], live[splats.labels == Label.OBJECT]
     weakest = may_go[np.argsort(shown[may_go], kind="stable")][: fixed.EVICT_ASKED * num]
     order, voxels = np.searchsorted(others, weakest), occupancy.occupied_centers()
-    chosen = others[redundant(order, num, splats.select(stands), voxels, tolerance, occupancy.num_threads)]
+    chosen = others[find_redundant(order, num, splats.select(stands), voxels, tolerance, occupancy.num_threads)]
     is_evicted = np.zeros(len(shown), bool)
     is_evicted[chosen] = True
     path = occupancy.swept_box()
@@ -115,18 +99,18 @@ def room_for(
         seeds = seeds.select(np.argsort(distance_to_box(seeds.centers, path), kind="stable"))
         left, slots = num - len(chosen), may_go[~is_evicted[may_go]]
         waiting = seeds.centers[len(seeds) - left :]
-        is_evicted[slots[far_away(left, waiting, buffer.centers[slots], path)]] = True
+        is_evicted[slots[find_far(left, waiting, buffer.centers[slots], path)]] = True
     return is_evicted, seeds
 
 
-def redundant(
-    order: NDArray[np.intp],
+def find_redundant(
+    order: Index,
     num_wanted: int,
     splats: SplatSet,
     voxels: Float32,
     tolerance: float,
     num_threads: int = 1,
-) -> NDArray[np.intp]:
+) -> Index:
     """The first splats of `order`, at most `num_wanted`, that the others together can replace.
 
     splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within `tolerance`
@@ -152,7 +136,7 @@ def redundant(
     return np.array(chosen, np.intp)
 
 
-def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
+def find_far(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> Index:
     """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
     Each is at least EVICT_NEARER farther from the path than its seed.
@@ -171,7 +155,7 @@ def distance_to_box(points: Float32, box: Box) -> Float64:
     return np.asarray(np.linalg.norm(outside, axis=1), np.float64)
 
 
-def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
+def clone_shape(opacity: Float64, radius: Float64, count: Index) -> tuple[Float64, Float64]:
     """Opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies.
 
     The peak is conserved, `a = 1 - (1 - alpha)^(1/N)`, and the blended opacity over the screen, `r' = r sqrt(alpha
@@ -185,7 +169,7 @@ def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> t
     return a, radius * np.sqrt(np.divide(opacity, mass, out=np.ones_like(mass), where=mass > 0))
 
 
-def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator) -> Index:
     """Draw indices (num_clones,) in proportion to opacity, with replacement."""
     total = float(opacities.sum())
     if num_clones < 1 or total <= 0.0:
@@ -201,12 +185,8 @@ def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Fil
     return Filled(relocated=buffer.copy(sources, *clone_shape(opacities, buffer.radii.astype(np.float64), count)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Misfit:
-    """A view's mean absolute colour error (H, W), 0 where not mappable."""
-
-    frame: RgbdFrame
-    error: Float32
+Misfit = tuple[RgbdFrame, Float32]
+"""A view's frame, and its mean absolute colour error (H, W), 0 where not mappable."""
 
 
 def use_idle(
@@ -223,14 +203,14 @@ def use_idle(
     if config.when_idle == "leave" or not is_alive.any():
         return Filled(), 0
     found, shown = ([], None) if config.when_idle == "clone" else misfits()
-    if shown is None or not any(misfit.error.any() for misfit in found):  # no depth shows where detail would be
+    if shown is None or not any(error.any() for _, error in found):  # no depth shows where detail would be
         return clone(buffer, int((~is_alive).sum()) - reserve, rng), 0
     weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
     is_weak = np.zeros(len(is_alive), bool)
     is_weak[weakest[: int(config.weak_share * is_alive.sum())]] = True
-    buffer.kill(is_weak)
+    num_weak = buffer.kill(is_weak)
     seeds = detail_seeds(found, int((~is_alive).sum()) - reserve, config, rng)
-    return buffer.fill(seeds, config.initial_opacity), int(is_weak.sum())
+    return buffer.fill(seeds, config.initial_opacity), num_weak
 
 
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
@@ -238,23 +218,23 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
 
     The error is a 3 x 3 mean, weighted by a pixel's area of surface. No two seeds are closer than their diameters.
     """
-    every = thinning(misfit.error > 0 for misfit in misfits)
-    masks = [thinned(misfit.error > 0, every) for misfit in misfits]
+    every = thinning(error > 0 for _, error in misfits)
+    masks = [thin_mask(error > 0, every) for _, error in misfits]
     weight = np.concatenate(
         [
-            np.square(uniform_filter(misfit.error, 3)[mask] * misfit.frame.depth[mask], dtype=np.float64)
-            for misfit, mask in zip(misfits, masks, strict=True)
+            np.square(uniform_filter(error, 3)[mask] * frame.depth[mask], dtype=np.float64)
+            for (frame, error), mask in zip(misfits, masks, strict=True)
         ]
     )
     count = min(fixed.SEED_OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
     if count == 0:
         return NO_SEEDS
-    found = _pixels([misfit.frame for misfit in misfits], masks, drawn(weight, count, rng))
+    found = _pixels([frame for frame, _ in misfits], masks, draw_indices(weight, count, rng))
     kept = _apart(found.centers, 2.0 * found.radii)[:num_seeds]
     return replace(found.select(kept), radii=np.clip(found.radii[kept], config.min_radius, config.max_radius))
 
 
-def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> Index:
     """Draw `count` different indices in proportion to weight (K,), at least `count` of them positive.
 
     Same as ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, but faster.
@@ -271,7 +251,7 @@ def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.i
     return found
 
 
-def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[np.intp]) -> Seeds:
+def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: Index) -> Seeds:
     order = np.argsort(chosen, kind="stable")
     parts, first = [], 0
     for frame, mask in zip(frames, masks, strict=True):
@@ -281,15 +261,10 @@ def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[
         only.reshape(-1)[pixels[chosen[order[begin:end]] - first]] = True
         parts.append(candidates(frame, only))
         first += len(pixels)
-    found = Seeds(
-        centers=np.concatenate([part.points for part in parts]),
-        radii=np.concatenate([part.pixels for part in parts]),
-        colors=np.concatenate([part.colors for part in parts]),
-    )
-    return found.select(np.argsort(order))
+    return parts[0].joined(*parts[1:]).select(np.argsort(order))
 
 
-def _apart(points: Float32, distances: Float32) -> NDArray[np.intp]:
+def _apart(points: Float32, distances: Float32) -> Index:
     """Indices of points (K, 3) not within the distance (K,) of earlier kept ones."""
     is_taken = np.zeros(len(points), bool)
     neighbours = cKDTree(points).query_ball_point(points, distances)

@@ -37,19 +37,14 @@ class Rendering:
     opacity: Float32
 
     def normalised_depth(self) -> Float32:
-        """`normalised_depth` of this view."""
-        return normalised_depth(self.depth, self.opacity)
+        """Depth / opacity (H, W) [m] for opacity of 0.5 or more, else 0."""
+        is_opaque = self.opacity >= fixed.OPAQUE_ENOUGH
+        return np.where(is_opaque, self.depth / np.where(is_opaque, self.opacity, 1.0), 0.0).astype(np.float32)
 
     def before(self, background: Color) -> "Rendering":
         """View before one colour: color + (1 - opacity) background."""
         behind = (1.0 - self.opacity)[..., None] * np.array(background, np.float32)
         return replace(self, color=self.color + behind)
-
-
-def normalised_depth(depth: Float32, opacity: Float32) -> Float32:
-    """Depth / opacity (H, W) [m] for opacity of 0.5 or more, else 0."""
-    is_opaque = opacity >= fixed.OPAQUE_ENOUGH
-    return np.where(is_opaque, depth / np.where(is_opaque, opacity, 1.0), 0.0).astype(np.float32)
 
 
 def camera_array(intrinsics: Intrinsics, T_world_camera: Float64) -> Float64:

@@ -57,9 +57,9 @@ class RecordedDepth:
 def depth_noise(images: Sequence[Float32]) -> float:
     """Standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
-    The standard deviation at depth z is that times z^2, as in disparity sensors (Khoshelham and Elberink 2012:
-    1.425e-3 of a Kinect). Residuals of linear fits to blocks are noise; a low quantile leaves out edges. Blocks two
-    or three times as wide may raise it, up to twice, as fits absorb noise that neighbours share.
+    At depth z it is that times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
+    Residuals of linear fits to blocks are noise; a low quantile leaves out edges. Fits absorb noise that neighbours
+    share: blocks two or three times as wide may raise it, up to twice.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *fixed.NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))
@@ -95,7 +95,7 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
         return config
     is_found = config.scene.scale == 0
     scale = depth.median / fixed.SCALE_DEPTH if is_found else config.scene.scale
-    scene, occupancy = scaled(config.scene, scale), scaled(config.occupancy, scale)
+    scene, occupancy = scale_lengths(config.scene, scale), scale_lengths(config.occupancy, scale)
     values: dict[str, float] = {"scale": scale}
     if is_found and scene.radius_depth == 0:
         values["radius_depth"] = depth.median
@@ -108,7 +108,7 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
     return config.derived(scene=scene.derived(**values), occupancy=occupancy.derived(**ranges))
 
 
-def in_words(config: Config, depth: RecordedDepth) -> str:
+def describe_scale(config: Config, depth: RecordedDepth) -> str:
     scene, occupancy = config.scene, config.occupancy
     if scene.scale == 0:
         return f"depth is noisier than usual: {1e3 * occupancy.depth_error:.2g} mm at 1 m, growing with its square"
@@ -118,7 +118,7 @@ def in_words(config: Config, depth: RecordedDepth) -> str:
     )
 
 
-def scaled(section: Lengths, scale: float) -> Lengths:
+def scale_lengths(section: Lengths, scale: float) -> Lengths:
     """Multiply defaults by the power of `scale` that a length has in them."""
     powers, default = POWERS[section.section], type(section)()
     kept = {key: getattr(section, key) for key in powers}

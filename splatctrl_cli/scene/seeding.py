@@ -1,21 +1,25 @@
-"""Seeds of new splats, from first frames and unexplained pixels (M_add, eq. 5)."""
+"""Seeds of new splats, from first frames and unexplained pixels (M_add, eq. 5).
+
+The paper seeds every pixel. Here nested cubes over coloured points get one splat each: a cube splits in eight while
+its points differ in colour or lie off a plane.
+"""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import SEED_CROWDED, SEED_LEVELS, SEED_MOST_PIXELS
-from splatctrl_cli.kernels.points import Cubes, SplatTree, back_projected
+from splatctrl_cli.config import SceneConfig, fixed
+from splatctrl_cli.kernels.points import CubeMeans, Cubes, SplatTree, back_projected
 from splatctrl_cli.kernels.raster import pack_camera
-from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Integers, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
 
 Each = Callable[..., Iterable[Any]]  # `map`, or a parallel one
 
@@ -24,19 +28,15 @@ NO_SEEDS = Seeds(
 )
 
 
-def world_points(frame: RgbdFrame) -> Float64:
-    """Back-projected points (H, W, 3) [m], world; meaningless where depth is 0."""
-    return back_projected(_placed(frame), frame.depth).reshape(*frame.depth.shape, 3)
+def world_points(frame: RgbdFrame, mask: Bool | None = None, num_threads: int = 1) -> Float64:
+    """Back-projected points [m], world: (K, 3) of a mask (H, W), else (H, W, 3).
 
-
-def world_points_at(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Float64:
-    """Back-projected points (K, 3) [m], world, of a mask (H, W)."""
-    return back_projected(_placed(frame), frame.depth, mask, num_threads)
-
-
-def _placed(frame: RgbdFrame) -> Float64:
+    The latter are meaningless where depth is 0.
+    """
     k = frame.intrinsics
-    return pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
+    camera = pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
+    points = back_projected(camera, frame.depth, mask, num_threads)
+    return points.reshape(*frame.depth.shape, 3) if mask is None else points
 
 
 def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
@@ -59,21 +59,12 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
     return np.asarray(mappable & (is_hole | (error > threshold)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Candidates(Columns):
-    """Pixels to seed: points (K, 3) [m] world, colors (K, 3) in [0, 1], pixels (K,) of size D/f [m]."""
-
-    points: Float32
-    colors: Float32
-    pixels: Float32
-
-
 def thinning(masks: Iterable[Bool]) -> int:
     """Step n that leaves about `SEED_MOST_PIXELS` of masks (H, W), or fewer."""
-    return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
+    return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / fixed.SEED_MOST_PIXELS))
 
 
-def thinned(mask: Bool, every: int) -> Bool:
+def thin_mask(mask: Bool, every: int) -> Bool:
     """Keep the first of each `every` pixels of a mask (H, W), in row order."""
     if every == 1:
         return mask
@@ -82,15 +73,75 @@ def thinned(mask: Bool, every: int) -> Bool:
     return kept.reshape(mask.shape)
 
 
-def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates:
+def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Seeds:
     """Candidates in a mask (H, W)."""
     focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
-    colors = frame.color[mask].astype(np.float32) / 255.0
-    return Candidates(
-        points=world_points_at(frame, mask, num_threads).astype(np.float32),
-        colors=colors,
-        pixels=(frame.depth[mask] / focal).astype(np.float32),
+    return Seeds(
+        centers=world_points(frame, mask, num_threads).astype(np.float32),
+        radii=(frame.depth[mask] / focal).astype(np.float32),
+        colors=frame.color[mask].astype(np.float32) / 255.0,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CubeLevel:
+    """Occupied cubes of one size: points (K, 3) [m], means, and parent (K,) one level up.
+
+    A cube's point is the measured one nearest to the mean.
+    """
+
+    edge: float
+    points: Float32
+    means: CubeMeans
+    parent: Integers
+
+    @cached_property
+    def detail(self) -> Float64:
+        """Number of points times (colour variance + SEED_BEND * least position variance / edge^2), (K,)."""
+        means = self.means
+        color_variance = (means.square - means.color**2).sum(axis=1)
+        covariance = means.covariance[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        thickness = np.maximum(np.linalg.eigvalsh(covariance)[:, 0], 0.0)
+        unexplained = np.maximum(color_variance, 0.0) + fixed.SEED_BEND * thickness / self.edge**2
+        return np.asarray(means.count * unexplained)
+
+
+def cube_levels(
+    points: Float32, colors: Float32, edge: float, num_levels: int, num_threads: int = 1
+) -> list[CubeLevel]:
+    """Cubes of edges `edge`, `edge` / 2, … [m] over points (K, 3) with colours (K, 3)."""
+    levels: list[CubeLevel] = []
+    above = np.zeros(len(points), np.int32)
+    for level in range(num_levels):
+        size = edge / 2**level
+        cubes = Cubes(points, size, num_threads)
+        of_point, first = cubes.members()
+        means = cubes.means(colors)
+        levels.append(CubeLevel(edge=size, points=points[means.nearest], means=means, parent=above[first]))
+        above = of_point
+    return levels
+
+
+def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
+    """Masks (K,) per level of standing cubes: one splits while its detail exceeds `tolerance`."""
+    masks, is_reached = [], np.ones(len(levels[0].points), bool)
+    for level, below in pairwise(levels):
+        is_split = is_reached & (level.detail > tolerance)
+        masks.append(is_reached & ~is_split)
+        is_reached = is_split[below.parent]
+    return [*masks, is_reached]
+
+
+def tolerance_for(levels: Sequence[CubeLevel], count: int) -> float:
+    """Least tolerance (to 1 %) for at most `count` cubes; infinite if the coarsest exceed it."""
+    if len(levels[0].points) > count:
+        return float("inf")
+    low, high = 1e-6, float(max(level.detail.max() for level in levels)) + 1e-6
+    while high / low > 1.01:
+        middle = float(np.sqrt(low * high))
+        fits = sum(int(mask.sum()) for mask in leaves(levels, middle)) <= count
+        low, high = (low, middle) if fits else (middle, high)
+    return high
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,22 +153,23 @@ class SeedDensity:
     num_candidates: int = 0
 
 
-def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
+def density_for(sources: Sequence[Seeds], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
     """Density that spends at most `count` seeds on the candidates.
 
     The edge starts at what the largest splats cover, and grows by 5 % while cubes are too many.
     """
-    points, colors, _ = _joined(sources)
+    everything = sources[0].joined(*sources[1:])
+    points = everything.centers
     extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
     edge = config.max_radius / config.radius_per_edge
     while edge < extent and len(Cubes(points, edge, num_threads)) > count:
         edge *= 1.05
-    tolerance = tolerance_for(cube_levels(points, colors, edge, SEED_LEVELS, num_threads), count)
+    tolerance = tolerance_for(cube_levels(points, everything.colors, edge, fixed.SEED_LEVELS, num_threads), count)
     return SeedDensity(edge=edge, tolerance=tolerance, num_candidates=len(points))
 
 
 def seeds_at(
-    sources: Sequence[Candidates],
+    sources: Sequence[Seeds],
     live_centers: Float32,
     density: SeedDensity,
     config: SceneConfig,
@@ -128,9 +180,9 @@ def seeds_at(
     None is within 0.7 edges of a live splat (L, 3). The paper's radius min(D/f, r_max) is one pixel; here r =
     min(max(radius_per_edge * edge, D/f), r_max).
     """
-    points, colors, pixel = _joined(sources)
-    levels = cube_levels(points, colors, density.edge, SEED_LEVELS, num_threads)
-    chosen = leaves(levels, density.tolerance)
+    found = sources[0].joined(*sources[1:])
+    levels = cube_levels(found.centers, found.colors, density.edge, fixed.SEED_LEVELS, num_threads)
+    pixel, chosen = float(np.median(found.radii)), leaves(levels, density.tolerance)
     parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)]
     return parts[-1].joined(*parts[-2::-1])
 
@@ -155,13 +207,13 @@ def gap_seeds(
     """
     spheres = SplatTree(splats.centers, splats.radii, num_threads)
 
-    def bare(frame: RgbdFrame, mappable: Bool) -> Candidates:
+    def bare(frame: RgbdFrame, mappable: Bool) -> Seeds:
         step = _gap_stride(frame, config.max_gap) if stride is None else stride
         rows = np.arange(len(mappable))
         skipped = (rows % step != 0) | ((rows // step) % 2 == (2 if half is None else 1 - half))
         mask = np.zeros_like(mappable)
         mask[~skipped, ::step] = mappable[~skipped, ::step]
-        mask[mask] = spheres.are_further(world_points_at(frame, mask, num_threads), config.max_gap)
+        mask[mask] = spheres.are_further(world_points(frame, mask, num_threads), config.max_gap)
         return candidates(frame, mask)
 
     sources = [source for source in each(lambda view: bare(*view), views) if len(source)]
@@ -170,10 +222,10 @@ def gap_seeds(
         sources.append(_of_voxels(forgotten, splats))
     if not sources:
         return NO_SEEDS
-    all_points, colors, pixel = _joined(sources)
-    level = cube_levels(all_points, colors, config.max_radius / config.radius_per_edge, 1, num_threads)[0]
-    everything, no_splats = np.ones(len(level.points), bool), np.zeros((0, 3), np.float32)
-    return _seeds_of(level, everything, pixel, no_splats, config)
+    found = sources[0].joined(*sources[1:])
+    level = cube_levels(found.centers, found.colors, config.max_radius / config.radius_per_edge, 1, num_threads)[0]
+    pixel, no_splats = float(np.median(found.radii)), np.zeros((0, 3), np.float32)
+    return _seeds_of(level, np.ones(len(level.points), bool), pixel, no_splats, config)
 
 
 def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
@@ -182,23 +234,17 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
     return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
 
 
-def _of_voxels(centers: Float32, splats: SplatSet) -> Candidates:
+def _of_voxels(centers: Float32, splats: SplatSet) -> Seeds:
     colors = np.full((len(centers), 3), 0.5, np.float32)
     if len(splats):
         colors = splats.colors[cKDTree(splats.centers).query(centers)[1]]
-    return Candidates(points=centers, colors=colors, pixels=np.zeros(len(centers), np.float32))
-
-
-def _joined(sources: Sequence[Candidates]) -> tuple[Float32, Float32, float]:
-    points = np.concatenate([source.points for source in sources])
-    colors = np.concatenate([source.colors for source in sources])
-    return points, colors, float(np.median(np.concatenate([source.pixels for source in sources])))
+    return Seeds(centers=centers, radii=np.zeros(len(centers), np.float32), colors=colors)
 
 
 def _seeds_of(level: CubeLevel, mask: Bool, pixel: float, live_centers: Float32, config: SceneConfig) -> Seeds:
-    centers, colors = level.points[mask].astype(np.float32), level.colors[mask].astype(np.float32)
+    centers, colors = level.points[mask].astype(np.float32), level.means.color[mask].astype(np.float32)
     if len(live_centers) and len(centers):
-        reach = SEED_CROWDED * level.edge
+        reach = fixed.SEED_CROWDED * level.edge
         is_free = ~np.isfinite(cKDTree(live_centers).query(centers, distance_upper_bound=reach)[0])
         centers, colors = centers[is_free], colors[is_free]
     radius = np.clip(max(config.radius_per_edge * level.edge, pixel), config.min_radius, config.max_radius)

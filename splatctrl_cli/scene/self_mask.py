@@ -8,29 +8,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import (
-    CONTACT_THICKNESS,
-    MASK_ALONE,
-    MASK_BORDER,
-    MASK_EDGE,
-    MASK_FAR_OFF,
-    MASK_PIXELS,
-    MASK_SIGMAS,
-    MASK_SPECK,
-    MASK_STEEP,
-    MASK_STEP,
-    MASK_SURE,
-    VOTE_SHARE,
-)
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
-from splatctrl_cli.kernels import native
-from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
+from splatctrl_cli.kernels import Int16, native
+from splatctrl_cli.records import Array, Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.surface_steps import surface_steps
+from splatctrl_cli.scene.surface_depth import surface_steps
 from splatctrl_cli.scene.time_steps import AuditRow
 
 
@@ -68,13 +53,13 @@ class SelfMask:
 def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
     """Self-mask of a frame, with the robot's pose at its stamp.
 
-    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths nearby:
-    in as many pixels as the tolerance spans. So is a point this near to a triangle, or inside. Points inside balls
-    and carried boxes are robot. Other depth is object, if `_judge` agrees.
+    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths in as
+    many pixels as the tolerance spans. So is a point this near to a triangle, or inside one, a ball or a carried box.
+    Other depth is object, if `_judge` agrees.
 
     The image is widened by 1 / `MASK_BORDER`.
     """
-    k, border = frame.intrinsics, frame.intrinsics.width // MASK_BORDER
+    k, border = frame.intrinsics, frame.intrinsics.width // fixed.MASK_BORDER
     lens = replace(k, cx=k.cx + border, cy=k.cy + border, width=k.width + 2 * border, height=k.height + 2 * border)
     wider = _mask_within(replace(frame, intrinsics=lens, depth=np.pad(frame.depth, border)), robot, config)
     image = slice(border, border + k.height), slice(border, border + k.width)
@@ -90,7 +75,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
         frame.T_world_camera,
         frame.depth,
         tolerance=config.self_mask_tolerance,
-        quadratic=MASK_SIGMAS * config.depth_error,
+        quadratic=fixed.MASK_SIGMAS * config.depth_error,
     )
     kinds = object_mask(frame).kinds
     mask = SelfMask(kinds=kinds, robot_depth=shown.depth, residuals={}, num_inside={})
@@ -98,7 +83,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     if box is None:
         return mask
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
-    edge = max(round(frame.intrinsics.width / MASK_EDGE), reach)
+    edge = max(round(frame.intrinsics.width / fixed.MASK_EDGE), reach)
     wide = 2 * edge + reach + 1  # pixels, beyond which nothing is explained, doubted or inside
     part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may extend
     depth, rendered, kinds = np.ascontiguousarray(frame.depth[part]), shown.depth[part], kinds[part]
@@ -112,17 +97,19 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     is_explained &= depth <= farthest + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
-    nearest_at_edge = _least_within(nearest, edge - reach)  # infinite away from the outline
-    nearest = _least_within(nearest_at_edge, wide - edge)
+    nearest_at_edge = least_within(nearest, edge - reach)  # infinite away from the outline
+    nearest = least_within(nearest_at_edge, wide - edge)
     beside = np.isfinite(nearest) & has_depth
     is_core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     is_sure = depth < nearest_at_edge
     is_sure |= cv2.erode(is_core.view(np.uint8), _window(edge - reach)).view(bool)
     if surface.trees:
-        is_near = depth < farthest_within(farthest, wide - reach) + CONTACT_THICKNESS
+        is_near = depth < farthest_within(farthest, wide - reach) + fixed.CONTACT_THICKNESS
         v, u = np.nonzero(beside & is_near & ~is_explained)
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
-        sure = tolerance_at(depth[v, u], config, MASK_SURE) + edge * depth[v, u] / np.float32(frame.intrinsics.fx)
+        sure = tolerance_at(depth[v, u], config, fixed.MASK_SURE) + edge * depth[v, u] / np.float32(
+            frame.intrinsics.fx
+        )
         gap = surface.distance(
             T_world_link,
             transform_points(frame.T_world_camera, rays),
@@ -141,9 +128,9 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     steps[_fixed_outline(surface, is_robot, link)] = 0.0  # else a table would run on into the foot on it
     _judge(kinds, depth, beside, area, steps)
     offset = depth - rendered
-    is_told = is_core & has_depth & (np.abs(offset) <= MASK_FAR_OFF)
+    is_told = is_core & has_depth & (np.abs(offset) <= fixed.MASK_FAR_OFF)
     is_told &= link < len(surface.links) - surface.num_carried
-    is_told &= rendered - nearest < MASK_STEP  # stereo may give it the depth of a nearer part next to it
+    is_told &= rendered - nearest < fixed.MASK_STEP  # stereo may give it the depth of a nearer part next to it
     is_inside = is_core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,
@@ -160,15 +147,15 @@ def is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, fx
 
     Time-of-flight cameras mix their depths. The object is nearer than a surface tilted by `MASK_STEEP`.
     """
-    apart = np.maximum(np.float32(MASK_STEP), np.float32(MASK_STEEP * reach / fx) * depth)
+    apart = np.maximum(np.float32(fixed.MASK_STEP), np.float32(fixed.MASK_STEEP * reach / fx) * depth)
     is_behind = depth - nearest_within(depth, is_object, reach) > apart
     return np.asarray(is_object & is_behind & (farthest_within(depth, reach) - depth > tolerance))
 
 
-def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: NDArray[np.int16]) -> Bool:
+def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: Int16) -> Bool:
     """Outermost robot pixels (H, W) of links that no joint moves."""
-    fixed = [number for number, name in enumerate(surface.links) if name in surface.fixed]
-    shown = (is_robot & np.isin(link, fixed)).view(np.uint8)
+    still = [number for number, name in enumerate(surface.links) if name in surface.fixed]
+    shown = (is_robot & np.isin(link, still)).view(np.uint8)
     return np.asarray((shown > 0) & (cv2.erode(shown, _window(1)) == 0))
 
 
@@ -181,17 +168,17 @@ def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Flo
     is_object, shown = kinds == PixelKind.OBJECT, np.empty(depth.shape)
     asked = is_object & beside
     native.piece_areas(depth, steps, area, is_object.view(np.uint8), asked.view(np.uint8), shown)
-    kinds[shown < MASK_ALONE] = PixelKind.DOUBTED
-    kinds[shown < MASK_SPECK] = PixelKind.MIXED
+    kinds[shown < fixed.MASK_ALONE] = PixelKind.DOUBTED
+    kinds[shown < fixed.MASK_SPECK] = PixelKind.MIXED
 
 
-def settled(
+def settle_pieces(
     frame: RgbdFrame, mask: SelfMask, others: Sequence[tuple[RgbdFrame, SelfMask]], config: OccupancyConfig
 ) -> SelfMask:
     """Mask with each doubted piece decided: object or mixed.
 
-    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` measured half of it, or
-    if there are none. others: of other cameras, and settled ones of the last step.
+    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` (of other cameras, and
+    settled ones of the last step) measured half of it, or without any.
     """
     doubted = (mask.kinds == PixelKind.DOUBTED).view(np.uint8)
     v, u = np.nonzero(doubted)
@@ -199,7 +186,7 @@ def settled(
         return mask
     depth = np.ascontiguousarray(frame.depth)
     points = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depth[v, u]))
-    is_object, steps = np.full(len(v), not others), np.full_like(depth, MASK_STEP)
+    is_object, steps = np.full(len(v), not others), np.full_like(depth, fixed.MASK_STEP)
     votes, balance = np.zeros(depth.shape), np.empty(depth.shape)
     for other, its in others:
         pixel, z = pixels_at(other, points)
@@ -214,7 +201,7 @@ def settled(
     return replace(mask, kinds=kinds)
 
 
-def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
+def outvote_objects(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
     """Masks of one time step without object pixels that robot pixels outvote.
 
     Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
@@ -236,7 +223,7 @@ def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: fl
     rows = rows[np.all((rows[:, :3] >= low) & (rows[:, :3] <= high), axis=1)]
     cell = np.ravel_multi_index(tuple((rows[:, :3] - low).T), tuple(high - low + 1))
     num_robot, num_object = (np.bincount(cell, weights=rows[:, 6] == own) for own in (0, 1))
-    lost = rows[(rows[:, 6] == 1) & (num_object < VOTE_SHARE * num_robot)[cell]]
+    lost = rows[(rows[:, 6] == 1) & (num_object < fixed.VOTE_SHARE * num_robot)[cell]]
     found = []
     for number, (_, mask) in enumerate(seen):
         kinds = mask.kinds.copy()
@@ -256,7 +243,7 @@ def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float
     return np.where(is_inside, v * k.width + u, -1), z
 
 
-def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _by_link(values: Array, links: Int16, names: Sequence[str]) -> dict[str, Array]:
     order = np.argsort(links, kind="stable")
     ends = np.searchsorted(links[order], np.arange(len(names) + 1))
     parts = {name: values[order[first:end]] for name, first, end in zip(names, ends, ends[1:], strict=False)}
@@ -294,71 +281,43 @@ def _nothing_rendered(shape: tuple[int, int]) -> Float32:
     return image
 
 
-def of_label(mask: SelfMask, label: Label) -> Bool:
+def label_pixels(mask: SelfMask, label: Label) -> Bool:
     """Pixels (H, W) of the robot, or of objects."""
     return np.asarray(mask.kinds == (PixelKind.ROBOT if label == Label.ROBOT else PixelKind.OBJECT))
 
 
-def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
+def drop_pixels(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
     """Frame with depth 0 in pixels of a kind."""
     is_of_it = mask.kinds == kind
     return replace(frame, depth=np.where(is_of_it, np.float32(0.0), frame.depth)) if is_of_it.any() else frame
 
 
-def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:
+def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = fixed.MASK_SIGMAS) -> Float32:
     """Largest allowed difference [m] of the robot's measured and rendered depth."""
     return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
 
-@dataclass(frozen=True, kw_only=True)
-class LinkResidual:
-    """The residual of one link over several masks.
+def audit_masks(masks: Sequence[SelfMask]) -> dict[str, Any]:
+    """`self_mask` and `inside_robot` of `AuditRow`, by link that a mask saw.
 
-    median [m]: of measured minus rendered depth over num_pixels, None without any; num_inside: as in `SelfMask`;
-    reach [m]: the least `SelfMask.reach`.
+    sign: 1 if the robot is measured behind its rendered surface, -1 before it; reach: the least `SelfMask.reach`.
     """
-
-    median: float | None
-    num_pixels: int
-    num_inside: int
-    reach: float
-
-    @property
-    def sign(self) -> int:
-        """1 if the robot is measured behind its rendered surface, -1 before it, else 0."""
-        return 0 if self.median is None else int(np.sign(self.median))
-
-
-def link_residuals(masks: Sequence[SelfMask]) -> dict[str, LinkResidual]:
-    """Residual of each link that a mask saw."""
-    links = dict.fromkeys(link for mask in masks for link in [*mask.residuals, *mask.num_inside])
-    found = {}
-    for link in links:
-        parts = [mask.residuals[link] for mask in masks if link in mask.residuals]
-        joined = np.concatenate(parts) if parts else np.zeros(0)
-        found[link] = LinkResidual(
-            median=float(np.median(joined)) if len(joined) else None,
-            num_pixels=len(joined),
-            num_inside=sum(mask.num_inside.get(link, 0) for mask in masks),
-            reach=min((mask.reach for mask in masks if link in mask.residuals), default=0.0),
-        )
-    return found
-
-
-def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
-    """`link_residuals` as in `AuditRow`."""
-    found = link_residuals(masks)
-    rows = {
-        link: {
-            "median_mm": round(1e3 * r.median, 2),
-            "sign": r.sign,
-            "num_pixels": r.num_pixels,
-            "reach_mm": round(1e3 * r.reach, 2),
-        }
-        for link, r in found.items()
-        if r.median is not None
-    }
-    return {"self_mask": rows, "inside_robot": {link: r.num_inside for link, r in found.items() if r.num_inside}}
+    rows, inside = {}, {}
+    for link in dict.fromkeys(link for mask in masks for link in [*mask.residuals, *mask.num_inside]):
+        seen = [mask for mask in masks if link in mask.residuals]
+        if seen:
+            offsets = np.concatenate([mask.residuals[link] for mask in seen])
+            median = float(np.median(offsets))
+            rows[link] = {
+                "median_mm": round(1e3 * median, 2),
+                "sign": int(np.sign(median)),
+                "num_pixels": len(offsets),
+                "reach_mm": round(1e3 * min(mask.reach for mask in seen), 2),
+            }
+        num_inside = sum(mask.num_inside.get(link, 0) for mask in masks)
+        if num_inside:
+            inside[link] = num_inside
+    return {"self_mask": rows, "inside_robot": inside}
 
 
 def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -> dict[str, Any]:
@@ -370,7 +329,7 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}
-    seen = {link for link in links if pixels[link] >= MASK_PIXELS}
+    seen = {link for link in links if pixels[link] >= fixed.MASK_PIXELS}
     judged = seen.difference(holding) or seen
     found = {}
     for link in links:
@@ -401,10 +360,11 @@ def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
     """Least depth (H, W) of chosen pixels within `reach` pixels, else inf."""
     kept = np.full(depth.shape, np.inf, np.float32)
     cv2.copyTo(depth, chosen.view(np.uint8), kept)
-    return _least_within(kept, reach)
+    return least_within(kept, reach)
 
 
-def _least_within(image: Float32, reach: int) -> Float32:
+def least_within(image: Float32, reach: int) -> Float32:
+    """Least value (H, W) within `reach` pixels."""
     return np.asarray(cv2.erode(image, _window(reach), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 

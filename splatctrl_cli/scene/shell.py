@@ -7,34 +7,31 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
-from splatctrl_cli.records import Bool, Box, SplatSet
-from splatctrl_cli.scene.buffer import COLOR, SplatBuffer
+from splatctrl_cli.records import Bool, Box, SplatSet, Values
+from splatctrl_cli.scene.buffer import COLOR, Seeds, SplatBuffer
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, seen_through
 from splatctrl_cli.scene.render import Color
-from splatctrl_cli.scene.scale import scaled
+from splatctrl_cli.scene.scale import scale_lengths
 from splatctrl_cli.scene.seeding import (
-    Candidates,
     SeedDensity,
     add_mask,
     candidates,
     density_for,
     seeds_at,
-    thinned,
+    thin_mask,
     thinning,
 )
 
 Masked = Sequence[tuple[View, Bool]]
 
 
-def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
+def pixels_beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
     """Valid pixels (H, W) with depth of at least `min_range` [m] outside the workspace, except `mounted` ones."""
     depth = view.target.depth
-    left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0)
-    left_out &= True if view.frame.valid is None else view.frame.valid
+    left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0) & view.frame.in_view
     return np.asarray(left_out if mounted is None else left_out & ~mounted)
 
 
@@ -57,11 +54,11 @@ class Shell:
     def _begin(self, depth: float, density: SeedDensity | None, num_iterations: int = 0) -> None:
         self._depth, self._density, config = depth, density, self.config
         if density is not None:
-            config = scaled(config, depth / fixed.SCALE_DEPTH).derived(radius_depth=depth)
+            config = scale_lengths(config, depth / fixed.SCALE_DEPTH).derived(radius_depth=depth)
             least, most = config.min_radius, config.max_radius  # the user may have set either
             widest = max(least, most, config.radius_per_edge * density.edge)  # else far walls have holes
             config = config.derived(max_radius=widest)
-            self._see_through = scaled(self.occupancy, depth / fixed.SCALE_DEPTH).see_through
+            self._see_through = scale_lengths(self.occupancy, depth / fixed.SCALE_DEPTH).see_through
         self._scaled = config
         self._descent = Descent(config, self.buffer, self._seed, self._num_threads)
         self._descent.num_iterations = num_iterations
@@ -72,7 +69,7 @@ class Shell:
         self.num_steps += 1
         self._remove(views.newest)
         every = [*views.newest, *views.keyframes]
-        masks = [beyond(view, self.occupancy.min_range, mounted.get(view.frame.camera)) for view in every]
+        masks = [pixels_beyond(view, self.occupancy.min_range, mounted.get(view.frame.camera)) for view in every]
         shown = [(view, mask) for view, mask in zip(every, masks, strict=True) if mask.any()]
         if not shown:
             return
@@ -101,19 +98,19 @@ class Shell:
         if self._density is not None and self._fill(_sources(asked), self._density) <= most:
             return
         stands = self.buffer.is_alive.copy()
-        held = Candidates(
-            points=self.buffer.centers[stands],
+        held = Seeds(
+            centers=self.buffer.centers[stands],
+            radii=self.buffer.radii[stands],
             colors=self.buffer.parameters[stands, COLOR],
-            pixels=self.buffer.radii[stands],
         )
         self.buffer.kill(stands)
         depth = float(np.median(np.concatenate([view.target.depth[mask] for view, mask in shown])))
-        sources, config = [*_sources(shown), held], scaled(self.config, depth / fixed.SCALE_DEPTH)
+        sources, config = [*_sources(shown), held], scale_lengths(self.config, depth / fixed.SCALE_DEPTH)
         density = density_for(sources, max(int(config.fill * config.max_splats), 1), config, self._num_threads)
         self._begin(depth, density, self._descent.num_iterations)
         self._fill(sources, density)
 
-    def _fill(self, sources: Sequence[Candidates], density: SeedDensity) -> int:
+    def _fill(self, sources: Sequence[Seeds], density: SeedDensity) -> int:
         if not any(len(source) for source in sources):
             return 0
         seeds = seeds_at(sources, self.buffer.centers[self.buffer.is_alive], density, self._scaled, self._num_threads)
@@ -124,13 +121,13 @@ class Shell:
         gone |= seen_through(self.buffer.centers, views, self._see_through, self._num_threads)
         self.buffer.kill(self.buffer.is_alive & gone)
 
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
+    def arrays(self) -> dict[str, Values]:
         d = self._density
         density = (0.0, 0.0, 0) if d is None else (d.edge, d.tolerance, d.num_candidates)
         counters = (self.num_steps, self._descent.num_iterations)
         return self.buffer.arrays() | {"begun": np.array([*counters, self._depth, *density])}
 
-    def restore(self, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+    def restore(self, arrays: Mapping[str, Values]) -> None:
         """Restore a state of the same configuration, seed and workspace."""
         for name, array in self.buffer.arrays().items():
             array[...] = arrays[name]
@@ -140,6 +137,6 @@ class Shell:
         self._begin(depth, density if edge else None, int(num_iterations))
 
 
-def _sources(masked: Masked) -> list[Candidates]:
+def _sources(masked: Masked) -> list[Seeds]:
     every = thinning(mask for _, mask in masked)
-    return [candidates(view.frame, thinned(mask, every)) for view, mask in masked]
+    return [candidates(view.frame, thin_mask(mask, every)) for view, mask in masked]

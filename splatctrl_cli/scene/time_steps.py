@@ -10,7 +10,7 @@ from splatctrl_cli.config.fixed import FRAMES_PER_STEP, JOINTS_GAP_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Box, Float32, Float64, JointState, PointCloud, Record, RgbdFrame
 from splatctrl_cli.scene.buffer import Filled
-from splatctrl_cli.scene.seeding import thinned, thinning, world_points_at
+from splatctrl_cli.scene.seeding import thin_mask, thinning, world_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +164,7 @@ def depth_box(frames: Sequence[RgbdFrame], max_range: float, scale: float = 1.0)
     """
     masks = [(frame.depth > 0) & (frame.depth <= max_range) for frame in frames]
     every = thinning(masks)
-    points = [world_points_at(frame, thinned(mask, every)) for frame, mask in zip(frames, masks, strict=True)]
+    points = [world_points(frame, thin_mask(mask, every)) for frame, mask in zip(frames, masks, strict=True)]
     joined = np.concatenate(points)
     del points
     if not len(joined):

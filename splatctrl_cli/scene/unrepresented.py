@@ -14,7 +14,7 @@ from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
 from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Bool, Box, Float32, Label, SplatSet
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels, VoxelState
+from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels, VoxelState, voxels_at
 
 
 def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig, error: float = 0.0) -> Balls:
@@ -35,7 +35,7 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     )
 
 
-def confirmed(found: Balls, before: Balls | None) -> Balls:
+def confirm_bare(found: Balls, before: Balls | None) -> Balls:
     """Balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
     before: of the last time step; None in the first, where all count.
@@ -117,9 +117,8 @@ def agreement_with_grid(
     grid = known.grid
     states = grid.states(occupancy.free_below, occupancy.occupied_above)
     others = splats.select(splats.labels != Label.ROBOT)
-    cell = np.floor((others.centers.astype(np.float64) - grid.origin) / grid.voxel + 0.5)
-    is_inside = np.all((cell >= 0) & (cell < states.shape), axis=1)
-    cells = tuple(cell[is_inside].astype(np.int64).T)
+    places, is_inside = voxels_at(others.centers.astype(np.float64), grid.origin, grid.voxel, states.shape)
+    cells = tuple(places[is_inside].T)
     may_hold = maximum_filter(np.isin(states, (VoxelState.OCCUPIED, VoxelState.UNCERTAIN)), size=3)
     was_seen = maximum_filter(states != VoxelState.NEVER_SEEN, size=3)  # space beyond the depth range is not
     num_told = was_seen[cells].sum() + np.count_nonzero(~is_inside)

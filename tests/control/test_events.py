@@ -106,18 +106,18 @@ def row(name: str, kind: RowKind, multiplier: float) -> Intervention:
 
 def signal(kind: EventKind, is_on: ArrayLike, value: ArrayLike, *names: str) -> Signal:
     on = np.asarray(is_on, np.bool_)
-    return Signal(kind=kind, is_on=on, value=np.broadcast_to(value, len(on)), names_at=lambda _: [*names])
+    return Signal(kind=kind, is_on=on, value=np.broadcast_to(value, len(on)), names=lambda _: [*names])
 
 
 def test_an_event_has_the_worst_value_of_its_run_and_every_name_in_order() -> None:
     """Many names are counted, and not all listed."""
     given = signal(EventKind.SCENE, [0, 1, 1, 1, 0, 1], [9.0, 1, 3, 2, 9, 5])
-    first, second = events_of(STAMPS, [replace(given, names_at=lambda i: ["a", "b"] if i == 3 else ["b"])])
+    first, second = events_of(STAMPS, [replace(given, names=lambda i: ["a", "b"] if i == 3 else ["b"])])
     assert (first.start_s, first.end_s, first.num_states) == (pytest.approx(0.1), pytest.approx(0.3), 3)
     assert (first.worst, first.worst_s, first.state) == (3.0, pytest.approx(0.2), 2)
     assert first.names == ("b", "a") and first.num_names == 2 and first.worst_name == "b"
     assert second.first_ns == second.last_ns == 500_000_000 and second.worst == 5.0
-    many = replace(given, is_on=given.value < 4, is_high_worse=False, names_at=lambda i: [f"{i}{j}" for j in "abcde"])
+    many = replace(given, is_on=given.value < 4, is_high_worse=False, names=lambda i: [f"{i}{j}" for j in "abcde"])
     (low,) = events_of(STAMPS, [many])
     assert low.worst == 1.0 and len(low.names) == 12 and low.num_names == 15
 

@@ -11,7 +11,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig, load_config
 from splatctrl_cli.config.fixed import ENCODER, MOTION_WINDOW
 from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.control.limits import JointLimits, MotionLimits, braking_speed, fr3_limits
+from splatctrl_cli.control.limits import FR3_JOINTS, JointLimits, MotionLimits, braking_speed, fr3_limits
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.errors import UsageError
@@ -109,15 +109,16 @@ def test_an_acceleration_that_cannot_be_is_refused(value: float | tuple[float, .
 def test_the_fr3_limits_are_those_that_are_published() -> None:
     """They are continuous, and zero lies between them."""
     limit, random, order = fr3_limits(NAMES), np.random.default_rng(2), [3, 0]
-    for q in random.uniform(limit.lower - 0.1, limit.upper + 0.1, (300, 7)):
-        np.testing.assert_allclose(limit.at(q), fr3_velocity_range(q), atol=1e-12)
-    np.testing.assert_allclose(fr3_limits([NAMES[j] for j in order]).at(q[order])[1], limit.at(q)[1][order])
+    most, offset, slope, lower, upper = np.array(FR3_JOINTS).T
+    for q in random.uniform(lower - 0.1, upper + 0.1, (300, 7)):
+        np.testing.assert_allclose(limit(q), fr3_velocity_range(q), atol=1e-12)
+    np.testing.assert_allclose(fr3_limits([NAMES[j] for j in order])(q[order])[1], limit(q)[1][order])
     for share in np.linspace(-0.05, 1.05, 2001):
-        q = limit.lower + share * (limit.upper - limit.lower)
-        lowest, highest = limit.at(q)
-        assert np.all(lowest <= 0) and np.all(highest >= 0) and np.all(highest <= limit.most)
-        ahead = limit.at(q + 1e-6)[1]
-        assert np.all(np.abs(ahead - highest) <= 1e-6 * limit.slope / (2 * limit.offset) + 1e-12)
+        q = lower + share * (upper - lower)
+        lowest, highest = limit(q)
+        assert np.all(lowest <= 0) and np.all(highest >= 0) and np.all(highest <= most)
+        ahead = limit(q + 1e-6)[1]
+        assert np.all(np.abs(ahead - highest) <= 1e-6 * slope / (2 * offset) + 1e-12)
 
 
 def test_the_fr3_limits_are_merged_with_those_of_the_urdf() -> None:
@@ -127,7 +128,7 @@ def test_the_fr3_limits_are_merged_with_those_of_the_urdf() -> None:
         lower=lower, upper=upper, velocity=np.array([1.0, 9.0]), gain=100.0, period=0.01, by_position=by_position
     )
     np.testing.assert_allclose(merged.box(np.zeros(2))[1], [1.0, 2.62])
-    np.testing.assert_allclose(merged.box(near)[1], np.minimum(by_position.at(near)[1], [1.0, 9.0]))
+    np.testing.assert_allclose(merged.box(near)[1], np.minimum(by_position(near)[1], [1.0, 9.0]))
     for q in (np.array([3.0, 2.0]), np.array([-3.0, -2.0])):
         lowest, highest = merged.box(q)
         assert np.all(lowest <= highest) and np.all(np.sign(highest + lowest) == -np.sign(q))

@@ -104,7 +104,7 @@ def test_seen_after_the_state_is_ahead_of_it() -> None:
 @pytest.mark.parametrize("turn", [0.05, 0.2])
 def test_on_the_way_no_sphere_moves_by_a_centimetre_from_one_posture_to_the_next(turn: float) -> None:
     arm, last = PlanarArm(), FIRST + np.array([turn, 0.0])
-    way = NearSpace(arm, 0.03).on_the_way(FIRST, last)
+    way = NearSpace(arm, 0.03).postures_between(FIRST, last)
     centers = np.array([arm.sphere_centers(q) for q in (FIRST, *way, last)])
     moved = np.linalg.norm(np.diff(centers, axis=0), axis=2).max(axis=1)
     assert moved.max() <= NEAR_MOVED and moved.min() > 0.8 * moved.max()
@@ -139,16 +139,17 @@ def test_states_are_thinned_by_time_across_blocks() -> None:
     space, stamps = NearSpace(PlanarArm(), 0.03), np.arange(0, 800, 40, dtype=np.int64) * 1_000_000  # 25 Hz
     assert NEAR_EVERY_NS == 200_000_000
     still = np.repeat(PlanarArm().sphere_centers(LATER)[None], len(stamps), axis=0)
-    assert space.due(stamps[:12], still[:12]) == {0: True, 5: True, 10: True}
-    assert space.due(stamps[12:], still[12:]) == {3: True}  # the state at 600 ms
-    assert list(space.due(np.array([10 * SECOND, 11 * SECOND]), still[:2])) == [0, 1]  # slow states are all looked at
+    assert space.choose(stamps[:12], still[:12]) == {0: True, 5: True, 10: True}
+    assert space.choose(stamps[12:], still[12:]) == {3: True}  # the state at 600 ms
+    slow = np.array([10 * SECOND, 11 * SECOND])
+    assert list(space.choose(slow, still[:2])) == [0, 1]  # all of them are looked at
 
 
 def test_no_sphere_of_a_fast_arm_moves_a_centimetre_between_two_looks() -> None:
     arm, space = PlanarArm(), NearSpace(PlanarArm(), 0.03)
     joints = FIRST + np.linspace(0.0, 0.1, 50)[:, None]  # in 100 ms
     centers, stamps = arm.sphere_centers_batch(joints), np.arange(50, dtype=np.int64) * 2_000_000
-    first, rest = (space.due(stamps[part], centers[part]) for part in (slice(20), slice(20, None)))
+    first, rest = (space.choose(stamps[part], centers[part]) for part in (slice(20), slice(20, None)))
     assert [at for at, is_timed in first.items() if is_timed] == [0] and not any(rest.values())
     chosen = [*first, *(20 + at for at in rest)]
     assert 3 < len(chosen) < 50

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
+from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
 from splatctrl_cli.control.open_loop import OpenLoopTask, OpenLoopTrace, is_shaped, open_loop
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.control.terms import RowKind
@@ -99,7 +99,7 @@ def test_a_logged_motion_is_linear_between_states_and_at_rest_after_the_last() -
 
 def test_a_guide_carries_the_frame_as_the_log_did() -> None:
     arm, logged = PlanarArm(), motion()
-    _, guide = logged.goal_at(arm, "tip", 300_000_000)
+    _, guide = guided_goal(arm, "tip", *logged.at(300_000_000))
     q, v = logged.at(300_000_000)
     step = (arm.frame_pose(q + 1e-6 * v, "tip") - arm.frame_pose(q - 1e-6 * v, "tip"))[:3, 3] / 2e-6
     np.testing.assert_allclose(guide.twist[:3], step, atol=1e-8)

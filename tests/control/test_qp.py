@@ -8,10 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.barriers import (
-    can_bind,
-    fastest_approach,
-)
+from splatctrl_cli.control.barriers import can_bind
 from splatctrl_cli.control.goals import pose_error, reference_velocity, rotation_vector
 from splatctrl_cli.control.limits import velocity_box
 from splatctrl_cli.control.qp import (
@@ -181,7 +178,6 @@ def test_the_program_without_slacks_gives_the_same_step_where_it_is_used() -> No
 
 def test_a_row_that_no_velocity_of_the_box_violates_cannot_bind() -> None:
     G, lowest, highest = np.array([[1.0, -2.0]]), np.array([-1.0, -0.5]), np.array([0.5, 1.0])
-    assert fastest_approach(G, lowest, highest)[0] == pytest.approx(1.5)
     assert can_bind(G, np.array([1.49]), lowest, highest)[0]
     assert not can_bind(G, np.array([1.5]), lowest, highest)[0]
 

@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.barriers import PeopleGrown, SceneStep, distance_rate, guarded
+from splatctrl_cli.control.barriers import PeopleGrown, SceneStep, distance_rate, guard_people
 from splatctrl_cli.control.preconditions import FixedParts, check_free, static_violations
 from splatctrl_cli.control.replay import ReplayTask, SceneChange, closed_loop
 from splatctrl_cli.control.step import QpIkController
@@ -78,10 +78,10 @@ def test_its_gradient_is_the_slope_of_its_distance() -> None:
 
 def test_without_people_or_a_larger_margin_the_scene_is_what_counts() -> None:
     scene, people = balls(THING), balls(PERSON)
-    assert guarded(scene, None, ControlConfig(human_margin=0.3)) is scene
-    assert guarded(scene, people, ControlConfig()) is scene
-    assert guarded(scene, people, ControlConfig(margin=0.05, human_margin=0.05)) is scene
-    assert guarded(scene, people, ControlConfig(human_margin=0.3)) is not scene
+    assert guard_people(scene, None, ControlConfig(human_margin=0.3)) is scene
+    assert guard_people(scene, people, ControlConfig()) is scene
+    assert guard_people(scene, people, ControlConfig(margin=0.05, human_margin=0.05)) is scene
+    assert guard_people(scene, people, ControlConfig(human_margin=0.3)) is not scene
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_the_controller_stays_farther_from_a_person_than_from_a_thing(
 ) -> None:
     """The goal is in a ball, which is a person or a thing."""
     arm, ball, config = PlanarArm(), balls((0.81, 0.39, 0.0)), ControlConfig(human_margin=human_margin)
-    field = guarded(ball, ball if is_person else None, config)
+    field = guard_people(ball, ball if is_person else None, config)
     controller = QpIkController(arm, config, field, frame="tip")
     goal = arm.frame_pose(np.array([0.4, 0.1]), "tip")
     _, postures = steps_towards(controller, np.array([-0.9, 0.3]), goal, 400)

@@ -16,7 +16,7 @@ from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box
 from splatctrl_cli.field.report import grid_statistics
-from splatctrl_cli.field.slabs import UnknownSpace, bake, baked_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.field.slabs import UnknownSpace, bake, bake_planes, bytes_per_cell, check_slab_memory, slabs
 from splatctrl_cli.formats.grid.npz_grid import write_npz
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import SWEPT, OccupancyGrid
@@ -241,7 +241,7 @@ def test_memory_is_that_of_a_slab_however_long_the_grid(monkeypatch: pytest.Monk
         baker = Baker(splats, layout, FieldConfig())
         tracemalloc.start()
         for first, last in slabs(layout, baker.channels):
-            baked_planes(baker, first, last)
+            bake_planes(baker, first, last)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     cells = 8 * 40 * 40
@@ -300,7 +300,7 @@ def test_unknown_space_in_slabs_is_that_of_the_whole_grid(policy: str, monkeypat
     wanted = apply_unknown(grid, policy)
     unknown = UnknownSpace(LAYOUT, config, half_seen(), OccupancyConfig())
     for first, last in slabs(LAYOUT, channels):
-        planes = unknown.apply(baked_planes(baker, first, last), first, last, baker.bound_margin)
+        planes = unknown.apply(bake_planes(baker, first, last), first, last, baker.bound_margin)
         for name, values in planes.items():
             assert values.tobytes() == wanted.channels[name][first:last].tobytes(), name
     assert {**header, **unknown.header()} == wanted.header

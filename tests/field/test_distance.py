@@ -17,7 +17,7 @@ from splatctrl_cli.field.distance import (
     SphereField,
     field_over,
     march,
-    normalised,
+    normalise,
 )
 from splatctrl_cli.field.slabs import planar_zero_level
 from splatctrl_cli.records import DistanceField
@@ -35,7 +35,7 @@ def fields(centers: np.ndarray, radii: np.ndarray) -> list[DistanceField]:
 
 
 def test_an_isolated_sphere_is_as_far_as_it_is_and_the_gradient_points_away() -> None:
-    center, directions = np.array([1.0, 2.0, 3.0]), normalised(queries(50))
+    center, directions = np.array([1.0, 2.0, 3.0]), normalise(queries(50))
     for field in fields(center[None], np.array([0.1])):
         for away in (0.1, 0.15, 0.6):
             distance, gradient = field.query(center + away * directions)
@@ -169,7 +169,7 @@ def test_threads_do_not_change_a_bit() -> None:
 
 
 def test_normalised_gradients_have_length_one_or_none() -> None:
-    unit = normalised(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]]))
+    unit = normalise(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]]))
     np.testing.assert_allclose(unit, [[0, 0, 0], [0.6, 0, 0.8]])
 
 

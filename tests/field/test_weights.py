@@ -10,8 +10,7 @@ from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField
 from splatctrl_cli.field.weights import (
     METHODS,
-    Matern12,
-    SquaredExponential,
+    Kernel,
     conjugate_gradients,
     log_row_sums,
     solve_process,
@@ -22,20 +21,21 @@ from tests.field.scenes import cloud, queries
 from tests.reference import field as reference
 
 LENGTH, NOISE = 0.02, 1e-6
+MATERN, GAUSSIAN = (Kernel(length=LENGTH, is_matern=is_matern) for is_matern in (True, False))
 
 
 def test_voxel_density_is_spread_convolved_and_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
     centers, _ = cloud(60)
     centers = 0.1 * centers  # all within reach of each other
     expected = reference.voxel_row_sums(centers, LENGTH, LENGTH / VOXELS_PER_LENGTH)
-    sums = voxel_row_sums(centers, LENGTH, Matern12(LENGTH).value)
+    sums = voxel_row_sums(centers, LENGTH, MATERN.value)
     np.testing.assert_allclose(sums, expected, rtol=1e-9)
     monkeypatch.setattr(weights_module, "NODES", 48)  # blocks of 15 cells rather than 63
-    np.testing.assert_allclose(voxel_row_sums(centers + 7.0, LENGTH, Matern12(LENGTH).value), expected, rtol=1e-9)
+    np.testing.assert_allclose(voxel_row_sums(centers + 7.0, LENGTH, MATERN.value), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("kernel", [Matern12(LENGTH), SquaredExponential(LENGTH)])
-def test_voxel_density_is_near_the_exact_one_across_blocks(kernel: Matern12 | SquaredExponential) -> None:
+@pytest.mark.parametrize("kernel", [MATERN, GAUSSIAN])
+def test_voxel_density_is_near_the_exact_one_across_blocks(kernel: Kernel) -> None:
     centers, radii = cloud(3000)
     centers *= 2.0  # 1.2 m: blocks of 0.63 m
     exact = np.exp(log_row_sums(kernel, Spheres.of(centers, radii)))
@@ -46,9 +46,9 @@ def test_voxel_density_is_near_the_exact_one_across_blocks(kernel: Matern12 | Sq
 
 
 def test_a_lone_splat_has_a_density_of_one_and_a_distant_one_does_not_change_it() -> None:
-    assert voxel_row_sums(np.array([[0.3, 0.1, 0.2]]), LENGTH, Matern12(LENGTH).value) == pytest.approx(1.0)
+    assert voxel_row_sums(np.array([[0.3, 0.1, 0.2]]), LENGTH, MATERN.value) == pytest.approx(1.0)
     several = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.5, 0.5, 0.5], [900.0, 0.0, 0.0]])
-    sums = voxel_row_sums(several, LENGTH, Matern12(LENGTH).value)
+    sums = voxel_row_sums(several, LENGTH, MATERN.value)
     np.testing.assert_allclose(sums[2:], 1.0, atol=1e-12)
     np.testing.assert_allclose(sums[:2], 1 + np.exp(-0.5), rtol=0.1)
 
@@ -67,7 +67,7 @@ def test_voxel_weights_give_nearly_the_field_of_the_row_sums() -> None:
 @pytest.mark.parametrize("is_matern", [True, False])
 def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
     centers, radii = cloud(400)
-    kernel = Matern12(LENGTH) if is_matern else SquaredExponential(LENGTH)
+    kernel = Kernel(length=LENGTH, is_matern=is_matern)
     log_values = radii / LENGTH if is_matern else np.zeros(400)
     scaled, log_scale, _, residual = solve_process(centers, log_values, LENGTH, kernel.value, NOISE)
     dense = reference.process_weights(kernel.value(reference.distances(centers, centers)), np.exp(log_values), NOISE)

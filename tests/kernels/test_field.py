@@ -27,7 +27,7 @@ def test_row_sums_are_those_of_the_kernel_matrix_in_any_order(is_matern: bool) -
     for length in (1e-6, 0.004, 0.05, 3.0):
         kernel = np.exp(-d / length) if is_matern else np.exp(-0.5 * (d / length) ** 2)
         points = Spheres.of(centers, np.zeros(len(centers)))
-        sums = points.gathered(native.row_sums(points.clusters, points.is_point, length, is_matern=is_matern))
+        sums = points.gather(native.row_sums(points.clusters, points.is_point, length, is_matern=is_matern))
         np.testing.assert_allclose(sums, kernel.sum(axis=1), rtol=1e-6, atol=700 * 2.0**-25)
         order = np.random.default_rng(0).permutation(700)
         frame = Box(lower=centers.min(axis=0), upper=centers.max(axis=0))
@@ -36,8 +36,8 @@ def test_row_sums_are_those_of_the_kernel_matrix_in_any_order(is_matern: bool) -
             Spheres.of(centers, np.zeros(len(centers)), frame),
             Spheres.of(more, np.zeros(len(more)), frame),
         )
-        a = first.gathered(native.row_sums(first.clusters, first.is_point, 0.05, is_matern=is_matern, threads=1))
-        b = other.gathered(native.row_sums(other.clusters, other.is_point, 0.05, is_matern=is_matern, threads=3))
+        a = first.gather(native.row_sums(first.clusters, first.is_point, 0.05, is_matern=is_matern, threads=1))
+        b = other.gather(native.row_sums(other.clusters, other.is_point, 0.05, is_matern=is_matern, threads=3))
         np.testing.assert_array_equal(b[:-1], a[order])
 
 

@@ -61,7 +61,7 @@ def field_bytes() -> bytes:
     centers, radii = cloud(700)
     points, at = Spheres.of(centers, np.zeros(len(centers))), queries()
     relative, offsets = points.relative(at), points.offsets(radii)
-    laid_out = points.laid_out(radii, spare=0.0).astype(np.float32)
+    laid_out = points.lay_out(radii, spare=0.0).astype(np.float32)
     results = [
         *fields.nearest(points.clusters, offsets, relative),
         *fields.matern(points.clusters, offsets, None, 0.02, 1e-3, relative),

@@ -46,6 +46,6 @@ def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
         header["bound"] = BOUND
         channels, num_changed = dict(grid.channels), 0
         if num_unknown:
-            channels, num_changed = Cubes.of(is_unknown, grid.voxel).joined(grid.channels, margin)
+            channels, num_changed = Cubes.of(is_unknown, grid.voxel).join(grid.channels, margin)
     header["unknown_cells"] = {"never_seen": num_unknown, "changed": num_changed}
     return replace(grid, channels=channels, header=header)

@@ -43,11 +43,11 @@ def test_a_carried_box_holds_points_of_its_link_while_it_is_carried(tmp_path: Pa
 def test_a_contact_is_expected_at_its_link_place_and_time_alone(tmp_path: Path) -> None:
     entries = declared(tmp_path)
     place = np.array([0.5, 0.0, 0.1])
-    found = entries.expects("hand", place, 3.5)
+    found = entries.find_expected("hand", place, 3.5)
     assert found is not None and found.reason == "the peg goes into its hole"
-    assert entries.expects("arm", place, 3.5) is None
-    assert entries.expects("hand", place + 0.2, 3.5) is None
-    assert entries.expects("hand", place, 4.5) is None
+    assert entries.find_expected("arm", place, 3.5) is None
+    assert entries.find_expected("hand", place + 0.2, 3.5) is None
+    assert entries.find_expected("hand", place, 4.5) is None
 
 
 def test_what_nothing_used_is_known(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_what_nothing_used_is_known(tmp_path: Path) -> None:
         ([0.5, 0.0, 0.1], [0.0, 0.0, 0.9], [("carried", 0)]),
         ([0.9, 0.0, 0.1], [0.0, 0.0, 0.2], []),
     ):
-        entries.expects("hand", np.array(contact), 3.5)
+        entries.find_expected("hand", np.array(contact), 3.5)
         entries.is_carried("hand", np.array([carried]), 2.0)
         assert entries.unused() == left
     assert Declarations().unused() == []

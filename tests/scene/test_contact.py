@@ -11,15 +11,15 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.config.fixed import CONTACT_REACH, ROBOT_REACH
 from splatctrl_cli.records import Box, Label, RgbdFrame
-from splatctrl_cli.robot.declared_contact import Carried, Declarations
+from splatctrl_cli.robot.declared_contact import Declarations, DeclaredContact
 from splatctrl_cli.scene import fitter as fitter_module
 from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.keyframes import kept_radii
+from splatctrl_cli.scene.keyframes import shrink_radii
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
-from splatctrl_cli.scene.steady_depth import steadied
+from splatctrl_cli.scene.surface_depth import steady_depth
 from tests.scene.test_labels import VISITOR, ball, seen_and_masked, seen_with, splats_at
 from tests.scene.wall import WORKSPACE, frame, plain_seeds
 
@@ -55,7 +55,9 @@ def test_a_carried_box_that_pixels_need_is_used_and_one_in_the_air_is_not() -> N
     assert robot.surface is not None
     held = Box(lower=np.array([-0.1, -0.1, -0.3]), upper=np.array([0.1, 0.1, VISITOR - 0.3]))  # in the ball's frame
     aside = Box(lower=np.array([0.2, 0.2, 0.0]), upper=np.array([0.3, 0.3, 0.1]))
-    declared = Declarations(carried=tuple(Carried(link="arm", box=box, start=0.0, end=1.0) for box in (held, aside)))
+    declared = Declarations(
+        carried=tuple(DeclaredContact(link="arm", box=box, start=0.0, end=1.0) for box in (held, aside))
+    )
     at_frame = {0: np.repeat(robot.T_world_surface[0], 3, axis=0)}  # the link's pose, and that of each box
     holding = replace(robot, surface=robot.surface.with_boxes(declared.carried_at(0.5)), T_world_surface=at_frame)
     mask = self_mask(view, holding, OccupancyConfig())
@@ -146,7 +148,7 @@ def test_near_the_robot_no_splat_reaches_past_the_surface_that_depth_shows() -> 
     near = objects.select(robot.distance(objects.centers) < ROBOT_REACH)
     assert (near.radii > least).any() and (near.radii == np.float32(least)).sum() > 5
     error = self_mask(view, robot, config).reach - config.self_mask_tolerance
-    assert (kept_radii(near.centers, near.radii, [target.view(view)], error, least) == near.radii).all()
+    assert (shrink_radii(near.centers, near.radii, [target.view(view)], error, least) == near.radii).all()
 
 
 def test_a_splat_of_the_robot_that_depth_shows_to_be_the_floor_is_small_at_once(
@@ -191,8 +193,8 @@ def test_what_was_the_robots_before_is_told_to_the_running_mean_of_depth(monkeyp
     target.step([view], robot)
     shown = target.seen[0][1].kinds
     assert (shown == PixelKind.ROBOT).any()
-    spy = Mock(side_effect=steadied)
-    monkeypatch.setattr(fitter_module, "steadied", spy)
+    spy = Mock(side_effect=steady_depth)
+    monkeypatch.setattr(fitter_module, "steady_depth", spy)
     target.step([view], robot)
     np.testing.assert_array_equal(spy.call_args_list[0].args[1][1], shown == PixelKind.OBJECT)
 

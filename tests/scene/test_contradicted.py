@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.config.fixed import CONTRADICTED
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.scene.contradicted import Contradicted, contradicted, without_contradicted
+from splatctrl_cli.scene.contradicted import Contradicted, find_contradicted, mark_contradicted
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.self_mask import PixelKind, object_mask
 from splatctrl_cli.voxels import EvidenceClass
@@ -29,10 +29,14 @@ def block_measured_at(depth: float, *, x: float = 0.0, camera: str = "cam0") -> 
 
 def contradict_all(*frames: RgbdFrame) -> list[Contradicted]:
     """Return what the other frames contradict of each frame."""
-    return [*contradicted([(seen, object_mask(seen)) for seen in frames], is_drawn=False)]
+    return [*find_contradicted([(seen, object_mask(seen)) for seen in frames], is_drawn=False)]
 
 
 OTHER = frame(x=BESIDE, camera="cam1")
+
+
+def points_of(found: Contradicted, its: RgbdFrame, *, is_blank: bool) -> np.ndarray:
+    return np.concatenate([np.zeros((0, 3)), *found.points(its, CONFIG, is_blank=is_blank)])
 
 
 @pytest.mark.parametrize(("behind", "is_wrong"), [(CONTRADICTED + 0.02, True), (CONTRADICTED - 0.02, False)])
@@ -44,9 +48,9 @@ def test_depth_far_behind_what_another_camera_measures_is_contradicted(behind: f
     assert not none.until.any() and not contradict_all(shiny)[0].until.any()  # nor does a lone camera
     assert pixels.any() == is_wrong and not (pixels & ~is_block).any()
     assert not is_wrong or pixels.sum() > 0.7 * is_block.sum()
-    assert ((without_contradicted(object_mask(shiny), found).kinds == PixelKind.CONTRADICTED) == pixels).all()
-    points = found.points(shiny, CONFIG, is_blank=False)
-    assert bool(len(points)) == is_wrong and not len(found.points(shiny, CONFIG, is_blank=True))
+    assert ((mark_contradicted(object_mask(shiny), found).kinds == PixelKind.CONTRADICTED) == pixels).all()
+    points = points_of(found, shiny, is_blank=False)
+    assert bool(len(points)) == is_wrong and not len(points_of(found, shiny, is_blank=True))
     if is_wrong:  # on the rays of the block and above the floor
         assert (points[:, 2] > 0).all() and np.abs(points[:, :2]).max() < 0.12
         assert HEIGHT - CONFIG.min_range - 0.01 < points[:, 2].max() <= HEIGHT - CONFIG.min_range
@@ -59,7 +63,7 @@ def test_a_ray_proves_nothing_free_where_another_camera_sees_through_what_it_mea
     is_unproven = (found.unproven(shiny).depth == 0) & (shiny.depth > 0)
     assert is_unproven.sum() > 0.5 * (shiny.depth < HEIGHT).sum() and not found.until.any()
     assert not found.pixels(shiny.depth.shape).any()  # what it measures stays a surface of the map
-    points = found.points(shiny, CONFIG, is_blank=False)
+    points = points_of(found, shiny, is_blank=False)
     assert HEIGHT - 0.6 - 1e-6 <= points[:, 2].min() < HEIGHT - 0.6 + CONFIG.voxel
     assert beside.until.any() and beside.unproven(OTHER) is OTHER
 
@@ -84,7 +88,7 @@ def test_a_camera_without_depth_where_another_measures_a_surface_looked_in_vain(
     """It makes no surface of the other's doubtful."""
     dark = block_measured_at(0.0)
     found, beside = contradict_all(dark, OTHER)
-    points = found.points(dark, CONFIG, is_blank=True)
+    points = points_of(found, dark, is_blank=True)
     assert len(points) and not found.pixels(dark.depth.shape).any() and not beside.through.any()
     assert np.linalg.norm(points - [0.0, 0.0, BLOCK / 2], axis=1).min() < CONFIG.voxel
 
@@ -131,8 +135,8 @@ def test_a_robot_that_returns_no_depth_is_hidden_by_something(is_drawn: bool) ->
     """A robot half a metre before the camera in its block's place, of which only some returned depth."""
     dark = block_measured_at(0.0)
     mask = replace(object_mask(dark), robot_depth=np.where(dark.depth <= 0, np.float32(0.5), np.float32(0.0)))
-    (found,) = contradicted([(dark, mask)], is_drawn=is_drawn)
-    points = found.points(dark, CONFIG, is_blank=True)
+    (found,) = find_contradicted([(dark, mask)], is_drawn=is_drawn)
+    points = points_of(found, dark, is_blank=True)
     assert bool(len(points)) == is_drawn
     assert not is_drawn or points[:, 2].min() > HEIGHT - 0.5 - 1e-6
 

@@ -13,7 +13,7 @@ from splatctrl_cli.scene.depth_holes import lost_edges, unanswered_points
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.self_mask import PixelKind, object_mask
-from splatctrl_cli.voxels import EvidenceClass, LostEdges, Unseen
+from splatctrl_cli.voxels import NO_EDGES, EvidenceClass, LostEdges, Unseen
 from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame
 
 CONFIG = OccupancyConfig()
@@ -182,7 +182,7 @@ def with_lost_edges(x: float = 0.0) -> RgbdFrame:
 
 def edges_of(*frames: RgbdFrame) -> LostEdges:
     named = [replace(each, camera=f"cam{number}") for number, each in enumerate(frames)]
-    return LostEdges.joined([*lost_edges([(each, object_mask(each)) for each in named], None, CONFIG).values()])
+    return NO_EDGES.joined(*lost_edges([(each, object_mask(each)) for each in named], None, CONFIG).values())
 
 
 def at_the_block(edges: LostEdges) -> np.ndarray:

@@ -12,7 +12,7 @@ from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Box, Label, PointCloud, spread
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.posture import RobotPosture, carried
+from splatctrl_cli.scene.posture import RobotPosture, carry_splats
 from splatctrl_cli.scene.removal import REASONS
 from splatctrl_cli.scene.render import render
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
@@ -120,7 +120,7 @@ def test_splats_inside_the_robot_are_its_own_and_the_table_under_it_is_not() -> 
 
 def test_robot_splats_move_with_their_link() -> None:
     points = np.float32([[0.0, 0.0, 0.32], [0.12, 0.0, 0.2]])
-    moved = carried(points, posture(0.0), posture(0.05))
+    moved = carry_splats(points, posture(0.0), posture(0.05))
     assert np.allclose(moved, points + np.float32([0.05, 0.0, 0.0]), atol=1e-6)
 
 

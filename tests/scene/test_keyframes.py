@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface
+from splatctrl_cli.scene.keyframes import View, Window, make_view, move_to_surface, shrink_radii
 from splatctrl_cli.scene.self_mask import pixels_at
 from tests.scene.wall import frame
 
@@ -73,16 +73,16 @@ def test_a_sphere_sticks_out_of_what_depth_shows_by_the_sensors_error_at_most() 
         [[0.25, 0.2, 0.0], [0.25, 0.2, -0.015], [0.09, 0.0, 0.15], [0.0, 0.0, 0.15], [9.0, 0.0, 0.0]]
     )
     large, small = (np.full(5, radius, np.float32) for radius in (0.03, 0.003))
-    kept = kept_radii(centers, large, views, 0.004, 0.005)
+    kept = shrink_radii(centers, large, views, 0.004, 0.005)
     assert kept[[0, 3, 4]].tolist() == np.float32([0.005, 0.03, 0.03]).tolist()
     assert 0.015 < kept[1] < 0.02 and 0.01 < kept[2] < 0.028  # at its side, where the next pixel is 1 cm away
-    assert (kept_radii(centers, small, views, 0.004, 0.005) == small).all()
+    assert (shrink_radii(centers, small, views, 0.004, 0.005) == small).all()
 
 
 def test_a_centre_in_the_air_goes_back_onto_what_every_camera_sees_behind_it() -> None:
     """Above the floor, beneath it, far out in the air, and where no camera looks."""
     centers = np.float32([[0.2, 0.1, 0.012], [0.2, 0.1, -0.012], [0.2, 0.1, 0.05], [9.0, 0.0, 0.012]])
-    put = on_surface(centers, [view(0, x=x) for x in (-0.1, 0.15)], 0.02)
+    put = move_to_surface(centers, [view(0, x=x) for x in (-0.1, 0.15)], 0.02)
     np.testing.assert_array_equal(put[1:], centers[1:])
     assert abs(put[0, 2]) < 1e-4 and np.abs(put[0, :2] - centers[0, :2]).max() < 0.012
 
@@ -95,11 +95,11 @@ def test_a_centre_that_one_camera_sees_on_a_surface_stays() -> None:
     above, beside = view(0), view(0, x=0.1)
     for hidden, height in ((0.0, 0.012), (0.03, 0.0)):  # hidden: it does not see the place
         beside.frame.depth[:] = pixels_at(beside.frame, POST)[1] - hidden
-        assert abs(on_surface(POST, [above, beside], 0.02)[0, 2] - height) < 1e-4
+        assert abs(move_to_surface(POST, [above, beside], 0.02)[0, 2] - height) < 1e-4
 
 
 def test_a_centre_beside_a_step_of_depth_stays_with_the_nearer_surface() -> None:
     seen = view(0)
     pixel, z = pixels_at(seen.frame, POST)
     seen.frame.depth.reshape(-1)[pixel + 1] = z
-    np.testing.assert_array_equal(on_surface(POST, [seen], 0.02), POST)
+    np.testing.assert_array_equal(move_to_surface(POST, [seen], 0.02), POST)

@@ -6,7 +6,7 @@ import pytest
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.scene.buffer import SplatBuffer
-from splatctrl_cli.scene.removal import Misfit, clone_shape, clone_sources, detail_seeds, drawn
+from splatctrl_cli.scene.removal import clone_shape, clone_sources, detail_seeds, draw_indices
 from tests.scene.wall import HEIGHT, INTRINSICS, frame, plain_seeds
 
 CONFIG = SceneConfig()
@@ -62,9 +62,9 @@ def test_copies_take_dead_slots_and_start_without_moments() -> None:
 
 def test_detail_is_seeded_where_the_colours_are_wrong_and_nowhere_else() -> None:
     error, pixel = np.zeros((60, 80), np.float32), HEIGHT / INTRINSICS.fx
-    assert len(detail_seeds([Misfit(frame=frame(), error=error)], 30, CONFIG, np.random.default_rng(0))) == 0
+    assert len(detail_seeds([(frame(), error)], 30, CONFIG, np.random.default_rng(0))) == 0
     error[20:30, 40:60] = 0.3
-    seeds = detail_seeds([Misfit(frame=frame(), error=error)], 30, CONFIG, np.random.default_rng(0))
+    seeds = detail_seeds([(frame(), error)], 30, CONFIG, np.random.default_rng(0))
     assert 10 <= len(seeds) <= 30 and seeds.radii == pytest.approx(pixel)
     u, v = seeds.centers[:, 0] / pixel + INTRINSICS.cx, -seeds.centers[:, 1] / pixel + INTRINSICS.cy
     assert ((u > 39.5) & (u < 59.5) & (v > 19.5) & (v < 29.5)).all()
@@ -78,4 +78,4 @@ def test_pixels_are_drawn_as_numpy_draws_them() -> None:
     weight[::7] = 0.0
     for count in (1, 30, int(np.count_nonzero(weight))):
         wanted = np.random.default_rng(2).choice(500, count, replace=False, p=weight / weight.sum())
-        np.testing.assert_array_equal(drawn(weight, count, np.random.default_rng(2)), wanted)
+        np.testing.assert_array_equal(draw_indices(weight, count, np.random.default_rng(2)), wanted)

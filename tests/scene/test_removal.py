@@ -15,7 +15,7 @@ from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import View, make_view, seen_through
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.removal import distance_to_box, far_away, redundant, removals, room_for
+from splatctrl_cli.scene.removal import distance_to_box, find_far, find_redundant, removals, room_for
 from splatctrl_cli.voxels import SWEPT
 from tests.plain import plain_splats
 from tests.reference.unrepresented import unrepresented
@@ -130,30 +130,30 @@ def test_what_is_given_up_leaves_no_surface_bare() -> None:
     """The first in the order go, and no more than are wanted."""
     splats = floor(0.02)
     order, num = np.random.default_rng(0).permutation(len(splats)), len(splats)
-    gone = redundant(order, num, splats, VOXELS, 0.018)
+    gone = find_redundant(order, num, splats, VOXELS, 0.018)
     assert 50 < len(gone) < num
     kept = splats.select(~np.isin(np.arange(num), gone))
     assert bare(splats, 0.018) == bare(kept, 0.018) == 0
-    assert len(redundant(np.arange(len(kept)), len(kept), kept, VOXELS, 0.018)) == 0
-    few = redundant(order, 3, splats, VOXELS, 0.018)
+    assert len(find_redundant(np.arange(len(kept)), len(kept), kept, VOXELS, 0.018)) == 0
+    few = find_redundant(order, 3, splats, VOXELS, 0.018)
     assert len(few) == 3 and few[0] == order[0]
 
 
 def test_the_only_splat_of_a_surface_is_not_redundant() -> None:
     pair = plain_splats([[0.1, 0.1, 0.0], [0.1, 0.1, 0.0], [0.3, 0.3, 0.0]], 0.01)
-    assert redundant(np.array([2, 0, 1]), 3, pair, pair.centers[1:], 0.018).tolist() == [0]
+    assert find_redundant(np.array([2, 0, 1]), 3, pair, pair.centers[1:], 0.018).tolist() == [0]
 
 
 @pytest.mark.parametrize(("distance", "count"), [(EVICT_NEARER - 0.01, 0), (EVICT_NEARER + 0.01, 1)])
 def test_a_surface_gives_way_to_one_that_is_much_nearer_to_the_path(distance: float, count: int) -> None:
     seeds = np.float32([[1.1, 0.5, 0.5]])
     centers = np.float32([[1.1 + distance, 0.5, 0.5], [0.5, 0.5, 0.5]])
-    assert far_away(5, seeds, centers, PATH).tolist() == [0] * count
+    assert find_far(5, seeds, centers, PATH).tolist() == [0] * count
 
 
 def test_the_farthest_go_first() -> None:
     centers = np.float32([[2.0, 0, 0], [4.0, 0, 0], [3.0, 0, 0]])
-    assert far_away(2, np.float32([[0.5, 0, 0], [0.2, 0, 0], [0.1, 0, 0]]), centers, PATH).tolist() == [1, 2]
+    assert find_far(2, np.float32([[0.5, 0, 0], [0.2, 0, 0], [0.1, 0, 0]]), centers, PATH).tolist() == [1, 2]
     assert distance_to_box(centers, PATH).tolist() == [1.0, 3.0, 2.0]
 
 

@@ -15,7 +15,7 @@ from splatctrl_cli.records import Box, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import View
 from splatctrl_cli.scene.render import render
-from splatctrl_cli.scene.scale import RecordedDepth, depth_noise, fitted_to, in_words
+from splatctrl_cli.scene.scale import RecordedDepth, depth_noise, describe_scale, fitted_to
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
 
 CONFIG = Config(scene=SceneConfig(max_splats=800, first_iterations=10))
@@ -107,7 +107,7 @@ def test_beside_a_robot_the_sensors_error_alone_follows_from_the_recording() -> 
     noisy, given = replace(ROOM, noise=0.004), Config(occupancy=OccupancyConfig(depth_error=0.003))
     made = fitted_to(Config(), noisy, has_robot=True)
     assert made.occupancy == OccupancyConfig(depth_error=0.004) and made.scene == SceneConfig()
-    assert "4 mm at 1 m" in in_words(made, noisy)
+    assert "4 mm at 1 m" in describe_scale(made, noisy)
     assert fitted_to(given, noisy, has_robot=True) is given
     assert fitted_to(CONFIG, ROOM, has_robot=True) is CONFIG
 

@@ -10,16 +10,18 @@ from splatctrl_cli.kernels.points import Cubes
 from splatctrl_cli.records import Bool, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.scene.seed_octree import cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.seeding import (
     SeedDensity,
     add_mask,
     candidates,
+    cube_levels,
     gap_seeds,
     inside_workspace,
+    leaves,
     seeds_at,
-    thinned,
+    thin_mask,
     thinning,
+    tolerance_for,
     world_points,
 )
 from tests.plain import plain_splats
@@ -167,8 +169,8 @@ def test_the_two_halves_of_the_rows_are_looked_at_in_turn(half: int) -> None:
 
 def test_more_pixels_than_are_looked_at_together_are_thinned_in_each_view(monkeypatch: pytest.MonkeyPatch) -> None:
     masks = [np.ones((60, 80), bool), np.zeros((60, 80), bool), np.eye(60, 80) > 0]
-    assert thinning(masks) == 1 and thinned(masks[0], 1) is masks[0]
-    monkeypatch.setattr("splatctrl_cli.scene.seeding.SEED_MOST_PIXELS", 1000)
+    assert thinning(masks) == 1 and thin_mask(masks[0], 1) is masks[0]
+    monkeypatch.setattr("splatctrl_cli.config.fixed.SEED_MOST_PIXELS", 1000)
     assert thinning(masks) == 5
-    assert [int(thinned(mask, 5).sum()) for mask in masks] == [960, 0, 12]
-    assert not (thinned(masks[2], 5) & ~masks[2]).any()
+    assert [int(thin_mask(mask, 5).sum()) for mask in masks] == [960, 0, 12]
+    assert not (thin_mask(masks[2], 5) & ~masks[2]).any()

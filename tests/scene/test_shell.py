@@ -14,7 +14,7 @@ from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import BLACK, render
 from splatctrl_cli.scene.seeding import world_points
-from splatctrl_cli.scene.shell import beyond
+from splatctrl_cli.scene.shell import pixels_beyond
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
 
 REACH = Box(lower=np.array([-0.2, -0.35, -0.05]), upper=np.array([0.2, 0.35, 0.6]))  # the floor is seen to 0.49 m
@@ -87,7 +87,7 @@ def test_a_block_across_the_border_is_whole_in_the_map_within_and_in_the_shell_b
 def test_pixels_that_are_not_valid_show_nothing_beyond_although_they_have_depth() -> None:
     """As the black corners of an undistorted image, where the depth of another lens is registered to it."""
     whole, valid = seen(0)[0], np.broadcast_to(np.arange(INTRINSICS.width) >= 20, (60, 80))
-    view, all_of_it = (beyond(fitter().view(f), MIN_RANGE) for f in (replace(whole, valid=valid), whole))
+    view, all_of_it = (pixels_beyond(fitter().view(f), MIN_RANGE) for f in (replace(whole, valid=valid), whole))
     assert all_of_it[:, :20].any() and np.array_equal(view, all_of_it & valid)
 
 
@@ -129,7 +129,7 @@ def test_pixels_within_reach_too_near_mounted_or_without_depth_are_not_beyond() 
     view.depth[:4], view.depth[4:8] = 0.0, 0.5 * MIN_RANGE
     mounted = np.broadcast_to(np.arange(INTRINSICS.width) < 5, view.depth.shape)
     target.mounted = {view.camera: mounted}
-    found = beyond(target.view(view), MIN_RANGE, mounted)
+    found = pixels_beyond(target.view(view), MIN_RANGE, mounted)
     assert found.any() and not found[:8].any() and not found[:, :5].any()
     assert np.array_equal(found[8:, 5:], outside(view)[8:, 5:])
 

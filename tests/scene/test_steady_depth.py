@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Bool, Float32, Intrinsics, RgbdFrame
-from splatctrl_cli.scene.steady_depth import object_twice, steadied
+from splatctrl_cli.scene.surface_depth import object_twice, steady_depth
 from tests.plain import plain_frame
 
 LENS = Intrinsics(fx=150.0, fy=150.0, cx=79.5, cy=59.5, width=160, height=120)
@@ -23,7 +23,7 @@ def frame_of(depth: float | Float32, x: float = 0.0) -> RgbdFrame:
 def steady(
     now: RgbdFrame, before: RgbdFrame | None = None, was: Bool = EVERYWHERE, is_object: Bool = EVERYWHERE
 ) -> tuple[RgbdFrame, Bool]:
-    return steadied(now, None if before is None else (before, was), is_object, SENSOR)
+    return steady_depth(now, None if before is None else (before, was), is_object, SENSOR)
 
 
 def noisy(z: float, rng: np.random.Generator) -> Float32:

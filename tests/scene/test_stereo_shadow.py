@@ -5,7 +5,7 @@ import pytest
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.records import Bool, Float32, Intrinsics
-from splatctrl_cli.scene.depth_holes import shadowed, unanswered_points
+from splatctrl_cli.scene.depth_holes import find_shadows, unanswered_points
 from tests.plain import plain_frame
 
 FOCAL, BASELINE = 400.0, 0.05  # [px], [m]
@@ -45,14 +45,14 @@ def as_stereo(depth: Float32) -> Float32:
 def test_all_that_a_pair_cannot_see_is_shadow(columns: tuple[slice, ...], turn: int) -> None:
     seen = as_stereo(plates(*columns))[:, ::turn]
     assert (seen == 0).sum() >= 300
-    assert (shadowed(seen, FOCAL) == (seen == 0)).all()
+    assert (find_shadows(seen, FOCAL) == (seen == 0)).all()
 
 
 def test_a_dark_thing_is_none_away_from_the_shadow() -> None:
     seen = as_stereo(plates(slice(60, 90)))
     seen[DARK, 90:110] = 0.0  # at the plate's other side
     seen[DARK, 20:51] = 0.0  # goes on from the shadow, whose first column is 50
-    found = shadowed(seen, FOCAL)
+    found = find_shadows(seen, FOCAL)
     assert not found[DARK, 90:109].any() and not found[DARK, 20:49].any()  # to the pixel
     assert found[DARK, 50:60].all()
 
@@ -60,10 +60,10 @@ def test_a_dark_thing_is_none_away_from_the_shadow() -> None:
 def test_a_baseline_is_that_of_a_camera() -> None:
     seen, few = plates(slice(60, 90)), plates(slice(60, 90))
     seen[5:35, 10:60] = 0.0  # as of a baseline of 25 cm
-    assert not shadowed(seen, FOCAL)[:, :34].any()
+    assert not find_shadows(seen, FOCAL)[:, :34].any()
     few[DARK, 45:60] = 0.0  # fewer than half of the plate's rows: a camera without shadows
     for depth in (few, np.zeros((4, 6), np.float32), np.ones((4, 6), np.float32)):
-        assert not shadowed(depth, FOCAL).any()
+        assert not find_shadows(depth, FOCAL).any()
 
 
 @pytest.mark.parametrize("is_dark", [False, True])

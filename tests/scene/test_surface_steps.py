@@ -5,7 +5,7 @@ import pytest
 
 from splatctrl_cli.config.fixed import MASK_STEP
 from splatctrl_cli.records import Bool, Float32
-from splatctrl_cli.scene.surface_steps import surface_steps
+from splatctrl_cli.scene.surface_depth import surface_steps
 
 SHAPE, EDGE = (200, 300), 5
 ERROR = 0.002  # [m] at 1 m

@@ -14,7 +14,7 @@ from splatctrl_cli.scene.unrepresented import (
     GridAgreement,
     agreement_with_grid,
     bare_voxels,
-    confirmed,
+    confirm_bare,
     representing_reach,
     unrepresented_voxels,
 )
@@ -79,7 +79,7 @@ ALL = [*LONE, *PAIR, *ROW]
     ],
 )
 def test_few_voxels_count_where_they_were_before(now: Cells, before: Cells | None, kept: Cells) -> None:
-    found = confirmed(balls(*now), None if before is None else balls(*before))
+    found = confirm_bare(balls(*now), None if before is None else balls(*before))
     assert found.centers.tolist() == balls(*kept).centers.tolist()
 
 

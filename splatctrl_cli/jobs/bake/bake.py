@@ -20,7 +20,7 @@ from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import (
     Kept,
     UnknownSpace,
-    baked_planes,
+    bake_planes,
     bytes_per_cell,
     check_slab_memory,
     field_header,
@@ -104,7 +104,7 @@ def bake_to_disk(
         total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=True if progress.is_quiet else None
     ) as bar:
         for first, last in slabs(layout, baker.channels, store.num_layers):
-            planes = baked_planes(baker, first, last, kept)
+            planes = bake_planes(baker, first, last, kept)
             counts = baker.counts
             if unknown is not None:
                 planes = unknown.apply(planes, first, last, baker.bound_margin)

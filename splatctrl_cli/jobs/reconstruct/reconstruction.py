@@ -29,7 +29,7 @@ from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspa
 from splatctrl_cli.scene.contact import count_carried
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
-from splatctrl_cli.scene.scale import RecordedDepth, fitted_to, in_words
+from splatctrl_cli.scene.scale import RecordedDepth, describe_scale, fitted_to
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep, cloud_box, depth_box, time_steps
 
@@ -356,7 +356,7 @@ class Reconstruction:
         self.depth, before = depth, self.config
         self.config = fitted_to(before, depth, has_robot=self.robot is not None)
         if self.config is not before:
-            console.log(in_words(self.config, depth))
+            console.log(describe_scale(self.config, depth))
 
     def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)

@@ -337,7 +337,7 @@ def _unexpected(
         return gap
     links, seconds = inputs.model.sphere_set.links, (stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
     is_meant = [
-        bool(gap[k] < margin and inputs.declared.expects(links[sphere], points[k], seconds))
+        bool(gap[k] < margin and inputs.declared.find_expected(links[sphere], points[k], seconds))
         for k, sphere in enumerate(moving)
     ]
     return np.where(is_meant, np.inf, gap)

@@ -26,7 +26,7 @@ from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.state.state_source import StateSource, open_states
 from splatctrl_cli.records import Box, Float64, RecordSource
 from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
-from splatctrl_cli.robot.declared_contact import ExpectedContact
+from splatctrl_cli.robot.declared_contact import DeclaredContact
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import DisabledPair, read_srdf, without_disabled
@@ -272,7 +272,7 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
     return LoggedStates(source=source, states=states, poses=pose_agreement(model, states))
 
 
-def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[ExpectedContact]:
+def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[DeclaredContact]:
     """Contact of a hand's links with a grasped part where it is taken and left.
 
     It lasts until `GRASPING` after the part is taken, since the map still shows it there.
@@ -288,7 +288,7 @@ def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[Expected
             box = Box(lower=corners.min(axis=0) - part.voxel, upper=corners.max(axis=0) + part.voxel)
             time, reason = 1e-9 * (stamp - first_ns), part.words(first_ns)
             for link in [link for link in bodies if bodies[link][0] == bodies[part.link][0]]:
-                yield ExpectedContact(
+                yield DeclaredContact(
                     link=link, box=box, start=time - before, end=time + GRASPING, reason=reason, is_learned=True
                 )
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_at
-from splatctrl_cli.control.barriers import SceneStep, guarded
+from splatctrl_cli.control.barriers import SceneStep, guard_people
 from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
@@ -239,7 +239,7 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
         if people.any()
         else None
     )
-    barrier = guarded(field_over(spheres, config.field, threads=threads), human, config.control)
+    barrier = guard_people(field_over(spheres, config.field, threads=threads), human, config.control)
     exact = SphereField(spheres, threads=threads)
     balls = BallDistance(of_points=_distance(exact), centers=chosen.centers, radii=chosen.radii)
     return KnownFields(

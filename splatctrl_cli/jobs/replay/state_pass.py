@@ -183,7 +183,7 @@ class ReplayRecord:
             sphere = int(self._reach.moving[column])
             center = self._model.sphere_centers(positions[state])[[sphere]]
             place = np.array(known.obstacles(center)[0].position)
-            if self._declared.expects(links[sphere], place, (int(stamps[state]) - self._first_state_ns) * 1e-9):
+            if self._declared.find_expected(links[sphere], place, (int(stamps[state]) - self._first_state_ns) * 1e-9):
                 kept[state, column] = np.inf
         return kept
 
@@ -275,12 +275,12 @@ class ReplayRecord:
         columns = {name: np.full((num, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
         if self._scene.has_seen_times:
             self.hindsight.add(part.stamp_ns, part.position)
-        for at, is_timed in self._near.due(part.stamp_ns, self._model.sphere_centers_batch(part.position)).items():
+        for at, is_timed in self._near.choose(part.stamp_ns, self._model.sphere_centers_batch(part.position)).items():
             stamp = int(part.stamp_ns[at])
             if (known := self._scene.seen_at(stamp)) is not None:
                 exact = self._scene.at(stamp).distances["exact"]
                 before, q = part.position[at - 1] if at else self._posture_before, part.position[at]
-                way = self._near.on_the_way(before, q) if before is not None and self._is_continuous else ()
+                way = self._near.postures_between(before, q) if before is not None and self._is_continuous else ()
                 accounts = [self._near.look(stamp, each, known, exact) for each in (q, *way)]
                 for name, value in _folded(accounts).items():
                     columns[name][at] = value

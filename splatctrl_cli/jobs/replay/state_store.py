@@ -12,6 +12,7 @@ import numpy as np
 from splatctrl_cli.control.audit import AuditTrace, Clearance
 from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
 from splatctrl_cli.control.qp import Rung
+from splatctrl_cli.control.replay import StepRecord
 from splatctrl_cli.control.step import ControlStep, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.files.spilled_rows import IN_MEMORY, RowFile, Rows, scratch_folder
@@ -186,8 +187,8 @@ def _figures_of(step: ControlStep) -> tuple[float, ...]:
     return (step.clearance, step.residual, step.scale, RUNGS.index(step.rung), step.num_refused, *shaped)
 
 
-class StoredLoop:
-    """A `StepRecord` in files."""
+class StoredLoop(StepRecord):
+    """Steps in files."""
 
     def __init__(self, num_joints: int) -> None:
         self.kept, self._num_joints = StoredSteps(), num_joints

@@ -31,7 +31,7 @@ from splatctrl_cli.robot.self_collision import SelfCollisionPairs, read_srdf, se
 from splatctrl_cli.robot.sphere_files import (
     SphereFile,
     are_links_renamed,
-    matched_links,
+    match_links,
     own_spheres,
     read_sphere_file,
     read_spheres,
@@ -198,7 +198,7 @@ def check_robot(request: RobotRequest) -> CoverageResult:
     check_gate_names(request.require, METRICS)
     urdf, path = read_urdf(request.urdf), request.spheres or request.urdf
     file = read_sphere_file(path)
-    spheres, left_out = matched_links(file.spheres, urdf, str(path))
+    spheres, left_out = match_links(file.spheres, urdf, str(path))
     solids = read_solids(urdf, request.packages)
     report = coverage_of_solids(urdf, solids, spheres)
     if request.picture is not None:

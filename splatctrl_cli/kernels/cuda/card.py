@@ -100,23 +100,19 @@ class CudaDevice:
         return address
 
     def free(self, address: int) -> None:
-        """Free, after queued work."""
         self.wait()
         _check(driver.cuMemFree(address))
 
     def write(self, address: int, values: Array) -> None:
-        """Copy an array there, after queued work."""
         values = np.ascontiguousarray(values)
         _check(driver.cuMemcpyHtoDAsync(address, values.ctypes.data, values.nbytes, self._handle))
         self.wait()  # the array may be freed
 
     def read(self, address: int, out: Array) -> None:
-        """Copy from there, after queued work."""
         _check(driver.cuMemcpyDtoHAsync(out.ctypes.data, address, out.nbytes, self._handle))
         self.wait()
 
     def copy(self, target: int, source: int, num_bytes: int) -> None:
-        """Copy within the device, after queued work."""
         _check(driver.cuMemcpyDtoDAsync(target, source, num_bytes, self._handle))
 
     def wait(self) -> None:

@@ -37,8 +37,6 @@ IMAGE_BYTES = 8  # of a pixel of a view: colour, depth, counted
 
 @dataclass(frozen=True, kw_only=True)
 class _DeviceView:
-    height: int
-    width: int
     target: TargetView
     row: Array  # one VIEW
     num_values: float
@@ -127,7 +125,6 @@ class DeviceFit:
 
     def add_view(self, camera: Float64, target: TargetView) -> int:
         """Copy a view to the device; return its number for `run`."""
-        height, width = target.depth.shape
         num_values = 3.0 * max(int(np.count_nonzero(target.counted)), 1)
         num_depths = int(np.count_nonzero((target.depth > 0) & (target.counted != 0)))
         images = [self._image(values) for values in (target.color, target.depth.astype(np.float32), target.counted)]
@@ -135,21 +132,14 @@ class DeviceFit:
         row["camera"] = camera_row(camera)
         row["per"] = 1.0 / num_values, 1.0 / num_depths if num_depths else 0.0
         row["images"] = images
-        view = _DeviceView(
-            height=height,
-            width=width,
-            target=target,
-            row=row,
-            num_values=num_values,
-            num_depths=float(max(num_depths, 1)),
+        self.views.append(
+            _DeviceView(target=target, row=row, num_values=num_values, num_depths=float(max(num_depths, 1)))
         )
-        self.views.append(view)
         return len(self.views) - 1
 
     def number_of(self, camera: Float64, target: TargetView) -> int:
         """Number of a view, added if its target is new."""
-        known = (k for k, view in enumerate(self.views) if view.target is target)
-        number = next(known, None)
+        number = next((k for k, view in enumerate(self.views) if view.target is target), None)
         return self.add_view(camera, target) if number is None else number
 
     def keep(self, targets: Sequence[TargetView]) -> None:
@@ -174,8 +164,8 @@ class DeviceFit:
             self.device.copy(self._addresses[f"{name}_before"], self._addresses[name], self._sizes[name])
         while True:
             self.rewind(schedule, weights, settings, seed)
-            for size, group in groupby(schedule, lambda k: (self.views[k].height, self.views[k].width)):
-                self._graph(*size, "step").run(len(list(group)))
+            for (height, width), group in groupby(schedule, lambda k: self.views[k].target.depth.shape):
+                self._graph(height, width, "step").run(len(list(group)))
             if self._fits():
                 return self._terms(schedule)
             for name in STATE:
@@ -183,7 +173,7 @@ class DeviceFit:
 
     def planes(self, view: int) -> Float32:
         """Planes (5, H, W) of a view, as in `kernels.raster`."""
-        height, width = self.views[view].height, self.views[view].width
+        height, width = self.views[view].target.depth.shape
         while True:
             self.rewind([view], None, None, 0)
             self._graph(height, width, "render").run()
@@ -192,7 +182,7 @@ class DeviceFit:
 
     def gradients(self, view: int, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
         """Derivatives (N, 8) of a view's loss by the parameters, which stay, and the loss."""
-        height, width = self.views[view].height, self.views[view].width
+        height, width = self.views[view].target.depth.shape
         while True:
             self.rewind([view], weights, settings, 0)
             self._graph(height, width, "gradients").run()
@@ -201,12 +191,12 @@ class DeviceFit:
 
     def list_lengths(self, view: int) -> Int32:
         """Number of splats (K,) on each tile's list, after the last launch."""
-        height, width = self.views[view].height, self.views[view].width
+        height, width = self.views[view].target.depth.shape
         return self._read(f"num_entries {height} {width}", (-(-height // TILE) * -(-width // TILE),), np.int32)
 
     def read_image(self, name: str, view: int, channels: int) -> Float32:
         """Read `planes`, `plane_gradients` or `maps` (channels, H, W), after the last launch."""
-        height, width = self.views[view].height, self.views[view].width
+        height, width = self.views[view].target.depth.shape
         return self._read(f"{name} {height} {width}", (channels, height, width))
 
     def _state(self, parameters: Float32, moments: Moments) -> dict[str, Array]:
@@ -300,7 +290,7 @@ class DeviceFit:
             view, (l1, ssim, depth, transmittance, squared) = self.views[k], sums[k].tolist()
             terms[k] = LossTerms(
                 l1=l1 / view.num_values,
-                dssim=(3.0 * view.height * view.width - ssim) / view.num_values,
+                dssim=(3.0 * view.target.depth.size - ssim) / view.num_values,
                 depth=depth / view.num_depths,
                 transmittance=transmittance / view.num_depths,
                 squared=squared / view.num_values,

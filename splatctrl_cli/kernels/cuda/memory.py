@@ -39,7 +39,7 @@ class Graph(Protocol):
 
 
 class Memory(Protocol):
-    """A device's memory; addresses are int."""
+    """A device's memory; addresses are int. All but `allocate` and `available` follow queued work."""
 
     def allocate(self, num_bytes: int) -> int:
         """Address of zeroed memory. Raises OutOfMemory."""
@@ -54,7 +54,7 @@ class Memory(Protocol):
         """Copy an array there."""
 
     def read(self, address: int, out: Array) -> None:
-        """Wait for what is queued, and copy from there."""
+        """Copy from there."""
 
     def copy(self, target: int, source: int, num_bytes: int) -> None:
         """Copy within the device."""

@@ -142,7 +142,7 @@ def test_a_hand_may_touch_what_it_takes_and_leaves_at_its_place_and_no_other_lin
     assert np.linalg.norm(taken - left) > 0.1
     declared = Declarations(expected_contact=tuple(contacts))
     times = [(taken, 0.5), (taken, 1.5), (left, 2.5), (taken, 2.5), (left, 1.5), (left, 3.5)]
-    assert [declared.expects("panda_hand", place, time) is not None for place, time in times] == [True] * 3 + [
+    assert [declared.find_expected("panda_hand", place, time) is not None for place, time in times] == [True] * 3 + [
         False
     ] * 3
     assert [*grasp_contacts(bare, states)] == []

@@ -129,7 +129,7 @@ def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measur
     link = arm.sphere_set.links[-1]
     ball_at_hand = np.asarray(trimesh.creation.icosphere(radius=0.02).triangles)
     drawn = arm.with_self_model(held_part(link, ball_at_hand, *ALWAYS))
-    model = drawn._changed(sphere_deficit=np.where(np.array(arm.sphere_set.links) == link, 0.05, 0.0))
+    model = drawn._change(sphere_deficit=np.where(np.array(arm.sphere_set.links) == link, 0.05, 0.0))
     center = model.sphere_centers(q[0])[-1] + [0.0, 0.0, -0.3]
     ball = SphereField(Spheres.of(center[None], np.array([0.01])))
     scene = BallDistance(of_points=lambda points: ball.query(points)[0], centers=center[None], radii=np.array([0.01]))

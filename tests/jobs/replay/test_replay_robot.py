@@ -21,7 +21,7 @@ from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.recording.log import state_columns
 from splatctrl_cli.records import Float64, JointState, SphereSet
 from splatctrl_cli.robot import self_margins
-from splatctrl_cli.robot.coverage import refined
+from splatctrl_cli.robot.coverage import refine_triangles
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import spheres_yaml
@@ -60,7 +60,7 @@ def surface_clearance(model: RobotModel, positions: Float64, field: Balls) -> fl
     least = np.inf
     for link, solids in read_solids(model.urdf).items():
         if link != "link0":
-            points = np.concatenate([refined(s.surface.corners, 0.02)[0].reshape(-1, 3)[::3] for s in solids])
+            points = np.concatenate([refine_triangles(s.surface.corners, 0.02).reshape(-1, 3)[::3] for s in solids])
             poses = [model.frame_pose(q, link) for q in positions]
             least = min(least, *(field.query(transform_points(pose, points))[0].min() for pose in poses))
     return float(least)
@@ -245,9 +245,9 @@ def test_blocks_of_any_size_give_the_same_files(
 def signals(values: Sequence[float], names: Sequence[str]) -> list[Signal]:
     value = np.array(values)
     low = Signal(
-        kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, names_at=lambda i: [names[i]], is_high_worse=False
+        kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, names=lambda i: [names[i]], is_high_worse=False
     )
-    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, names_at=lambda i: [names[i]])]
+    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, names=lambda i: [names[i]])]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5, 12])
