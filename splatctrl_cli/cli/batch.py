@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.cli.commands import build_parser
-from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
@@ -36,8 +36,8 @@ OWN = ("out", "force", "resume", "threads")  # options a batch gives itself
 NOT_OF_A_NODE = (*OWN, "help", "help-all", "json", "verbose", "quiet", "junit", "preset")  # the last is in --set
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args, is_step=True)  # it tells CI of every recording itself
+def run(args: argparse.Namespace, console: Console) -> int:
+    console.reports = None  # it tells CI of every recording itself
     workers = args.workers or os.cpu_count() or 1
     request = request_of(BatchRequest, args, workers=workers)
     command_line = OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1))
@@ -164,18 +164,20 @@ def _flat(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any
             yield before + key, value
 
 
-def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:
+def _lines(result: BatchResult, *, is_long: bool) -> list[str]:
     runs = {(run.recording, run.column): run for run in result.runs}
     columns = columns_of(((run.job, column) for (_, column), run in runs.items()), result.jobs)
     recordings = list(dict.fromkeys(recording for recording, _ in runs))
     odd = {run.recording for run in result.runs if run.state != DONE}
     shown = recordings if is_long or len(recordings) <= MOST_ROWS else [name for name in recordings if name in odd]
     rows = [[name, *(_cell(runs.get((name, column))) for column in columns)] for name in shown]
-    yield from table(("recording", *columns), rows) if rows else ()
-    if len(shown) < len(recordings):
-        yield f"{len(recordings) - len(shown)} recordings as expected; -v prints them, too"
-    yield ""
-    yield f"{len(result.runs) - result.num_kept} run, {result.num_kept} as before; wrote {result.out / 'batch.json'}"
+    num = len(recordings) - len(shown)
+    return [
+        *(table(("recording", *columns), rows) if rows else ()),
+        *remarks((f"{num} recordings as expected; -v prints them, too", num)),
+        "",
+        f"{len(result.runs) - result.num_kept} run, {result.num_kept} as before; wrote {result.out / 'batch.json'}",
+    ]
 
 
 def _cell(run: Run | None) -> str:

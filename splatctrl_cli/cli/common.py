@@ -276,16 +276,12 @@ _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
 class Console:
-    """Output of a command: results to stdout, log lines to stderr, verdicts to CI.
+    """Output of a command: results to stdout, log lines to stderr, verdicts to CI."""
 
-    is_step: a step of another command; CI gets no verdict.
-    """
-
-    def __init__(self, args: argparse.Namespace, *, is_step: bool = False) -> None:
+    def __init__(self, args: argparse.Namespace) -> None:
         self._args = args
-        self.is_json = bool(args.json)
-        self.is_quiet = bool(args.quiet)
-        self.reports = reports_of(args) if hasattr(args, "junit") and not is_step else None
+        self.is_json, self.is_quiet = bool(args.json), bool(args.quiet)
+        self.reports = reports_of(args) if hasattr(args, "junit") else None
 
     def log(self, line: str) -> None:
         if not self.is_quiet:
@@ -316,6 +312,7 @@ class Console:
         With --json a failure's sentence also goes to stderr. has_findings: `lines` contain the reasons.
         """
         code = verdict.exit_code if code is None else code
+        self._args.label = verdict.label
         if self.is_json:
             self.result({"verdict": verdict.as_dict(), **result}, (), code=code)
         else:
@@ -332,6 +329,11 @@ class Console:
         if self.reports is not None:
             self.reports.conclude(verdict.as_dict(), code)
         return code
+
+
+def remarks(*texts: tuple[str, object]) -> list[str]:
+    """Return the texts whose condition holds."""
+    return [text for text, holds in texts if holds]
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:

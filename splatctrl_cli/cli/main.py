@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 
 from splatctrl_cli.cli.commands import build_parser, function_of, judges
+from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.reports import enveloped, tell_of_failure
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
@@ -50,7 +51,7 @@ def _run(argv: Sequence[str] | None) -> int:
         args = build_parser(words[0] if words else "").parse_args(words)
         args.began = start
         _check_outputs(args)
-        code = function_of(args.run)(args)
+        code = function_of(args.run)(args, Console(args))
         sys.stdout.flush()
         return code
     except BrokenPipeError:

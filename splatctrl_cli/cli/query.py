@@ -4,19 +4,17 @@ import argparse
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.sdf_bake import labels_of
 from splatctrl_cli.config import load_config
 from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace, console: Console) -> int:
     """Run; without an output answers go to stdout, figures to stderr."""
-    console = Console(args)
     request = request_of(
         QueryRequest,
         args,
@@ -27,9 +25,8 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None or console.is_json:
         result = query(request, console)
         out = None if result.out is None else str(result.out)
-        return console.result(
-            {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}, _lines(result)
-        )
+        found = {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}
+        return console.result(found, _lines(result))
     with tempfile.TemporaryDirectory() as folder:  # a table with a wrong line is refused before anything is printed
         answers = Path(folder) / "answers.csv"
         result = query(replace(request, out=answers), console)
@@ -40,15 +37,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _lines(result: QueryResult) -> Iterator[str]:
-    yield from table(
-        (result.kind, ""), [(name.replace("_", " "), _shown(name, value)) for name, value in result.metrics.items()]
-    )
-    yield from (f"note: {note}" for note in result.notes)
-    rate = (result.metrics["num_points"] or 0) / max(result.seconds["answer"], 1e-9)
-    wrote = [] if result.out is None else [f"wrote {result.out}"]
-    # a rate of fewer points says nothing
-    yield from [*([f"{rate:,.0f} points/s"] if (result.metrics["num_points"] or 0) >= 1000 else []), *wrote]
+def _lines(result: QueryResult) -> list[str]:
+    num = result.metrics["num_points"] or 0
+    rate = f"{num / max(result.seconds['answer'], 1e-9):,.0f} points/s"  # of fewer points it says nothing
+    return [
+        *table((result.kind, ""), [(name.replace("_", " "), _shown(name, v)) for name, v in result.metrics.items()]),
+        *(f"note: {note}" for note in result.notes),
+        *remarks((rate, num >= 1000), (f"wrote {result.out}", result.out)),
+    ]
 
 
 def _shown(name: str, value: float | None) -> str:

@@ -19,24 +19,11 @@ ERRORS = ("mean", "rmse", "over_95", "over_max")
 COLUMNS = ("count", "mean mm", "rmse mm", "95 % mm", "max mm")
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args)
-    return show_baked(console, bake(_request(args), console))
-
-
-def show_baked(console: Console, result: BakeResult) -> int:
-    console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
-    compared = result.accuracy.as_dict()
-    return console.concluded(
-        result.verdict, {**result.summary, **({"accuracy": compared} if compared else {})}, _lines(result)
-    )
-
-
-def _request(args: argparse.Namespace) -> BakeRequest:
+def run(args: argparse.Namespace, console: Console) -> int:
     config = load_config(args.config, args.set)
     given = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
     log, cameras = (None, ()) if args.held_out is None else split_cameras(args.held_out)
-    return request_of(
+    request = request_of(
         BakeRequest,
         args,
         out=args.out or Path("field"),
@@ -49,6 +36,11 @@ def _request(args: argparse.Namespace) -> BakeRequest:
         held_out=log,
         held_out_cameras=cameras,
     )
+    result = bake(request, console)
+    console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
+    compared = result.accuracy.as_dict()
+    found = {**result.summary, **({"accuracy": compared} if compared else {})}
+    return console.concluded(result.verdict, found, _lines(result))
 
 
 def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
@@ -60,24 +52,21 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
 
 
 def _lines(result: BakeResult) -> Iterator[str]:
-    shown_values = {**result.summary, "shape": " x ".join(map(str, result.summary["shape"]))}
-    yield from table(
-        ("field", ""), [(name.replace("_", " "), format_cell(value)) for name, value in shown_values.items()]
-    )
+    values = {**result.summary, "shape": " x ".join(map(str, result.summary["shape"]))}
+    yield from table(("field", ""), [(name.replace("_", " "), format_cell(value)) for name, value in values.items()])
     truth, mesh, held_out = result.accuracy.truth, result.accuracy.reference_mesh, result.accuracy.held_out_depth
-    if truth is not None:
-        yield from ("", *_truth_lines(truth))
+    yield from () if truth is None else ("", *_truth_lines(truth))
     if mesh is not None:
         cells = [(name, _band(band), *_errors(band)) for name, band in _each(mesh.accuracy.everywhere)]
         yield from ("", *table(("field", "from mesh cm", *COLUMNS), cells))
     if held_out is not None:
         note = "before it: points whose ball up to it was seen to be free"
-        yield from ("", f"held-out depth of {held_out.num_frames} frames; {note}")
         places = {name: [("on it", band)] for name, band in held_out.on_surface.items()}
         for name, band in _each(held_out.before.seen):
             places[name].append((_band(band), band))
         cells = [(name, place, *_errors(band)) for name, bands in places.items() for place, band in bands]
-        yield from table(("field", "from depth cm", *COLUMNS), cells)
+        titled = f"held-out depth of {held_out.num_frames} frames; {note}"
+        yield from ("", titled, *table(("field", "from depth cm", *COLUMNS), cells))
 
 
 def _truth_lines(compared: TruthComparison) -> list[str]:

@@ -40,17 +40,8 @@ class CheckRequest(RobotOptions):
     fail_on: str = "error"
 
 
-@dataclass(frozen=True, kw_only=True)
-class CheckResult:
-    """Findings and verdict."""
-
-    report: CheckReport
-    verdict: Verdict
-    exit_code: int
-
-
-def check(request: CheckRequest) -> CheckResult:
-    """Check the recording, reading it once.
+def check(request: CheckRequest) -> tuple[CheckReport, Verdict]:
+    """Check the recording, reading it once, and judge the findings.
 
     Raises UsageError for contradictory options, InputError for an unreadable recording.
     """
@@ -63,10 +54,7 @@ def check(request: CheckRequest) -> CheckResult:
         report,
         findings=[*report.findings, *([warning("robot-model", str(request.urdf), other, TAKE)] if other else [])],
     )
-    verdict = _verdict(report, request.fail_on)
-    return CheckResult(
-        report=report, verdict=verdict, exit_code=0 if request.fail_on == "never" else verdict.exit_code
-    )
+    return report, _verdict(report, request.fail_on)
 
 
 def refuse_errors(path: Path, options: SourceOptions, allowed: Collection[str] = ()) -> None:
