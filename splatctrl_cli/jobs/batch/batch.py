@@ -1,18 +1,16 @@
 """A batch: read the suite, run its graph, write batch.json."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import DAMAGED, InputError, UsageError
+from splatctrl_cli.errors import DAMAGED, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, verdict_of
-from splatctrl_cli.files.output import MARKERS, write_durably, write_json
+from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
 from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Ledger, Run, keys_of
 from splatctrl_cli.jobs.batch.run import (
@@ -115,14 +113,8 @@ def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node
     nodes = of_shard(every, request.shard)
     with Ledger(out) as ledger:
         keys, latest = keys_of(nodes, ledger, command_line.entry), ledger.latest()
-    is_kept = {
-        node.name: not request.again
-        and (run := latest.get(node.name)) is not None
-        and run.key == keys[node.name]
-        and run.state in {DONE, "failed"}
-        for node in nodes
-    }
-    return [(node, "done" if is_kept[node.name] else "to do") for node in nodes]
+    stand = {name for name, run in latest.items() if run.state in {DONE, FAILED} and run.key == keys.get(name)}
+    return [(node, "done" if node.name in stand and not request.again else "to do") for node in nodes]
 
 
 def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
@@ -223,27 +215,6 @@ def write_batch(
         "nodes": [run.document() for run in found],
     }
     write_durably(out / FILE, lambda path: write_json(path, document))
-
-
-def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: str) -> None:
-    """Raise UsageError if `out` is of another command, or of other settings (`what`).
-
-    Its file `name` has the settings. Raises InputError if that is unreadable.
-    """
-    file = out / name
-    if not file.is_file():
-        if any((out / other).exists() for other in (*MARKERS, FILE)):
-            raise UsageError(f"{out}: is no {what}, but something else", remedy="give another --out")
-        return
-    try:
-        before = json.loads(file.read_text(encoding="utf-8"))["asked"]
-        differs = [key for key in asked if before.get(key) != asked[key]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{file}: is not what a {what} writes", remedy="give another --out") from None
-    if differs:
-        raise UsageError(
-            f"{out}: was begun with other settings: {', '.join(differs)}", remedy="give them again, or another --out"
-        )
 
 
 @contextmanager

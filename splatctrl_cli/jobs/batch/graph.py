@@ -1,9 +1,10 @@
 """The graph of a suite: nodes of recording, job and variant."""
 
 import itertools
+import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -141,23 +142,13 @@ def _in_order(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, 
 
 
 def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str, ...]:
-    found = dict.fromkeys(place for text in _texts((job.options, job.matrix)) for place in _PLACE.findall(text))
+    texts = json.dumps([job.options, job.matrix], ensure_ascii=False, default=str)
+    found = dict.fromkeys(_PLACE.findall(texts))
     for place in found:
         if place not in {RECORDING, NAME, *jobs}:
             known = ", ".join((RECORDING, NAME, *jobs))
             raise UsageError(f"{_where(job, recording)}: {{{place}}} is no job", remedy=f"known here: {known}")
     return tuple(place for place in found if place in jobs)
-
-
-def _texts(value: Any) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, Mapping):
-        for each in value.values():
-            yield from _texts(each)
-    elif isinstance(value, list | tuple):
-        for each in value:
-            yield from _texts(each)
 
 
 def _nodes_of(
@@ -177,21 +168,38 @@ def _nodes_of(
             for picked in itertools.product(*job.matrix.values()):
                 chosen = dict(zip(job.matrix, picked, strict=True))
                 variant = {**inherited, **{f"{job.name}.{option}": value for option, value in chosen.items()}}
-                node = _node(recording, job, variant, _suffix(variant, (each for each, _ in jobs)), before, out)
+                suffix = _suffix(variant, (each for each, _ in jobs))
+                place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:120]
+                only_prints = job.command in ("check", "info")
+                its = None if only_prints else out / recording.name / (place + ENDINGS.get(job.command, ""))
                 values: dict[str, Any] = {
                     **{each.job: str(each.out) for each in before},
                     RECORDING: [str(path) for path in recording.paths],
                     NAME: recording.name,
                 }
                 options = _placed(_merged(job.options, chosen), values.__getitem__)
-                options |= {} if node.out is None else {"out": str(node.out), "force": True, "resume": True}
+                options |= {} if its is None else {"out": str(its), "force": True, "resume": True}
                 try:
                     words, read = command_line.parsed(job.command, options, folder)
                 except UsageError as error:
                     raise UsageError(f"{_where(job, recording)}: {error.message}", remedy=error.remedy) from None
                 outs = [each.out for each in before if each.out is not None]
                 inputs = (path for path in read if not any(out in (path, *path.parents) for out in outs))
-                made[job.name].append(replace(node, words=words, inputs=tuple(inputs)))
+                made[job.name].append(
+                    Node(
+                        name=f"{recording.name}/{place}",
+                        recording=recording.name,
+                        job=job.name,
+                        command=job.command,
+                        words=words,
+                        variant=variant,
+                        inputs=tuple(inputs),
+                        needs=tuple(each.name for each in before),
+                        out=its,
+                        expect=job.expect,
+                        limits=job.limits,
+                    )
+                )
     nodes = [node for each in made.values() for node in each]
     by_name: dict[str, Node] = {}
     for node in nodes:
@@ -233,24 +241,6 @@ def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
         text = next(text for each, text in zip(values, _short(values), strict=True) if each is value)
         found += f"+{option if count[option] == 1 else key}={text}"
     return found
-
-
-def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before: Sequence[Node], out: Path) -> Node:
-    place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:120]
-    return Node(
-        name=f"{recording.name}/{place}",
-        recording=recording.name,
-        job=job.name,
-        command=job.command,
-        words=(),
-        variant=variant,
-        needs=tuple(node.name for node in before),
-        out=None
-        if job.command in ("check", "info")
-        else out / recording.name / (place + ENDINGS.get(job.command, "")),
-        expect=job.expect,
-        limits=job.limits,
-    )
 
 
 def _joined(variants: Sequence[Variant]) -> Variant | None:

@@ -60,14 +60,27 @@ class Scheduler:
                 if run is not None:
                     self._settle(waiting.pop(node.name), run, clock)
                 elif self.ledger.claim(node.name):
-                    run = self._without_running(node, self.keys[node.name], self.ledger.last(node.name))
+                    run = self._without_running(
+                        node, self.keys[node.name], next(self.ledger.runs([f"node={node.name}"]), None)
+                    )
                     if run is not None:
                         self.ledger.release(node.name)
                         self._settle(waiting.pop(node.name), run, clock)
                         continue
                     del waiting[node.name]
                     Path(self._place(node, ".end")).unlink(missing_ok=True)
-                    futures[self.executor.submit(run_task, self._task(node, self.keys[node.name]))] = node
+                    task = Task(
+                        entry=self.entry,
+                        words=[*node.words],
+                        key=self.keys[node.name],
+                        out="" if node.out is None else str(node.out.absolute()),
+                        result=self._place(node, ".json"),
+                        log=self._place(node, ".log"),
+                        end=self._place(node, ".end"),
+                        timeout=node.limits.timeout,
+                        memory=node.limits.memory,
+                    )
+                    futures[self.executor.submit(run_task, task)] = node
                 else:
                     is_busy = True
             ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
@@ -127,19 +140,6 @@ class Scheduler:
         line = clock.passed(run)
         if run.started >= clock.started or run.state == SKIPPED:
             self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
-
-    def _task(self, node: Node, key: str) -> Task:
-        return Task(
-            entry=self.entry,
-            words=[*node.words],
-            key=key,
-            out="" if node.out is None else str(node.out.absolute()),
-            result=self._place(node, ".json"),
-            log=self._place(node, ".log"),
-            end=self._place(node, ".end"),
-            timeout=node.limits.timeout,
-            memory=node.limits.memory,
-        )
 
     def _place(self, node: Node, ending: str) -> str:
         return str((self.ledger.folder / node.name).absolute()) + ending
@@ -248,7 +248,7 @@ def _end_of(future: "Future[End]") -> End:
     try:
         return future.result()
     except Exception as error:  # of the executor: a worker that died, a machine that is gone
-        return End.without_one("", f"lost: {type(error).__name__}: {error}"[:200])
+        return End(key="", cause=f"lost: {type(error).__name__}: {error}"[:200])
 
 
 def verdict_in(result: Path) -> dict[str, Any]:
@@ -261,4 +261,4 @@ def verdict_in(result: Path) -> dict[str, Any]:
 
 
 def not_run(node: Node, key: str, folder: Path, *, state: str, cause: str) -> Run:
-    return replace(run_of(node, key, End.without_one(key, cause), folder), state=state)
+    return replace(run_of(node, key, End(key=key, cause=cause), folder), state=state)

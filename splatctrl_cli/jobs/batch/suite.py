@@ -15,6 +15,7 @@ from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 
 Table = Mapping[str, Any]
 
+_ODD = re.compile(r"[^\w.+-]")  # in no name of a folder
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 SECONDS = {"s": 1, "m": 60, "min": 60, "h": 3600}
 EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
@@ -83,7 +84,7 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
         raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the path") from None
     _check_keys(path.name, document, ("name", "out", "recordings", "jobs"))
     folder = path.absolute().parent
-    name = _text(path.name, document, "name", path.stem)
+    name = _worded(path.name, "name", document.get("name", path.stem))
     jobs = tuple(_job(key, table, commands) for key, table in _tables(path.name, document, "jobs").items())
     tables = _list(path.name, document, "recordings")
     recordings = _named([one for table in tables for one in _recordings(folder, table)])
@@ -94,7 +95,7 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     return Suite(
         name=name,
         folder=folder,
-        out=folder / _text(path.name, document, "out", f"{path.stem}.out"),
+        out=folder / _worded(path.name, "out", document.get("out", f"{path.stem}.out")),
         recordings=tuple(recordings),
         jobs=jobs,
     )
@@ -115,7 +116,7 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     if not isinstance(table, Mapping):
         raise UsageError(f"{where}: expected a table, got {shown(table)}")
     _checked_name(where, name)
-    command = _text(where, table, "command", base.command if base else name)
+    command = _worded(where, "command", table.get("command", base.command if base else name))
     if command not in commands:
         raise UsageError(
             f"{where}: no job is called {command!r}", remedy=_near(command, commands, "give command = one of")
@@ -126,7 +127,7 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     matrix = table.get("matrix", {})
     if not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()):
         raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {shown(matrix)}")
-    expect = _text(where, table, "expect", base.expect if base else "passed")
+    expect = _worded(where, "expect", table.get("expect", base.expect if base else "passed"))
     if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
         raise UsageError(
             f"{where} expect: no verdict is called {expect!r}", remedy=_near(expect, (*EXPECTED, "exit N"))
@@ -156,7 +157,7 @@ def _recordings(folder: Path, table: Table) -> list[Recording]:
         raise UsageError(f"{where}: expected paths or session, and not both")
     key = "paths" if "paths" in table else "session"
     paths = list(dict.fromkeys(path for each in _list(where, table, key) for path in _found(folder, where, each)))
-    name = _text(where, table, "name", "")
+    name = _worded(where, "name", table.get("name", ""))
     if name and key == "paths" and len(paths) > 1:
         raise UsageError(f"{where} name = {name!r}: {len(paths)} recordings match", remedy="leave the name out")
     each = [tuple(paths)] if key == "session" else [(path,) for path in paths]
@@ -180,7 +181,7 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
     own = [
         f"{p.parent.name}-{p.name}" if p.name in ("log", "capture", "recording", "data") else p.name for p in places
     ]
-    names = [each.name or _plain(name) for each, name in zip(recordings, own, strict=True)]
+    names = [each.name or _ODD.sub("_", name) for each, name in zip(recordings, own, strict=True)]
     for above in range(max((len(place.parts) - 1 for place in places), default=0)):
         alike: dict[str, list[int]] = {}
         for k, name in enumerate(names):
@@ -188,16 +189,12 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
         for group in alike.values():
             folders = {k: "".join(parent.name for parent in [*places[k].parents][above : above + 1]) for k in group}
             for k in group if len(set(folders.values())) > 1 else ():
-                names[k] = names[k] if recordings[k].name else _plain(f"{folders[k]}-{names[k]}".lstrip("-"))
+                names[k] = names[k] if recordings[k].name else _ODD.sub("_", f"{folders[k]}-{names[k]}".lstrip("-"))
     return [replace(each, name=name) for each, name in zip(recordings, names, strict=True)]
 
 
 def _without_ending(path: Path) -> Path:
     return path.with_suffix("") if path.suffix in (".mcap", ".bag", ".db3", ".toml", ".capture") else path
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[^\w.+-]", "_", name)
 
 
 def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> None:
@@ -232,10 +229,6 @@ def _near(word: str, known: Sequence[str], otherwise: str = "known here") -> str
 def _checked_name(where: str, name: str) -> None:
     if not re.fullmatch(r"\w[\w.+-]*", name):
         raise UsageError(f"{where}: {name!r} is no name of a folder", remedy="use letters, digits, . _ + -")
-
-
-def _text(where: str, table: Table, key: str, default: str) -> str:
-    return _worded(where, key, table.get(key, default))
 
 
 def _worded(where: str, key: str, value: object) -> str:

@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
@@ -56,23 +56,18 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """The end of a run; exit_code is None if it was killed, for `cause`.
+    """The end of a run; exit_code is None if it was killed, or never completed, for `cause`.
 
     started [s since 1970]. stamp: of the output, changes when rewritten.
     """
 
     key: str
-    exit_code: int | None
+    exit_code: int | None = None
     cause: str
-    started: float
-    seconds: float
-    peak_mb: float
-    stamp: str
-
-    @classmethod
-    def without_one(cls, key: str, cause: str) -> "End":
-        """End of a task that never completed."""
-        return cls(key=key, exit_code=None, cause=cause, started=time.time(), seconds=0.0, peak_mb=0.0, stamp="")
+    started: float = field(default_factory=time.time)
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    stamp: str = ""
 
 
 def run_task(task: Task) -> End:
@@ -97,10 +92,10 @@ def run_task(task: Task) -> End:
         if line:
             return End(**json.loads(line))
         if runner not in _runners:  # ended by stop_runners: another would only delay the end of the batch
-            return End.without_one(task.key, "ended with its batch")
+            return End(key=task.key, cause="ended with its batch")
         runner.kill()
         runner.wait()
-    return End.without_one(task.key, "its runner was killed twice")
+    return End(key=task.key, cause="its runner was killed twice")
 
 
 def stop_runners() -> None:
