@@ -213,15 +213,30 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
         *((-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE),
     ]
     ordered = sorted(weighed, key=lambda one: one[:2])
-    reasons = [*_of_verdicts(verdicts, after), *(reason for *_, reason in ordered), *_of_single(jobs)]
-    lone = ((before, only_before), (after, only_after))
-    reasons += [
-        note(criterion="runs", sentence=f"only in {side.path}: {_named(names)}") for side, names in lone if names
+    single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
+    more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
+    notes = {
+        "single recordings": [f"{one.metric} of {one.worst.run}: {one.worst.sentence}{more}" for one in single[:1]],
+        "runs": [
+            f"only in {side.path}: {_named(names)}"
+            for side, names in ((before, only_before), (after, only_after))
+            if names
+        ],
+    }
+    num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
+    counted = f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
+    reasons = [
+        note(criterion="comparison", sentence=counted)
+        if num_figures or num_verdicts
+        else lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides"),
+        *_of_verdicts(verdicts, after),
+        *(reason for *_, reason in ordered),
+        *(note(criterion=name, sentence=sentence) for name, sentences in notes.items() for sentence in sentences),
     ]
     return CompareResult(
         verdict=verdict_of(
             "compare",
-            [_overall(metrics), *reasons],
+            reasons,
             scope=f"{before.path} -> {after.path}",
             passed="no regression",
             notes=[f"not compared, only in {before.path}: {_named(only_before)}"] if only_before else [],
@@ -242,22 +257,11 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
     )
 
 
-def _overall(metrics: Mapping[str, int]) -> Reason:
-    num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
-    if not num_figures and not num_verdicts:
-        return lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides")
-    return note(
-        criterion="comparison",
-        sentence=f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}",
-    )
-
-
 def _verdict_change(old: JudgedRun, new: JudgedRun) -> VerdictChange | None:
-    if old.is_green == new.is_green and (old.outcome, old.label) == (new.outcome, new.label):
+    is_other = old.is_green != new.is_green
+    if not is_other and (old.outcome, old.label) == (new.outcome, new.label):
         return None
-    change = Change.OTHER
-    if old.is_green != new.is_green:
-        change = Change.WORSE if old.is_green else Change.BETTER
+    change = Change.OTHER if not is_other else Change.WORSE if old.is_green else Change.BETTER
     return VerdictChange(run=new.name, recording=new.recording, before=old.label, after=new.label, change=change)
 
 
@@ -310,11 +314,8 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
         if harm is None:
             continue
         allowed = sum(one.allowed for one in changes) / len(changes)
-        change = Change.SAME
-        if harm.low > 0 and harm.mean > allowed:
-            change = Change.WORSE
-        elif harm.high < 0 and -harm.mean > allowed:
-            change = Change.BETTER
+        is_worse, is_better = harm.low > 0 and harm.mean > allowed, harm.high < 0 and -harm.mean > allowed
+        change = Change.WORSE if is_worse else Change.BETTER if is_better else Change.SAME
         yield JobChange(
             job=job, metric=metric, harm=harm, change=change, worst=max(changes, key=lambda one: one.share)
         )
@@ -372,22 +373,12 @@ def _of_job(one: JobChange) -> Reason:
     )
 
 
-def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
-    if single := [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]:
-        first = single[0]
-        more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
-        yield note(
-            criterion="single recordings",
-            sentence=f"{first.metric} of {first.worst.run}: {first.worst.sentence}{more}",
-        )
-
-
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
     """Differing settings, versions and inputs, before and after in the first such run."""
     found: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
-        for name in [name for name in old.settings if name in new.settings]:
-            values = str(old.settings[name]), str(new.settings[name])
+        for name, value in old.settings.items():
+            values = str(value), str(new.settings.get(name, value))
             if values[0] != values[1]:
                 found.setdefault(name, values)
     return found

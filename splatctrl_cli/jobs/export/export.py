@@ -6,11 +6,10 @@ Written splats are read back and rendered before they count.
 import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import methodcaller
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,9 +87,6 @@ class ExportResult:
     covered_share: float
     isotropic_psnr: float | None
     was_rounded: bool
-
-    def as_dict(self) -> dict[str, Any]:
-        return {name: value for name, value in asdict(self).items() if name != "was_rounded"}
 
 
 def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:

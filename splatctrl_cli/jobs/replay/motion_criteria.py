@@ -32,10 +32,8 @@ from splatctrl_cli.robot.self_margins import least_gap
 def clearance(judged: Judged) -> Iterator[Reason]:
     """The exact distance of every moving sphere to the splats keeps the margin."""
     represented = lowest(judged.replay.between["represented"])
-    if represented is not None and represented >= judged.threshold:
-        yield from _unrepresented(judged, represented)
-    else:
-        yield from _by_source(judged, "exact")
+    is_starved = represented is not None and represented >= judged.threshold
+    yield from _by_source(judged, "exact", represented if is_starved else None)
 
 
 def certified_clearance(judged: Judged) -> Iterator[Reason]:
@@ -72,7 +70,8 @@ def true_clearance(judged: Judged) -> Iterator[Reason]:
         yield from _by_source(judged, "true")
 
 
-def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
+def _by_source(judged: Judged, source: str, represented: float | None = None) -> Iterator[Reason]:
+    """A clearance keeps the margin; represented [m]: to splats, if voxels without one alone break it."""
     replay = judged.replay
     least = lowest(np.asarray(replay.true_clearance if source == "true" else replay.audit.clearance[source]))
     if least is None:
@@ -80,8 +79,21 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     if least >= judged.threshold:
         yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
         return
-    events = events_of(replay, EventKind.IN_COLLISION if least < 0 else EventKind.BELOW_MARGIN, source)
+    is_contact = least < 0 and represented is None
+    events = events_of(replay, EventKind.IN_COLLISION if is_contact else EventKind.BELOW_MARGIN, source)
     worst = min(events, key=lambda event: event.worst)
+    if represented is not None:
+        starved = lacking(
+            sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats "
+            f"are {mm(represented)} away), margin {mm(replay.margin)}",
+            value=least,
+            threshold=replay.margin,
+            unit="m",
+            remedy="the map is starved: raise --max-splats",
+            count=judged.num_states,
+        )
+        yield _at_worst(worst, starved)
+        return
     states = sum(event.num_states for event in events)
     apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
     yield _at_worst(
@@ -94,28 +106,6 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
             unit="m",
             count=judged.num_states,
             label=CONTACT if least < 0 else MARGIN,
-        ),
-    )
-
-
-def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
-    replay = judged.replay
-    least = lowest(np.asarray(replay.audit.clearance["exact"]))
-    assert least is not None
-    if least >= judged.threshold:
-        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
-        return
-    worst = min(events_of(replay, EventKind.BELOW_MARGIN, "exact"), key=lambda event: event.worst)
-    yield _at_worst(
-        worst,
-        lacking(
-            sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats "
-            f"are {mm(represented)} away), margin {mm(replay.margin)}",
-            value=least,
-            threshold=replay.margin,
-            unit="m",
-            remedy="the map is starved: raise --max-splats",
-            count=judged.num_states,
         ),
     )
 
@@ -233,10 +223,7 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
 def position_limits(judged: Judged) -> Iterator[Reason]:
     """Joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise."""
     least = lowest(judged.replay.audit.figures["limit_margin"])
-    tolerance = judged.request.config.control.limit_tolerance
-    if least is None:
-        return
-    if least < -tolerance:
+    if least is not None and least < -judged.request.config.control.limit_tolerance:
         worst = min(events_of(judged.replay, EventKind.OUTSIDE_LIMITS), key=lambda event: event.worst)
         yield _at_worst(
             worst,
@@ -250,7 +237,7 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
                 label=LIMITS,
             ),
         )
-    else:
+    elif least is not None:
         yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.num_states)
 
 
