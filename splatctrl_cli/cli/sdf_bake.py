@@ -4,10 +4,10 @@ import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from splatctrl_cli.cli.common import Console, format_cell, names_of, request_of, table
 from splatctrl_cli.config import fixed, load_config
-from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, TruthComparison
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.formats.grid.grid_formats import FORMATS
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
@@ -16,6 +16,9 @@ from splatctrl_cli.records import Box, Label
 
 SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options
 ERRORS = ("mean", "rmse", "over_95", "over_max")
+Band = Mapping[str, Any]
+"""Errors in a band of true distance, as in ``field.json``."""
+
 COLUMNS = ("count", "mean mm", "rmse mm", "95 % mm", "max mm")
 
 
@@ -38,8 +41,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     )
     result = bake(request, console)
     console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
-    compared = result.accuracy.as_dict()
-    found = {**result.summary, **({"accuracy": compared} if compared else {})}
+    found = {**result.summary, **({"accuracy": result.accuracy} if result.accuracy else {})}
     return console.concluded(result.verdict, found, _lines(result))
 
 
@@ -54,46 +56,45 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
 def _lines(result: BakeResult) -> Iterator[str]:
     values = {**result.summary, "shape": " x ".join(map(str, result.summary["shape"]))}
     yield from table(("field", ""), [(name.replace("_", " "), format_cell(value)) for name, value in values.items()])
-    truth, mesh, held_out = result.accuracy.truth, result.accuracy.reference_mesh, result.accuracy.held_out_depth
+    truth, mesh, held_out = (result.accuracy.get(name) for name in ("truth", "reference_mesh", "held_out_depth"))
     yield from () if truth is None else ("", *_truth_lines(truth))
     if mesh is not None:
-        cells = [(name, _band(band), *_errors(band)) for name, band in _each(mesh.accuracy.everywhere)]
+        cells = [(name, _band(band), *_errors(band)) for name, band in _each(mesh["everywhere"])]
         yield from ("", *table(("field", "from mesh cm", *COLUMNS), cells))
     if held_out is not None:
         note = "before it: points whose ball up to it was seen to be free"
-        places = {name: [("on it", band)] for name, band in held_out.on_surface.items()}
-        for name, band in _each(held_out.before.seen):
+        places = {name: [("on it", band)] for name, band in held_out["on_surface"].items()}
+        for name, band in _each(held_out["before"]["seen"]):
             places[name].append((_band(band), band))
         cells = [(name, place, *_errors(band)) for name, bands in places.items() for place, band in bands]
-        titled = f"held-out depth of {held_out.num_frames} frames; {note}"
+        titled = f"held-out depth of {held_out['num_frames']} frames; {note}"
         yield from ("", titled, *table(("field", "from depth cm", *COLUMNS), cells))
 
 
-def _truth_lines(compared: TruthComparison) -> list[str]:
-    accuracy, figures = compared.accuracy, ("mean", "rmse", "median", "over_95", "over_max")
+def _truth_lines(compared: Mapping[str, Any]) -> list[str]:
+    figures, over = ("mean", "rmse", "median", "over_95", "over_max"), compared["over_estimate"]
     rows = [
         (where, name, _band(band), *_errors(band, figures))
-        for where, fields in (("seen", accuracy.seen), ("all", accuracy.everywhere))
-        for name, band in _each(fields)
+        for where, place in (("seen", "seen"), ("all", "everywhere"))
+        for name, band in _each(compared[place])
     ]
-    over = accuracy.over_estimate
     verdict = (
-        f"hard exceeds the truth by more than {over.allowance * 1e3:.1f} mm at {over.count_beyond} of {over.count} "
-        "seen cells"
+        f"hard exceeds the truth by more than {over['allowance'] * 1e3:.1f} mm at {over['count_beyond']} of "
+        f"{over['count']} seen cells"
     )
-    if over.median_beyond is not None and over.max_error is not None:
+    if over["median_beyond"] is not None and over["max_error"] is not None:
         verdict += (
-            f": in the median by {over.median_beyond * 1e3:.1f} mm more than that; "
-            f"the largest error is {over.max_error * 1e3:.1f} mm"
+            f": in the median by {over['median_beyond'] * 1e3:.1f} mm more than that; "
+            f"the largest error is {over['max_error'] * 1e3:.1f} mm"
         )
-    if compared.num_outside_workspace:
-        verdict += f"; {compared.num_outside_workspace} cells before seen surfaces outside the workspace do not count"
+    if outside := compared["num_outside_workspace"]:
+        verdict += f"; {outside} cells before seen surfaces outside the workspace do not count"
     expected = [
-        f"probability, {name}: calibration error {curve.calibration_error:.3f} at seen cells"
-        for name, curve in compared.reliability.items()
+        f"probability, {name}: calibration error {curve['calibration_error']:.3f} at seen cells"
+        for name, curve in compared["reliability"].items()
     ]
-    if compared.error_mean is not None and compared.error_sigma:
-        mean, sigma = compared.error_mean, compared.error_sigma
+    mean, sigma = compared["error_mean"], compared["error_sigma"]
+    if mean is not None and sigma:
         expected.append(
             f"within {fixed.PROBABILITY_NEAR * 100:g} cm of seen surfaces sdf errs by {mean * 1e3:.1f} +- "
             f"{sigma * 1e3:.1f} mm: calibrate the probability with --set "
@@ -108,18 +109,18 @@ def _truth_lines(compared: TruthComparison) -> list[str]:
     ]
 
 
-def _each(fields: Mapping[str, Iterable[BandAccuracy]]) -> Iterator[tuple[str, BandAccuracy]]:
+def _each(fields: Mapping[str, Iterable[Band]]) -> Iterator[tuple[str, Band]]:
     return ((name, band) for name, bands in fields.items() for band in bands)
 
 
-def _band(band: BandAccuracy) -> str:
-    return f"{band.lower * 100:g}-{band.upper * 100:g}"
+def _band(band: Band) -> str:
+    return f"{band['lower'] * 100:g}-{band['upper'] * 100:g}"
 
 
-def _errors(band: BandAccuracy, figures: Sequence[str] = ERRORS) -> list[object]:
+def _errors(band: Band, figures: Sequence[str] = ERRORS) -> list[object]:
     """Count and errors [mm]."""
-    values = (getattr(band, name) for name in figures)
-    return [band.count, *("-" if value is None else f"{value * 1e3:.1f}" for value in values)]
+    values = (band[name] for name in figures)
+    return [band["count"], *("-" if value is None else f"{value * 1e3:.1f}" for value in values)]
 
 
 def labels_of(text: str) -> frozenset[Label]:

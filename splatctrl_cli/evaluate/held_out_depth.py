@@ -7,7 +7,7 @@ was seen free: else it may know surface that no held-out pixel shows.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,6 @@ from scipy.spatial import cKDTree
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.field_accuracy import (
-    BandAccuracy,
-    FieldAccuracy,
     GridDistance,
     band_accuracy,
     field_accuracy,
@@ -193,32 +191,6 @@ def _box(points: Float64) -> str:
 REACH = fixed.BANDS[-1][1]  # [m] before the surface that points are put on a ray
 
 
-@dataclass(frozen=True, kw_only=True)
-class HeldOutComparison:
-    """Errors [m] against held-out depth, and counts of points.
-
-    on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
-    to the nearest measured point, seen free, so under-estimates count too. over_estimate: over all points. num_edges
-    pixels were left out at depth edges; num_outside points lie outside the grid, num_unknown at a corner without
-    distance.
-    """
-
-    on_surface: dict[str, BandAccuracy]
-    before: FieldAccuracy
-    reference: str
-    num_frames: int
-    num_measured: int
-    num_edges: int
-    num_drawn: int
-    num_outside: int
-    num_unknown: int
-
-    def as_dict(self) -> dict[str, Any]:
-        counts = {name: value for name, value in vars(self).items() if name not in {"on_surface", "before"}}
-        on_surface = {name: asdict(band) for name, band in self.on_surface.items()}
-        return {**counts, "on_surface": on_surface, "before": self.before.as_dict()}
-
-
 def compare_with_held_out_depth(
     grid: DistanceGrid,
     frames: Sequence[RgbdFrame],
@@ -226,12 +198,17 @@ def compare_with_held_out_depth(
     seed: int,
     counted: Sequence[Bool] | None = None,
     max_points: int = 20_000,
-) -> HeldOutComparison:
-    """Errors of interpolated distances on `max_points` held-out rays, sampled by `seed`.
+) -> dict[str, Any]:
+    """Errors [m] of interpolated distances on held-out rays sampled by `seed`, as in ``field.json``.
+
+    on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
+    to the nearest measured point, seen free, so under-estimates count too. over_estimate: over all points. num_edges
+    pixels were left out at depth edges; num_outside points lie outside the grid, num_unknown at a corner without
+    distance.
 
     frames: of held-out cameras, at the bake's stamp, in the grid's frame. counted: per frame (H, W), False on objects
-    that the field leaves out; None: all count. Raises InputError for masks that do not fit, NotEvaluableError without
-    a measured point in the grid.
+    that the field leaves out; None: all count. max_points: rays. Raises InputError for masks that do not fit,
+    NotEvaluableError without a measured point in the grid.
     """
     distances = grid_distances(grid)
     box = Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1))
@@ -254,20 +231,21 @@ def compare_with_held_out_depth(
     points, values = points[is_known], {name: value[is_known] for name, value in values.items()}
     reference = np.asarray(cKDTree(measured).query(points)[0])
     radius = median_radius(grid)
-    return HeldOutComparison(
-        on_surface={name: band_accuracy(value[np.isfinite(value)], 0.0, 0.0) for name, value in at_surface.items()},
-        before=replace(
-            field_accuracy(values, reference, _ball_is_free(points, reference, frames), median_radius=radius),
-            over_estimate=field_accuracy(values, reference, None, median_radius=radius).over_estimate,
-        ),
-        reference="nearest measured depth point",
-        num_frames=len(frames),
-        num_measured=len(measured),
-        num_edges=num_edges,
-        num_drawn=len(drawn),
-        num_outside=len(drawn) - len(is_known),
-        num_unknown=int(np.count_nonzero(~is_known)),
+    accuracy = replace(
+        field_accuracy(values, reference, _ball_is_free(points, reference, frames), median_radius=radius),
+        over_estimate=field_accuracy(values, reference, None, median_radius=radius).over_estimate,
     )
+    return {
+        "reference": "nearest measured depth point",
+        "num_frames": len(frames),
+        "num_measured": len(measured),
+        "num_edges": num_edges,
+        "num_drawn": len(drawn),
+        "num_outside": len(drawn) - len(is_known),
+        "num_unknown": int(np.count_nonzero(~is_known)),
+        "on_surface": {n: asdict(band_accuracy(v[np.isfinite(v)], 0.0, 0.0)) for n, v in at_surface.items()},
+        "before": accuracy.as_dict(),
+    }
 
 
 def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float64, Float64] | None) -> Bool:

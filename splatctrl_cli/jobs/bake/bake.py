@@ -16,7 +16,7 @@ from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
 from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.report import grid_statistics
+from splatctrl_cli.field.report import GradientLengths, grid_statistics
 from splatctrl_cli.field.slabs import (
     Kept,
     UnknownSpace,
@@ -32,12 +32,12 @@ from splatctrl_cli.formats.grid.grid_format import CHANNELS, GridSlabs, SlabPlan
 from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
 from splatctrl_cli.jobs.bake.accuracy import (
     SUMMARY_METRICS,
-    Accuracy,
-    FieldReport,
     accuracy_of,
     bake_verdict,
     check_references,
+    field_document,
     metrics_of,
+    summary_of,
 )
 from splatctrl_cli.jobs.bake.request import (
     BakeRequest,
@@ -55,6 +55,7 @@ from splatctrl_cli.jobs.running.resume import check_resumption, deciding_version
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import (
+    Reliability,
     gradient_picture,
     probability_picture,
     reliability_picture,
@@ -142,13 +143,16 @@ def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection
 
 @dataclass(frozen=True, kw_only=True)
 class BakeResult:
-    """A baked field in `out`; metrics can be gated on, seconds are by stage."""
+    """A baked field in `out`; metrics can be gated on, seconds are by stage.
+
+    accuracy: by reference (truth, reference_mesh, held_out_depth), as in ``field.json``.
+    """
 
     __repr__ = brief
 
     out: Path
     summary: Mapping[str, Any]
-    accuracy: Accuracy
+    accuracy: Mapping[str, Mapping[str, Any]]
     metrics: Mapping[str, float | None]
     verdict: Verdict
     seconds: Mapping[str, float]
@@ -178,19 +182,19 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
             finally:
                 job.baker.close()
         with stopwatch.stage("report"):
-            report = FieldReport(grid=grid, statistics=grid_statistics(grid), changes=changes)
+            statistics = grid_statistics(grid)
+            document = field_document(grid, statistics, changes)
         with stopwatch.stage("write"):
             write_grid(partial, grid, request.formats)
         with stopwatch.stage("accuracy"):
-            accuracy = accuracy_of(grid, job.baker.spheres, job.source, request)
+            accuracy, curves = accuracy_of(grid, job.baker.spheres, job.source, request)
         with stopwatch.stage("report"):
-            compared = accuracy.as_dict()
-            write_json(partial / "field.json", report.as_dict() | ({"accuracy": compared} if compared else {}))
+            write_json(partial / "field.json", document | ({"accuracy": accuracy} if accuracy else {}))
             if not request.no_report:
-                _draw(partial / "report", report, accuracy, _middle(job))
-        summary = report.summary()
+                _draw(partial / "report", grid, statistics.gradient, curves, _middle(job))
+        summary = summary_of(document)
         metrics = metrics_of(summary, accuracy)
-        verdict = bake_verdict(request, report, metrics, has_occupancy=job.source.occupancy is not None)
+        verdict = bake_verdict(request, document, metrics, has_occupancy=job.source.occupancy is not None)
         shutil.rmtree(partial / FOLDER)
         write_run(
             partial,
@@ -320,16 +324,21 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
     return store.grid({**header, **made}), changes
 
 
-def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence[float]) -> None:
+def _draw(
+    folder: Path,
+    grid: DistanceGrid,
+    lengths: GradientLengths | None,
+    curves: Mapping[str, Reliability],
+    point: Sequence[float],
+) -> None:
     folder.mkdir()
-    grid, lengths = report.grid, report.statistics.gradient
     slices_picture(folder / "slices.png", grid, point)
     if lengths is not None:
         gradient_picture(folder / "gradient.png", grid, lengths.histogram, lengths.bin_width, point)
     if "probability" in grid.channels:
         probability_picture(folder / "probability.png", grid, point)
-    if accuracy.truth is not None and accuracy.truth.reliability:
-        reliability_picture(folder / "reliability.png", accuracy.truth.reliability, "Probability against the truth")
+    if curves:
+        reliability_picture(folder / "reliability.png", curves, "Probability against the truth")
 
 
 def _middle(job: _Job) -> list[float]:
