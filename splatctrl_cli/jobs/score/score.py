@@ -140,7 +140,7 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
     protocol = _protocol(scorer)
     definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
     metrics = (
-        total_score(scorer.views)
+        total_score(scorer.figures)
         | surface
         | {
             "free_mass": _free_mass(request.scene, scene),
@@ -187,9 +187,7 @@ def _report(
         "metrics": metrics,
         "warnings": [*other, *scorer.doubts],
         "skipped_views": scorer.skipped,
-        "views": [
-            {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scorer.views
-        ],
+        "views": [view | as_json(figures) for view, figures in zip(scorer.views, scorer.figures, strict=True)],
     }
 
 
@@ -206,7 +204,7 @@ def _protocol(scorer: Scorer) -> dict[str, Any]:
         "left_out_views": None if split is None else list(split.left_out),
         "split": "by camera" if split is None else split.words(),
         "mask_rule": reference.mask_rule,
-        "resolution": [f"{width}x{height}" for width, height in sorted({view.size for view in scorer.views})],
+        "resolution": [f"{width}x{height}" for width, height in sorted(scorer.sizes)],
         "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
         "published_scans": None if named is None or not named.scans else list(named.scans),
         "background": [round(value, 4) for value in scorer.scene.background],

@@ -1,12 +1,13 @@
 """Scores of rendered views and of surfaces."""
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import isnan
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
-from splatctrl_cli.evaluate.score import ViewScore, score_view
+from splatctrl_cli.evaluate.score import CORRECTABLE, CORRECTED, score_view
 from splatctrl_cli.evaluate.score_report import Doubts
 from splatctrl_cli.evaluate.views import View, seen_by, seen_pixels, surface_points, views_to_score
 from splatctrl_cli.files.output import Stopwatch
@@ -38,8 +39,8 @@ class Scorer:
     """Scorer of views of `reference`; `draw` gets every view's row of pictures.
 
     newest: render from the newest snapshot not later than the view, else from the final splats. Filled by `run`:
-    views; skipped: names before the first snapshot; extremes: best and worst by camera; training: frames known at
-    the last view; doubts.
+    views, their figures and sizes [px]; skipped: names before the first snapshot; extremes: best and worst by camera;
+    training: frames known at the last view; doubts.
     """
 
     scene: SceneFolder
@@ -49,7 +50,9 @@ class Scorer:
     newest: bool = True
     allow_training: bool = False
     threads: int = 0
-    views: list[ViewScore] = field(default_factory=list)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, float]] = field(default_factory=list)
+    sizes: set[tuple[int, int]] = field(default_factory=set)
     skipped: list[str] = field(default_factory=list)
     extremes: dict[str, tuple[Ranked, Ranked]] = field(default_factory=dict)
     training: tuple[RgbdFrame, ...] = ()
@@ -112,7 +115,7 @@ class Scorer:
                 remedy="give the recording that the scene was reconstructed from, or other --cameras",
             )
         has_training = self.scene.names_its_views
-        if has_training and self.reference.has_depth and not any(view.seen.share for view in self.views):
+        if has_training and self.reference.has_depth and not any(view["seen_share"] for view in self.figures):
             raise NotEvaluableError(
                 f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
                 remedy="is it the same world and the same scene? give the recording that reconstruct was given",
@@ -120,14 +123,17 @@ class Scorer:
 
     def _score_one(self, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None) -> None:
         frame = view.frame
-        score, row = self._compared(view, frame, splats, shell)
+        figures, row = self._compared(view, frame, splats, shell)
         doubts.look(view, row.render, row.mask)
         if self.scene.corrections:
             there = corrected_among(frame, view.training, self.scene.corrections)
-            score = replace(score, corrected=self._compared(view, there, splats, shell)[0])
-        self.views.append(score)
+            figures_there, _ = self._compared(view, there, splats, shell)
+            figures |= {f"{n}{CORRECTED}": value for n, value in figures_there.items() if n in CORRECTABLE}
+        self.views.append({"view": view.name, "camera": frame.camera, "stamp_ns": frame.stamp_ns})
+        self.figures.append(figures)
+        self.sizes.add((frame.intrinsics.width, frame.intrinsics.height))
         self.training = view.training
-        rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
+        rank = figures["psnr_all" if isnan(figures["psnr_seen"]) else "psnr_seen"]
         if self.draw is not None:
             self.draw(row)
         best, worst = self.extremes.get(frame.camera, ((rank, row), (rank, row)))
@@ -138,12 +144,11 @@ class Scorer:
 
     def _compared(
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
-    ) -> tuple[ViewScore, ComparisonRow]:
+    ) -> tuple[dict[str, float], ComparisonRow]:
         protocol = self.reference.protocol
         rendering, depth = rendered_with_shell(splats, shell, frame, self.scene.background, self.threads)
         mask = None if self.reference.mask is None else self.reference.mask(frame)
-        score = score_view(
-            view=view.name,
+        figures = score_view(
             color=rendering.color,
             depth=depth,
             frame=frame,
@@ -152,9 +157,9 @@ class Scorer:
             fill=0.0 if protocol is None else protocol.fill,
             is_zero_padded=protocol is not None and protocol.is_zero_padded,
         )
-        return score, ComparisonRow(
+        return figures, ComparisonRow(
             title=view.name,
-            figures=_figures(score),
+            figures=_caption(figures),
             photo=frame.color,
             render=rendering.color,
             photo_depth=frame.depth,
@@ -163,10 +168,10 @@ class Scorer:
         )
 
 
-def _figures(score: ViewScore) -> str:
-    seen = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} seen"]
-    masked = [] if score.masked is None else [f"{score.masked.psnr:.1f} masked"]
-    return "dB: " + ", ".join([*seen, *masked, f"{score.all.psnr:.1f} all"])
+def _caption(figures: Mapping[str, float]) -> str:
+    values = {name: figures.get(f"psnr_{name}") for name in ("seen", "masked", "all")}
+    parts = [f"{v:.1f} {name}" for name, v in values.items() if v is not None and not (name == "seen" and isnan(v))]
+    return "dB: " + ", ".join(parts)
 
 
 def rendered_with_shell(
