@@ -37,7 +37,7 @@ NOT_OF_A_NODE = (*OWN, "help", "help-all", "json", "verbose", "quiet", "junit", 
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    console.reports = None  # it tells CI of every recording itself
+    console.reports_to_ci = False  # it tells CI of every recording itself
     workers = args.workers or os.cpu_count() or 1
     request = request_of(BatchRequest, args, workers=workers)
     command_line = OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1))

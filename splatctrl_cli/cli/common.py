@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several, whole
-from splatctrl_cli.cli.reports import enveloped, reports_of
+from splatctrl_cli.cli.reports import enveloped, report_command
 from splatctrl_cli.config import PRESETS, fixed
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, shown
 from splatctrl_cli.errors import UsageError
@@ -281,7 +281,7 @@ class Console:
     def __init__(self, args: argparse.Namespace) -> None:
         self._args = args
         self.is_json, self.is_quiet = bool(args.json), bool(args.quiet)
-        self.reports = reports_of(args) if hasattr(args, "junit") else None
+        self.reports_to_ci = hasattr(args, "junit")
 
     def log(self, line: str) -> None:
         if not self.is_quiet:
@@ -326,8 +326,8 @@ class Console:
         if code and self.is_json:
             gates = [str(reason) for reason in verdict.decisive[1:] if reason.criterion.startswith("--require")]
             print("\n".join(f"splatctrl: {line}" for line in (verdict.sentence, *gates)), file=sys.stderr, flush=True)
-        if self.reports is not None:
-            self.reports.conclude(verdict.as_dict(), code)
+        if self.reports_to_ci:
+            report_command(self._args, verdict.as_dict(), code)
         return code
 
 

@@ -80,17 +80,6 @@ class FigureChange:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerdictChange:
-    """Verdict labels of a run before and after."""
-
-    run: str
-    recording: str
-    before: str
-    after: str
-    change: Change
-
-
-@dataclass(frozen=True, kw_only=True)
 class JobChange:
     """One figure of a job over the recordings: mean harm, and the worst recording."""
 
@@ -105,14 +94,14 @@ class JobChange:
 class CompareResult:
     """Changes of figures, verdicts and jobs, regressions first.
 
-    jobs: over enough recordings; they then decide in place of the figures. differences: settings, versions and
-    inputs, before and after. only_before: not compared.
+    verdicts: run, recording, change, and labels before and after. jobs: over enough recordings; they then decide in
+    place of the figures. differences: settings, versions and inputs, before and after. only_before: not compared.
     """
 
     __repr__ = brief
 
     verdict: Verdict
-    verdicts: tuple[VerdictChange, ...]
+    verdicts: tuple[Mapping[str, str], ...]
     figures: tuple[FigureChange, ...]
     jobs: tuple[JobChange, ...]
     differences: Mapping[str, tuple[str, str]]
@@ -124,7 +113,7 @@ class CompareResult:
     def as_dict(self) -> dict[str, Any]:
         return {
             "metrics": dict(self.metrics),
-            "verdicts": [asdict(one) for one in self.verdicts],
+            "verdicts": list(self.verdicts),
             "figures": [
                 asdict(one) | {"share": one.share if math.isfinite(one.share) else None} for one in self.figures
             ],
@@ -203,8 +192,8 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
         "num_runs": len(pairs),
         "num_verdicts": sum(bool(old.outcome and new.outcome) for old, new in pairs),
         "num_figures": sum(one.better is not Better.NEITHER for one in found),
-        "num_verdicts_worse": sum(one.change is Change.WORSE for one in verdicts),
-        "num_verdicts_better": sum(one.change is Change.BETTER for one in verdicts),
+        "num_verdicts_worse": sum(one["change"] is Change.WORSE for one in verdicts),
+        "num_verdicts_better": sum(one["change"] is Change.BETTER for one in verdicts),
         "num_worse": len(alone) + sum(one.change is Change.WORSE for one in jobs),
         "num_better": sum(one.change is Change.BETTER for one in found),
     }
@@ -257,12 +246,18 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
     )
 
 
-def _verdict_change(old: JudgedRun, new: JudgedRun) -> VerdictChange | None:
+def _verdict_change(old: JudgedRun, new: JudgedRun) -> dict[str, str] | None:
     is_other = old.is_green != new.is_green
     if not is_other and (old.outcome, old.label) == (new.outcome, new.label):
         return None
     change = Change.OTHER if not is_other else Change.WORSE if old.is_green else Change.BETTER
-    return VerdictChange(run=new.name, recording=new.recording, before=old.label, after=new.label, change=change)
+    return {
+        "run": new.name,
+        "recording": new.recording,
+        "before": old.label,
+        "after": new.label,
+        "change": change,
+    }
 
 
 def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
@@ -321,20 +316,21 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
         )
 
 
-def _of_verdicts(verdicts: Sequence[VerdictChange], after: Judged) -> Iterator[Reason]:
+def _of_verdicts(verdicts: Sequence[Mapping[str, str]], after: Judged) -> Iterator[Reason]:
     for one in verdicts:
-        words = f"{one.run}: the verdict went from '{one.before}' to '{one.after}'"
-        if one.change is not Change.WORSE:
-            better = ", an improvement" if one.change is Change.BETTER else ""
-            yield note(criterion=f"verdict of {one.run}", sentence=words + better)
+        name = f"verdict of {one['run']}"
+        words = f"{one['run']}: the verdict went from '{one['before']}' to '{one['after']}'"
+        if one["change"] is not Change.WORSE:
+            better = ", an improvement" if one["change"] is Change.BETTER else ""
+            yield note(criterion=name, sentence=words + better)
             continue
-        why = next((reason for reason in after.runs[one.run].reasons if reason["outcome"] != "passed"), None)
+        why = next((reason for reason in after.runs[one["run"]].reasons if reason["outcome"] != "passed"), None)
         yield failed(
-            criterion=f"verdict of {one.run}",
+            criterion=name,
             sentence=words if why is None else f"{words}: {why['criterion']}: {why['sentence']}",
             time_s=None if why is None else why["time_s"],
             place=None if why is None or why["place"] is None else tuple(why["place"]),
-            who=one.recording,
+            who=one["recording"],
             cause="" if why is None else why["cause"],
             remedy="" if why is None else why["remedy"],
             label=REGRESSION,

@@ -1,13 +1,12 @@
 """A query: answers of a field or scene at points of a table."""
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -243,7 +242,7 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
 
     Raises SplatCtrlError, leaving no file, for an unreadable source or table.
     """
-    stopwatch, figures = Stopwatch(), _Figures()
+    stopwatch, figures = Stopwatch(), list[dict[str, Any]]()
     with ExitStack() as stack:
         out: TextIO | None = None
         if request.out is not None:
@@ -258,14 +257,15 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
                     answers = asked.at(points)
                 except DeviceError as error:
                     raise named(error, asked.device) from error
-                figures.add(answers)
+                figures.append(_figures_of(answers))
                 if out is not None:
                     out.write(rows_of(points, answers))
+    metrics = _metrics_of(figures)
     return QueryResult(
         out=request.out,
         kind=asked.kind,
-        metrics=figures.metrics(),
-        notes=figures.notes(asked),
+        metrics=metrics,
+        notes=_notes_of(asked, metrics),
         seconds=stopwatch.seconds,
     )
 
@@ -362,52 +362,50 @@ def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
                 wait.at(raw.tell())
 
 
-class _Figures:
-    def __init__(self) -> None:
-        self._num = Counter[str]()
-        self._sum, self._least, self._least_bound = 0.0, np.inf, np.inf
-        self._knows_seen = True
+def _figures_of(answers: Answers) -> dict[str, Any]:
+    distance = answers.distance[~np.isnan(answers.distance)]
+    bounds = distance[:0] if answers.bound is None else answers.bound[~np.isnan(answers.bound)]
+    is_seen_known = answers.observed is not None
+    return {
+        "num_points": len(answers.distance),
+        "num_answered": len(distance),
+        "num_outside": 0 if answers.in_box is None else int(np.count_nonzero(~answers.in_box)),
+        "num_in_collision": int(np.count_nonzero(distance <= 0)),
+        "num_never_seen": int(np.count_nonzero(answers.observed == VoxelState.NEVER_SEEN)) if is_seen_known else None,
+        "sum": float(distance.sum()),
+        "min_distance": float(distance.min(initial=np.inf)),
+        "min_bound": float(bounds.min(initial=np.inf)),
+    }
 
-    def add(self, answers: Answers) -> None:
-        distance = answers.distance[~np.isnan(answers.distance)]
-        bounds = distance[:0] if answers.bound is None else answers.bound[~np.isnan(answers.bound)]
-        self._num.update(
-            points=len(answers.distance),
-            answered=len(distance),
-            in_collision=int(np.count_nonzero(distance <= 0)),
-            outside=0 if answers.in_box is None else int(np.count_nonzero(~answers.in_box)),
-            never_seen=int(np.count_nonzero(answers.observed == VoxelState.NEVER_SEEN)),
+
+def _metrics_of(figures: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+    """Metrics over the blocks of a table."""
+    counts = ("num_points", "num_answered", "num_outside", "num_in_collision")
+    num: dict[str, float | None] = {name: sum(each[name] for each in figures) for name in counts}
+    seen = [each["num_never_seen"] for each in figures]
+    least = {name: min((each[name] for each in figures), default=np.inf) for name in ("min_distance", "min_bound")}
+    num_answered = num["num_answered"]
+    return {
+        **num,
+        "num_never_seen": None if None in seen else sum(seen),
+        "min_distance": least["min_distance"] if num_answered else None,
+        "mean_distance": sum(each["sum"] for each in figures) / num_answered if num_answered else None,
+        "min_bound": least["min_bound"] if np.isfinite(least["min_bound"]) else None,
+    }
+
+
+def _notes_of(asked: _Asked, metrics: Mapping[str, float | None]) -> tuple[str, ...]:
+    num, notes = {name: int(value or 0) for name, value in metrics.items() if name.startswith("num_")}, []
+    if num["num_outside"] and asked.box is not None:
+        lower, upper = (", ".join(f"{x:.4g}" for x in corner) for corner in (asked.box.lower, asked.box.upper))
+        place = f"outside the box ({lower}) to ({upper}) m of the {asked.kind.partition(' ')[0]}"
+        what = "have no distance; bake a larger --box" if asked.is_grid else "were never seen; ask inside it"
+        notes.append(f"{num['num_outside']} of {num['num_points']} points lie {place} and {what}")
+    if blank := num["num_points"] - num["num_answered"] - (num["num_outside"] if asked.is_grid else 0):
+        notes.append(f"{blank} points lie next to unseen cells, baked as nan, and have no distance")
+    if num["num_never_seen"]:
+        notes.append(
+            f"{num['num_never_seen']} of {num['num_points']} points are where no camera looked: nothing is known of"
+            " obstacles there; scan it, or count it as an obstacle (sdf-bake --unknown obstacle)"
         )
-        self._knows_seen &= answers.observed is not None
-        self._sum += float(distance.sum())
-        self._least = min(self._least, float(distance.min(initial=np.inf)))
-        self._least_bound = min(self._least_bound, float(bounds.min(initial=np.inf)))
-
-    def metrics(self) -> dict[str, float | None]:
-        num = self._num
-        return {
-            "num_points": num["points"],
-            "num_answered": num["answered"],
-            "num_outside": num["outside"],
-            "num_in_collision": num["in_collision"],
-            "num_never_seen": num["never_seen"] if self._knows_seen else None,
-            "min_distance": self._least if num["answered"] else None,
-            "mean_distance": self._sum / num["answered"] if num["answered"] else None,
-            "min_bound": self._least_bound if np.isfinite(self._least_bound) else None,
-        }
-
-    def notes(self, asked: _Asked) -> tuple[str, ...]:
-        num, notes = self._num, []
-        if num["outside"] and asked.box is not None:
-            lower, upper = (", ".join(f"{x:.4g}" for x in corner) for corner in (asked.box.lower, asked.box.upper))
-            place = f"outside the box ({lower}) to ({upper}) m of the {asked.kind.partition(' ')[0]}"
-            what = "have no distance; bake a larger --box" if asked.is_grid else "were never seen; ask inside it"
-            notes.append(f"{num['outside']} of {num['points']} points lie {place} and {what}")
-        if blank := num["points"] - num["answered"] - (num["outside"] if asked.is_grid else 0):
-            notes.append(f"{blank} points lie next to unseen cells, baked as nan, and have no distance")
-        if self._knows_seen and num["never_seen"]:
-            notes.append(
-                f"{num['never_seen']} of {num['points']} points are where no camera looked: nothing is known of"
-                " obstacles there; scan it, or count it as an obstacle (sdf-bake --unknown obstacle)"
-            )
-        return tuple(notes)
+    return tuple(notes)
