@@ -42,7 +42,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     request = request_of(BatchRequest, args, workers=workers)
     command_line = OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1))
     if args.list or args.where or args.failed or args.csv is not None:
-        return _listed(console, args, request, command_line)
+        return _list_runs(console, args, request, command_line)
     if args.dry_run:
         planned_nodes = dry_run(request, command_line)
         rows = [(node.name, state, ", ".join(node.needs) or "-") for node, state in planned_nodes]
@@ -187,7 +187,7 @@ def _cell(run: Run | None) -> str:
     return word if run.state == DONE else f"{word.upper()} !" if run.state == FAILED else run.state.upper()
 
 
-def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
+def _list_runs(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
     folder, order = request.suite, dict[str, int]()
     if not folder.is_dir():
         _, nodes, folder = planned(request, command_line)

@@ -69,11 +69,11 @@ def _needs(report: CheckReport) -> Iterator[str]:
 def run_info(args: argparse.Namespace, console: Console) -> int:
     """Print facts and tables, and what a reconstruction lacks."""
     summary = describe(args.path, source_options(args))
-    lines = _described(summary, is_long=args.verbose > 0)
+    lines = _describe(summary, is_long=args.verbose > 0)
     return console.result(summary.as_dict(), lines, code=DAMAGED if summary.damaged else 0)
 
 
-def _described(summary: Summary, *, is_long: bool) -> Iterator[str]:
+def _describe(summary: Summary, *, is_long: bool) -> Iterator[str]:
     yield f"{summary.path}: {summary.kind}"
     yield from _facts(summary.facts, "  ")
     for grid in summary.grids:

@@ -93,7 +93,7 @@ def numbers(text: str) -> tuple[float, ...]:
     return values
 
 
-def _listed(name: str, text: str) -> str:
+def _split_list(name: str, text: str) -> str:
     """Strip a comma list, for argparse. Raises UsageError if empty."""
     names = _names(text)
     if not names:
@@ -203,10 +203,12 @@ DEVICE = of_run(
 )
 GATES = option("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
 HOLDOUT = option(
-    "--holdout 0,6", "keep frames of an image folder for judging, as camera holdout", partial(_listed, "--holdout")
+    "--holdout 0,6",
+    "keep frames of an image folder for judging, as camera holdout",
+    partial(_split_list, "--holdout"),
 )
 SOURCE = (  # the options of a source, all but --cameras in a group of their own
-    option("--cameras A,B", "only these cameras", partial(_listed, "--cameras")),
+    option("--cameras A,B", "only these cameras", partial(_split_list, "--cameras")),
     group(
         "input",
         option("--camera NAME=COLOR,DEPTH[,INFO] ...", "topics of a camera, instead of those found"),

@@ -71,7 +71,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
     """Print an error on stderr (with --json on stdout); return line and exit code."""
-    message, remedy, code = _told(error)
+    message, remedy, code = _explain(error)
     if code == INTERRUPTED and remedy.endswith(RESUME):
         goes_on = shlex.join([words[0], RESUME, *(word for word in words[1:] if word != RESUME)])
         remedy = f"continue it with: splatctrl {goes_on}"
@@ -87,7 +87,7 @@ def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbo
     return line, code
 
 
-def _told(error: BaseException) -> tuple[str, str, int]:
+def _explain(error: BaseException) -> tuple[str, str, int]:
     match error:
         case SplatCtrlError():
             return error.message, error.remedy, error.exit_code

@@ -213,19 +213,19 @@ def invocation(action: argparse.Action) -> str:
 
 def real(low: float, high: float, unit: str = "") -> Callable[[str], float]:
     """Parser of a number in [low, high]."""
-    return _bounded(float, Within(low, high, unit, ""))
+    return _parse_within(float, Within(low, high, unit, ""))
 
 
 def whole(low: int, high: int, unit: str = "") -> Callable[[str], int]:
     """Parser of a whole number in [low, high]."""
-    return _bounded(int, Within(low, high, unit, ""))
+    return _parse_within(int, Within(low, high, unit, ""))
 
 
 def setting(section: type[Section], key: str) -> Callable[[str], float]:
     """Parser of a configuration key's number: its type and range."""
     declared = section.declared[key]
     assert isinstance(declared, Within)
-    return _bounded(int if type(getattr(section, key)) is int else float, declared)
+    return _parse_within(int if type(getattr(section, key)) is int else float, declared)
 
 
 def words(section: type[Section], key: str) -> tuple[str, ...]:
@@ -244,7 +244,7 @@ def several(text: str) -> tuple[float, ...]:
     return values if all(abs(value) <= MAX_PLACE for value in values) else ()
 
 
-def _bounded(kind: Callable[[str], T], declared: Within) -> Callable[[str], T]:
+def _parse_within(kind: Callable[[str], T], declared: Within) -> Callable[[str], T]:
     def parse(text: str) -> T:
         what = f"expected {'a whole number, ' if kind is int else ''}{declared.expected}, got {shown(text)}"
         try:

@@ -41,13 +41,16 @@ def _lines(result: QueryResult) -> list[str]:
     num = result.metrics["num_points"] or 0
     rate = f"{num / max(result.seconds['answer'], 1e-9):,.0f} points/s"  # of fewer points it says nothing
     return [
-        *table((result.kind, ""), [(name.replace("_", " "), _shown(name, v)) for name, v in result.metrics.items()]),
+        *table(
+            (result.kind, ""),
+            [(name.replace("_", " "), _format_figure(name, v)) for name, v in result.metrics.items()],
+        ),
         *(f"note: {note}" for note in result.notes),
         *remarks((rate, num >= 1000), (f"wrote {result.out}", result.out)),
     ]
 
 
-def _shown(name: str, value: float | None) -> str:
+def _format_figure(name: str, value: float | None) -> str:
     if value is None:
         return "-"
     return f"{value:.0f}" if name.startswith("num_") else f"{value * 1e3:.1f} mm"

@@ -28,11 +28,11 @@ LEARNED = ("num_pixels", "num_configurations", "area", "outside_95", "outside_mo
 def run_spheres(args: argparse.Namespace, console: Console) -> int:
     limits = {} if args.max_spheres or args.max_protrusion else {"max_spheres": DEFAULT_SPHERES}
     fit = request_of(FitOptions, args, **limits)
-    return _concluded(console, fit_robot(request_of(RobotRequest, args, fit=fit), console))
+    return _conclude(console, fit_robot(request_of(RobotRequest, args, fit=fit), console))
 
 
 def run_check(args: argparse.Namespace, console: Console) -> int:
-    return _concluded(console, check_robot(request_of(RobotRequest, args)))
+    return _conclude(console, check_robot(request_of(RobotRequest, args)))
 
 
 def run_pairs(args: argparse.Namespace, console: Console) -> int:
@@ -116,7 +116,7 @@ def _learned_row(part: LearnedLink) -> tuple[object, ...]:
     return part.link, part.num_pixels, part.num_configurations, f"{1e4 * part.area:.0f}", *outside, place, since
 
 
-def _concluded(console: Console, result: CoverageResult) -> int:
+def _conclude(console: Console, result: CoverageResult) -> int:
     """Print a coverage by link, and its verdict."""
     report = result.report
     unclosed = (

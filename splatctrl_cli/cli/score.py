@@ -80,7 +80,7 @@ def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
     rows += [[s, one["metrics"]["num_views"], *_cells(columns, one["metrics"])] for s, one in scans.items()]
     header = ("scan", "views") if scans else ("view", "stamp [s]")
     num = metrics["num_views"] if scans else "-"
-    yield from _with_mean(header, columns, rows, [f"mean of {len(rows)}", num], metrics)
+    yield from _add_mean(header, columns, rows, [f"mean of {len(rows)}", num], metrics)
     yield from ("", *_protocol_lines(report["protocol"]))
     if views:
         yield (
@@ -103,7 +103,7 @@ def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _with_mean(
+def _add_mean(
     header: Sequence[str],
     columns: Sequence[str],
     rows: Sequence[Sequence[Any]],

@@ -89,7 +89,7 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
     """
     given: dict[str, dict[str, Any]] = {}
     for where, section, values in _tables(path, assignments):
-        given.setdefault(section, {}).update(_typed(where, section, values))
+        given.setdefault(section, {}).update(_convert(where, section, values))
     default = Config()
     return replace(default, **{name: replace(getattr(default, name), **values) for name, values in given.items()})
 
@@ -121,7 +121,7 @@ def _is_preset(assignment: str) -> bool:
     return assignment.partition("=")[0].strip() == "preset"
 
 
-def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
+def _convert(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
     """Typed values. Raises UsageError for unknown keys or types."""
     kind = type(getattr(Config(), section))
     assert issubclass(kind, Section)
@@ -129,7 +129,7 @@ def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
     typed: dict[str, Any] = {}
     for key, value in values.items():
         _check_known(key, declared, where, f"{section}.")
-        typed[key] = _of_type(value, hints[key])
+        typed[key] = _has_type(value, hints[key])
         if type(typed[key]) not in [get_origin(option) or option for option in _options(hints[key])]:
             expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
             expected += declared[key].expected
@@ -171,13 +171,13 @@ def _options(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
 
 
-def _of_type(value: Any, hint: Any) -> Any:
+def _has_type(value: Any, hint: Any) -> Any:
     """The value; integers to floats, lists to tuples, by type."""
     options = _options(hint)
     if str in options and isinstance(value, float) and math.isnan(value):
         return "nan"  # a word here, which TOML takes for a number
     if isinstance(value, list) and tuple[float, ...] in options:
-        numbers = tuple(_of_type(item, float) for item in value)
+        numbers = tuple(_has_type(item, float) for item in value)
         return numbers if all(type(number) is float for number in numbers) else value
     if float in options and type(value) is int and abs(value) < 1 << 1023:  # what a float holds
         return float(value)
@@ -238,7 +238,7 @@ def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Se
 
 def toml_of(settings: Sequence[Setting]) -> Iterator[str]:
     """TOML lines of every key; changed ones with source and default."""
-    for section, setting in _with_sections(settings):
+    for section, setting in _add_headers(settings):
         yield from section
         changed = f"  # {setting.source} (default: {toml_value(setting.default)})"
         yield f"{setting.key} = {toml_value(setting.value)}" + ("" if setting.source == DEFAULT else changed)
@@ -246,7 +246,7 @@ def toml_of(settings: Sequence[Setting]) -> Iterator[str]:
 
 def template_of(settings: Sequence[Setting]) -> Iterator[str]:
     """TOML lines of every default as a comment, with meaning and range."""
-    for section, setting in _with_sections(settings):
+    for section, setting in _add_headers(settings):
         yield from section
         yield f"# {setting.declared.reason}; {setting.declared.expected}"
         yield f"# {setting.key} = {toml_value(setting.default)}"
@@ -258,7 +258,7 @@ def toml_value(value: Value) -> str:
     return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
-def _with_sections(settings: Sequence[Setting]) -> Iterator[tuple[list[str], Setting]]:
+def _add_headers(settings: Sequence[Setting]) -> Iterator[tuple[list[str], Setting]]:
     before = ""
     for setting in settings:
         blank = [""] if before else []

@@ -82,7 +82,7 @@ class Section:
     def __init_subclass__(cls, *, section: str) -> None:
         """Raises TypeError for a key without a range."""
         hints = get_type_hints(cls, include_extras=True)
-        cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
+        cls.section, cls.declared = section, {key: _declare(hints[key]) for key in cls.__annotations__}
 
     derived = copy_unchecked
 
@@ -96,7 +96,7 @@ class Section:
             check(least <= most, f"{self.section}.{low}", expected, least)
 
 
-def _declared(hint: Any) -> Declared:
+def _declare(hint: Any) -> Declared:
     for note in get_args(hint)[1:]:
         if isinstance(note, Within | OneOf):
             return note

@@ -288,7 +288,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)
-    cells, num_in_reach = _drawn_cells(
+    cells, num_in_reach = _draw_cells(
         grid, mesh.vertices.min(axis=0) - REACH, mesh.vertices.max(axis=0) + REACH, max_points, seed
     )
     drawn = np.ravel_multi_index(tuple(cells.T), grid.channels["sdf"].shape)
@@ -323,7 +323,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     }
 
 
-def _drawn_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
+def _draw_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
     """Sampled cells (C, 3), in order, of those in a box, and their number."""
     shape = np.array(grid.channels["sdf"].shape)
     first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)

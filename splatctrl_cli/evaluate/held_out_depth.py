@@ -212,7 +212,7 @@ def compare_with_held_out_depth(
     """
     distances = grid_distances(grid)
     box = Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1))
-    measured, eyes, num_edges = _measured(frames, counted, Box(lower=box.lower - REACH, upper=box.upper + REACH))
+    measured, eyes, num_edges = _measure(frames, counted, Box(lower=box.lower - REACH, upper=box.upper + REACH))
     if not box.contains(measured).any():
         raise NotEvaluableError(
             f"held-out depth: no pixel of {len(frames)} frames shows a point in the grid",
@@ -224,8 +224,8 @@ def compare_with_held_out_depth(
     length = np.linalg.norm(ray, axis=1)
     back = np.minimum(rng.uniform(0.0, REACH, len(drawn)), length)
     points = measured[drawn] - (back / length)[:, None] * ray
-    at_surface = _interpolated(grid, distances, measured[drawn][box.contains(measured[drawn])])
-    values = _interpolated(grid, distances, points[box.contains(points)])
+    at_surface = _interpolate(grid, distances, measured[drawn][box.contains(measured[drawn])])
+    values = _interpolate(grid, distances, points[box.contains(points)])
     points = points[box.contains(points)]
     is_known = np.isfinite(values["sdf"])
     points, values = points[is_known], {name: value[is_known] for name, value in values.items()}
@@ -263,7 +263,7 @@ def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float
     return counted
 
 
-def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
+def _measure(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
     """Surface points (M, 3) in a box, their eyes, and the edges left out."""
     if counted is not None and [mask.shape for mask in counted] != [frame.depth.shape for frame in frames]:
         raise InputError(
@@ -297,7 +297,7 @@ def depth_edges(depth: NDArray[np.float32]) -> Bool:
     return is_edge
 
 
-def _interpolated(grid: DistanceGrid, distances: dict[str, GridDistance], points: Float64) -> dict[str, Float64]:
+def _interpolate(grid: DistanceGrid, distances: dict[str, GridDistance], points: Float64) -> dict[str, Float64]:
     points = np.ascontiguousarray(points)
     return {
         name: each.added
@@ -316,11 +316,11 @@ def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame])
     for share in fixed.FREE_PROBES:
         for direction in directions:
             asked = np.flatnonzero(is_free)
-            is_free[asked] = _seen_free(points[asked] + share * radius[asked, None] * direction, frames)
+            is_free[asked] = _find_seen_free(points[asked] + share * radius[asked, None] * direction, frames)
     return is_free
 
 
-def _seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
+def _find_seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
     """(Q,) True before, or just behind, a frame's measured depth."""
     is_free = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:

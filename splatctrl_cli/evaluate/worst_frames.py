@@ -98,7 +98,7 @@ def draw_sight(path: Path, moment: Moment, frame: RgbdFrame) -> None:
             picture,
             *(_pixel(point, frame.intrinsics, zoom) for point in (_surface(worst, obstacle, moment), obstacle)),
         )
-    if not cv2.imwrite(str(path), np.vstack([picture, _captioned(moment.caption, picture.shape[1])])):
+    if not cv2.imwrite(str(path), np.vstack([picture, _add_caption(moment.caption, picture.shape[1])])):
         raise WriteError(f"{path}: could not be written")
 
 
@@ -173,7 +173,7 @@ def _join(picture: UInt8, start: Float64, end: Float64) -> None:
         cv2.drawMarker(picture, b, color, cv2.MARKER_TILTED_CROSS, 16, thickness, cv2.LINE_AA)
 
 
-def _captioned(lines: Sequence[str], width: int) -> UInt8:
+def _add_caption(lines: Sequence[str], width: int) -> UInt8:
     strip = np.full((LINE_HEIGHT * len(lines) + 2 * EDGE, width, 3), PAPER, np.uint8)
     for number, line in enumerate(lines):
         (length, _), _ = cv2.getTextSize(line, FONT, FONT_SCALE, 1)

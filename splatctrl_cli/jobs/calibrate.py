@@ -123,7 +123,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
         progress.log(f"calibrate: {len(frames)} frames of {', '.join(evidence.cameras)}")
         start = Estimate(corrections={camera: np.eye(4) for camera in evidence.cameras})
         solution = solved(evidence, start, held)
-        unknown = _unobserved(solution)
+        unknown = _find_unobserved(solution)
         if any(unknown.values()):
             if not request.allow_unobserved:
                 raise _refusal(unknown, evidence)
@@ -251,7 +251,7 @@ def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool
     return (cameras[0],)
 
 
-def _unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
+def _find_unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
     evidence = solution.adjustment.evidence
     found = {}
     for camera in solution.adjustment.unknowns.poses:

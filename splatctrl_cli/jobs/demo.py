@@ -82,7 +82,7 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
                 words = [word.format(data=data, out=folder, threads=request.threads) for word in text.split()]
                 shown = [word.replace(str(folder), str(out)) for word in words]
                 progress.log(f"\n$ splatctrl {shlex.join(shown)}")
-                with _recorded_as(shown):
+                with _record_label(shown):
                     label = perform(words, folder)
                 reasons.append(_reason(words, expected, label))
                 progress.log(f"demo: {reasons[-1]}")
@@ -122,7 +122,7 @@ def _reason(words: Sequence[str], expected: str, label: str) -> Reason:
 
 
 @contextmanager
-def _recorded_as(words: Sequence[str]) -> Iterator[None]:
+def _record_label(words: Sequence[str]) -> Iterator[None]:
     """Set the arguments that run.json records."""
     arguments = sys.argv
     sys.argv = [arguments[0], *words]

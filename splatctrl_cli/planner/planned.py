@@ -125,7 +125,7 @@ def planned_path(
     path, num_proved, num_edges = None, 0, 0
     if min(margin, own) > 0:
         room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
-        outcome, way = _found(room, task, goals, approach, planner, control)
+        outcome, way = _find(room, task, goals, approach, planner, control)
         if outcome is PlanOutcome.SOLVED:
             path = timed(
                 way,
@@ -149,7 +149,7 @@ def planned_path(
     )
 
 
-def _found(
+def _find(
     room: Clearance, task: ReplayTask, goals: Float64, approach: float, planner: PlannerConfig, control: ControlConfig
 ) -> tuple[PlanOutcome, Float64]:
     last = [approach_to(room, task.frame, goal, approach, planner, control) for goal in goals]
@@ -181,7 +181,7 @@ def approach_to(
     for back in np.arange(fixed.APPROACH_STEP, length + 1e-9, fixed.APPROACH_STEP):
         T = T_world_goal.copy()
         T[:3, 3] -= back * T[:3, 2]
-        q = _solved(model, frame, T, way[0], control)
+        q = _solve(model, frame, T, way[0], control)
         if q is None or np.max(np.abs(q - way[0])) > fixed.APPROACH_TURN:
             break
         is_free = check_edges(room, q[None], way[0][None], contact=planner.contact).is_free[0]
@@ -233,7 +233,7 @@ def goal_postures(
     """
     found: list[Float64] = []
     for guess in guesses:
-        q = _solved(model, frame, T_world_goal, guess, config)
+        q = _solve(model, frame, T_world_goal, guess, config)
         if q is not None and all(np.max(np.abs(q - other)) > fixed.GOAL_DISTINCT for other in found):
             found.append(q)
         if len(found) == at_most:
@@ -241,7 +241,7 @@ def goal_postures(
     return np.array(found).reshape(-1, len(model.lower))
 
 
-def _solved(
+def _solve(
     model: RobotModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
 ) -> Float64 | None:
     """Levenberg's method with steps clipped at the limits; None without convergence."""

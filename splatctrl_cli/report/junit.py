@@ -131,11 +131,11 @@ def _case(name: str, group: str, reasons: Sequence[Mapping[str, Any]]) -> Case:
         group=group,
         kind=Kind(worst["outcome"]),
         sentence=f"{sentence}; and {more} more" if more else sentence,
-        text="\n\n".join(map(_told, ordered)),
+        text="\n\n".join(map(_explain, ordered)),
     )
 
 
-def _told(reason: Mapping[str, Any]) -> str:
+def _explain(reason: Mapping[str, Any]) -> str:
     unit = f" {reason['unit']}" if reason["unit"] else ""
     place = reason["place"]
     facts = {
@@ -269,12 +269,12 @@ def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping
     lines = []
     # GitHub shows ten of a level for a step
     for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:10]:
-        file = _in_repository(suite.path, environment)
+        file = _repository_path(suite.path, environment)
         properties = {**({"file": file} if file else {}), "title": f"{case.group}: {case.name} ({case.kind})"}
         given = ",".join(
-            f"{name}={_escaped(value).replace(':', '%3A').replace(',', '%2C')}" for name, value in properties.items()
+            f"{name}={_escape(value).replace(':', '%3A').replace(',', '%2C')}" for name, value in properties.items()
         )
-        lines.append(f"::{level} {given}::{_escaped(case.text)}")
+        lines.append(f"::{level} {given}::{_escape(case.text)}")
     return lines
 
 
@@ -313,7 +313,7 @@ def _cell(text: str) -> str:
     return " ".join(escaped.split()).encode("utf-8", "backslashreplace").decode()
 
 
-def _in_repository(path: str, environment: Mapping[str, str]) -> str:
+def _repository_path(path: str, environment: Mapping[str, str]) -> str:
     """The file's path in the repository, or ""."""
     workspace = environment.get("GITHUB_WORKSPACE", "")
     if not (path and workspace and Path(path).is_file()):
@@ -322,6 +322,6 @@ def _in_repository(path: str, environment: Mapping[str, str]) -> str:
     return real.relative_to(root).as_posix() if real.is_relative_to(root) else ""
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     """Text escaped as in actions/toolkit."""
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")

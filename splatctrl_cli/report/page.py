@@ -154,7 +154,7 @@ def three_js() -> str:
         script = page[page.index("<script>") + len("<script>") : page.index("var camera,controls")]
     except (OSError, KeyError, ValueError) as error:
         raise UsageError(f"three.js: not found in trimesh: {error}", remedy="pip install 'trimesh>=4.4,<6'") from None
-    return _deflated(script.encode("utf-8"))
+    return _deflate(script.encode("utf-8"))
 
 
 def packed(space: Space) -> str:
@@ -184,7 +184,7 @@ def packed(space: Space) -> str:
         if deciding.sphere is not None:
             center, radius = deciding.sphere
             header["deciding"] |= {"center": np.asarray(center).tolist(), "radius": radius}
-    return json.dumps({"header": header, "bytes": _deflated(block)}, allow_nan=False)
+    return json.dumps({"header": header, "bytes": _deflate(block)}, allow_nan=False)
 
 
 def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
@@ -238,7 +238,7 @@ def _mesh(block: bytearray, vertices: NDArray[np.floating], faces: NDArray[np.in
     return {"vertices": _points(block, vertices), "faces": _add(block, faces, np.uint32)}
 
 
-def _deflated(data: bytes | bytearray) -> str:
+def _deflate(data: bytes | bytearray) -> str:
     return base64.b64encode(zlib.compress(data)).decode("ascii")
 
 
@@ -318,7 +318,7 @@ def rendered(page: Page) -> str:
     environment.filters |= {
         "classed": lambda state: str(state).replace(" ", "-"),
         "scripted": lambda text: Markup(text.replace("<", "\\u003c")),
-        "shown": _shown,
+        "shown": _format_cell,
     }
     environment.tests["a_cell"] = lambda value: isinstance(value, Cell)
     parts = {
@@ -344,7 +344,7 @@ def picture(path: Path, title: str, most: int) -> Picture:
     return Picture(title=title, data=f"data:image/jpeg;base64,{text}", width=width, height=height)
 
 
-def _shown(cell: object) -> str:
+def _format_cell(cell: object) -> str:
     if cell is None or cell == "":
         return "-"
     return f"{cell:.4g}" if isinstance(cell, float) else str(cell)

@@ -176,7 +176,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
                 remove(path)
         with stopwatch.stage("bake"):
             try:
-                grid, changes = _baked(job, partial, progress)
+                grid, changes = _bake_grid(job, partial, progress)
             except DeviceError as error:
                 raise named(error, job.device, checkpoint) from error
             finally:
@@ -286,7 +286,7 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
     return chosen
 
 
-def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, Changes | None]:
+def _bake_grid(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, Changes | None]:
     baker, previous, source, config = job.baker, job.previous, job.source, job.request.config
     changes = kept = old = None
     if previous is not None:

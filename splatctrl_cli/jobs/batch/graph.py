@@ -80,8 +80,8 @@ def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
     nodes: list[Node] = []
     for recording in sorted(suite.recordings, key=lambda each: each.name):
         jobs = jobs_for(recording, suite.jobs, COMMANDS)
-        kept = {job.name: _with_roles(job, jobs, recording) for job in jobs}
-        nodes += _nodes_of(recording, _in_order(kept, recording), suite.folder, out, command_line)
+        kept = {job.name: _add_roles(job, jobs, recording) for job in jobs}
+        nodes += _nodes_of(recording, _sort_jobs(kept, recording), suite.folder, out, command_line)
     return nodes
 
 
@@ -98,13 +98,13 @@ def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[
     return sorted(job_of, key=lambda name: jobs.index(job_of[name]) if job_of[name] in jobs else len(jobs))
 
 
-def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
+def _add_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
     given = {*job.options, *job.matrix}
     given |= {"field", "lockstep"} & given and {"scene"}  # either stands for its scene
     roles = {option: role for option, role in ROLES[job.command].items() if option not in given}
     if job.command in {"reconstruct", "score"} and "dtu" in given:
         roles = {option: role for option, role in roles.items() if option == "scene"}
-    filled = {option: _filled(job, role, jobs, recording) for option, role in roles.items()}
+    filled = {option: _fill(job, role, jobs, recording) for option, role in roles.items()}
     return replace(job, options={**filled, **job.options})
 
 
@@ -112,7 +112,7 @@ def _where(job: Job, recording: Recording) -> str:
     return f"[jobs.{job.name}] of {recording.name}"
 
 
-def _filled(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
+def _fill(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
     where = _where(job, recording)
     makers = [other.name for other in jobs if other.command == role and other.name != job.name]
     if len(makers) > 1:
@@ -123,7 +123,7 @@ def _filled(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> s
     return f"{{{makers[0] if makers else RECORDING}}}"
 
 
-def _in_order(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
+def _sort_jobs(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
     needs = {name: _needs(job, jobs, recording) for name, job in jobs.items()}
     try:
         TopologicalSorter(needs).prepare()
@@ -162,7 +162,7 @@ def _nodes_of(
     for job, needs in jobs:
         made[job.name] = []
         for before in itertools.product(*(made[name] for name in needs)):
-            inherited = _joined([node.variant for node in before])
+            inherited = _join([node.variant for node in before])
             if inherited is None:
                 continue
             for picked in itertools.product(*job.matrix.values()):
@@ -177,7 +177,7 @@ def _nodes_of(
                     RECORDING: [str(path) for path in recording.paths],
                     NAME: recording.name,
                 }
-                options = _placed(_merged(job.options, chosen), values.__getitem__)
+                options = _fill_places(_merge(job.options, chosen), values.__getitem__)
                 options |= {} if its is None else {"out": str(its), "force": True, "resume": True}
                 try:
                     words, read = command_line.parsed(job.command, options, folder)
@@ -243,7 +243,7 @@ def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
     return found
 
 
-def _joined(variants: Sequence[Variant]) -> Variant | None:
+def _join(variants: Sequence[Variant]) -> Variant | None:
     """Union of variants; None if two choose differently."""
     joined: dict[str, Any] = {}
     for variant in variants:
@@ -252,7 +252,7 @@ def _joined(variants: Sequence[Variant]) -> Variant | None:
     return joined
 
 
-def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
+def _merge(options: Table, chosen: Variant) -> dict[str, Any]:
     """Add matrix choices to options; ``set.SECTION.KEY`` and ``perturb.NAME`` add an entry to their table."""
     merged = dict(options)
     for key, value in chosen.items():
@@ -265,14 +265,14 @@ def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
     return merged
 
 
-def _placed(value: Any, filled: Callable[[str], Any]) -> Any:
+def _fill_places(value: Any, filled: Callable[[str], Any]) -> Any:
     """Fill each {place}; a text that is one place becomes its value, even a list."""
     if isinstance(value, str):
         alone = _PLACE.fullmatch(value)
         return filled(alone[1]) if alone else _PLACE.sub(lambda match: _one(filled(match[1])), value)
     if isinstance(value, Mapping):
-        return {key: _placed(each, filled) for key, each in value.items()}
-    return [_placed(each, filled) for each in value] if isinstance(value, list) else value
+        return {key: _fill_places(each, filled) for key, each in value.items()}
+    return [_fill_places(each, filled) for each in value] if isinstance(value, list) else value
 
 
 def _one(value: Any) -> str:

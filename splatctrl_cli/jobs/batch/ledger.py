@@ -102,11 +102,11 @@ class Ledger(AbstractContextManager["Ledger"]):
         self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
         self._lock: TextIO | None = None
         try:
-            self._base = self._opened()
+            self._base = self._open()
         except sqlite3.DatabaseError as error:
             raise InputError(f"{self.path}: is no ledger: {error}", remedy="move it away; outputs stay") from None
 
-    def _opened(self) -> sqlite3.Connection:
+    def _open(self) -> sqlite3.Connection:
         base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
         base.row_factory = sqlite3.Row
         version = int(base.execute("PRAGMA user_version").fetchone()[0])

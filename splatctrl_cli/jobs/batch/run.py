@@ -56,11 +56,11 @@ class Scheduler:
                     break
                 if any(need not in self.runs for need in node.needs):
                     continue
-                run = self._without_running(node, self.keys[node.name], latest.get(node.name))
+                run = self._reuse_run(node, self.keys[node.name], latest.get(node.name))
                 if run is not None:
                     self._settle(waiting.pop(node.name), run, clock)
                 elif self.ledger.claim(node.name):
-                    run = self._without_running(
+                    run = self._reuse_run(
                         node, self.keys[node.name], next(self.ledger.runs([f"node={node.name}"]), None)
                     )
                     if run is not None:
@@ -107,7 +107,7 @@ class Scheduler:
                 self._settle(node, run, clock)
         return {node.name: self.runs[node.name] for node in nodes}
 
-    def _without_running(self, node: Node, key: str, before: Run | None) -> Run | None:
+    def _reuse_run(self, node: Node, key: str, before: Run | None) -> Run | None:
         """The run that stands: earlier, unrecorded, or skipped for a missing need."""
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:
@@ -122,7 +122,7 @@ class Scheduler:
         # both stamps are empty after an expected error
         if before is not None and is_same and (node.out is None or before.stamp == stamp_of(node.out)):
             self.num_kept += 1
-            judged = _judged_again(before, node)
+            judged = _judge_again(before, node)
             if judged != before:
                 self.ledger.record(judged)
             return judged
@@ -178,10 +178,10 @@ def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
         version=__version__,
         host=socket.gethostname(),
     )
-    return _judged_again(run, node)
+    return _judge_again(run, node)
 
 
-def _judged_again(run: Run, node: Node) -> Run:
+def _judge_again(run: Run, node: Node) -> Run:
     if run.cause:
         return replace(run, state=ERROR)
     is_expected = node.expect in {run.label, run.outcome, f"exit {run.exit_code}"}

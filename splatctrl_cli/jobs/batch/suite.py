@@ -87,7 +87,7 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     name = _worded(path.name, "name", document.get("name", path.stem))
     jobs = tuple(_job(key, table, commands) for key, table in _tables(path.name, document, "jobs").items())
     tables = _list(path.name, document, "recordings")
-    recordings = _named([one for table in tables for one in _recordings(folder, table)])
+    recordings = _check_names([one for table in tables for one in _recordings(folder, table)])
     if not jobs or not recordings:
         lacking = "the first" if jobs else "the second"
         raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {lacking}")
@@ -115,11 +115,11 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     where = f"[jobs.{name}]"
     if not isinstance(table, Mapping):
         raise UsageError(f"{where}: expected a table, got {shown(table)}")
-    _checked_name(where, name)
+    _check_name(where, name)
     command = _worded(where, "command", table.get("command", base.command if base else name))
     if command not in commands:
         raise UsageError(
-            f"{where}: no job is called {command!r}", remedy=_near(command, commands, "give command = one of")
+            f"{where}: no job is called {command!r}", remedy=_suggest(command, commands, "give command = one of")
         )
     own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
     if own is not None:
@@ -130,7 +130,7 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     expect = _worded(where, "expect", table.get("expect", base.expect if base else "passed"))
     if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
         raise UsageError(
-            f"{where} expect: no verdict is called {expect!r}", remedy=_near(expect, (*EXPECTED, "exit N"))
+            f"{where} expect: no verdict is called {expect!r}", remedy=_suggest(expect, (*EXPECTED, "exit N"))
         )
     limits = base.limits if base else Limits()
     return Job(
@@ -156,7 +156,9 @@ def _recordings(folder: Path, table: Table) -> list[Recording]:
     if ("paths" in table) == ("session" in table):
         raise UsageError(f"{where}: expected paths or session, and not both")
     key = "paths" if "paths" in table else "session"
-    paths = list(dict.fromkeys(path for each in _list(where, table, key) for path in _found(folder, where, each)))
+    paths = list(
+        dict.fromkeys(path for each in _list(where, table, key) for path in _find_files(folder, where, each))
+    )
     name = _worded(where, "name", table.get("name", ""))
     if name and key == "paths" and len(paths) > 1:
         raise UsageError(f"{where} name = {name!r}: {len(paths)} recordings match", remedy="leave the name out")
@@ -165,18 +167,18 @@ def _recordings(folder: Path, table: Table) -> list[Recording]:
     return [Recording(name=name, paths=files, only=only, overrides=jobs) for files in each]
 
 
-def _found(folder: Path, where: str, pattern: object) -> list[Path]:
+def _find_files(folder: Path, where: str, pattern: object) -> list[Path]:
     places = sorted(glob.glob(_worded(where, "paths", pattern), root_dir=folder, recursive=True))  # noqa: PTH207
     if not places:
         raise InputError(f"{where}: nothing matches {pattern!r} in {folder}", remedy="check the pattern")
     return [folder / place for place in places]
 
 
-def _named(recordings: Sequence[Recording]) -> list[Recording]:
+def _check_names(recordings: Sequence[Recording]) -> list[Recording]:
     """Name the recordings by file, with as many folders, or the ending, as distinguish them."""
     files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
-    beside = Counter(map(_without_ending, set(files)))
-    places = [path if beside[_without_ending(path)] > 1 else _without_ending(path) for path in files]
+    beside = Counter(map(_strip_ending, set(files)))
+    places = [path if beside[_strip_ending(path)] > 1 else _strip_ending(path) for path in files]
     # a common name gets the folder's in front
     own = [
         f"{p.parent.name}-{p.name}" if p.name in ("log", "capture", "recording", "data") else p.name for p in places
@@ -193,14 +195,14 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
     return [replace(each, name=name) for each, name in zip(recordings, names, strict=True)]
 
 
-def _without_ending(path: Path) -> Path:
+def _strip_ending(path: Path) -> Path:
     return path.with_suffix("") if path.suffix in (".mcap", ".bag", ".db3", ".toml", ".capture") else path
 
 
 def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> None:
     by_name: dict[str, Recording] = {}
     for recording in recordings:
-        _checked_name("[[recordings]] name", recording.name)
+        _check_name("[[recordings]] name", recording.name)
         other = by_name.setdefault(recording.name, recording)
         if other is not recording:
             both = f"{other.paths[0]} and {recording.paths[0]}"
@@ -210,23 +212,23 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> N
             )
         for job in recording.only:
             if job not in jobs:
-                raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_near(job, jobs))
+                raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_suggest(job, jobs))
         for job in recording.overrides:
             if job not in (recording.only or jobs):
-                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_near(job, jobs))
+                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_suggest(job, jobs))
 
 
 def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:
     for key in table:
         if key not in known:
-            raise UsageError(f"{where}: unknown key {key!r}", remedy=_near(key, known))
+            raise UsageError(f"{where}: unknown key {key!r}", remedy=_suggest(key, known))
 
 
-def _near(word: str, known: Sequence[str], otherwise: str = "known here") -> str:
+def _suggest(word: str, known: Sequence[str], otherwise: str = "known here") -> str:
     return did_you_mean(word, known, f"{otherwise}: {', '.join(known)}")
 
 
-def _checked_name(where: str, name: str) -> None:
+def _check_name(where: str, name: str) -> None:
     if not re.fullmatch(r"\w[\w.+-]*", name):
         raise UsageError(f"{where}: {name!r} is no name of a folder", remedy="use letters, digits, . _ + -")
 

@@ -81,7 +81,7 @@ def run_task(task: Task) -> End:
     for _ in range(2):
         runner = getattr(_local, "runner", None)
         if runner is None or runner.poll() is not None:
-            runner = _local.runner = _started(task.entry)
+            runner = _local.runner = _start(task.entry)
         assert runner.stdin is not None and runner.stdout is not None
         try:
             runner.stdin.write(json.dumps(asdict(task)) + "\n")
@@ -143,7 +143,7 @@ def last_lines(log: Path, number: int = 5) -> list[str]:
     return [line for line in lines if line.strip()][-number:]
 
 
-def _started(entry: str) -> "subprocess.Popen[str]":
+def _start(entry: str) -> "subprocess.Popen[str]":
     words = [sys.executable, "-m", __name__, entry]
     told = {name: value for name, value in os.environ.items() if name not in BY_THE_BATCH}
     environment = {**told, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

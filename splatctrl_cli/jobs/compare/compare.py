@@ -145,7 +145,7 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
     after = read_judged(request.runs[-1])
     before = read_baseline(request.against) if request.against is not None else read_judged(request.runs[0])
     _check_alike(before, after)
-    result = _compared(before, after)
+    result = _compare(before, after)
     if request.update_baseline is not None:
         write_baseline(request.update_baseline, after)
         progress.log(f"wrote {request.update_baseline}")
@@ -161,7 +161,7 @@ def _check_alike(before: Judged, after: Judged) -> None:
         raise InputError(f"{after.path}: expected a run of {expected}, as {before.path} is, got one of {got}")
     common = [name for name in before.runs if name in after.runs]
     if not common:
-        expected, got = (_named([*judged.runs]) or "none" for judged in (before, after))
+        expected, got = (_list_names([*judged.runs]) or "none" for judged in (before, after))
         raise InputError(
             f"{after.path}: expected some of the runs of {before.path} ({expected}), got {got}",
             remedy="compare runs of the same recordings",
@@ -173,12 +173,12 @@ def _check_alike(before: Judged, after: Judged) -> None:
         lost = sorted(old.metrics.keys() - new.metrics.keys())
         if before.is_baseline and new.outcome and lost:
             raise InputError(
-                f"{before.path}: {name}: has figures that this run has not: {_named(lost)}",
+                f"{before.path}: {name}: has figures that this run has not: {_list_names(lost)}",
                 remedy="run it with the options of then, or write the baseline anew with --update-baseline",
             )
 
 
-def _compared(before: Judged, after: Judged) -> CompareResult:
+def _compare(before: Judged, after: Judged) -> CompareResult:
     pairs = [(old, after.runs[name]) for name, old in before.runs.items() if name in after.runs]
     only_before = tuple(sorted(before.runs.keys() - after.runs.keys()))
     verdicts = [change for old, new in pairs if (change := _verdict_change(old, new)) is not None]
@@ -198,8 +198,8 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
         "num_better": sum(one.change is Change.BETTER for one in found),
     }
     weighed = [
-        *((-one.share, one.metric, _of_figure(one, after.kind)) for one in alone),
-        *((-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE),
+        *((-one.share, one.metric, _figure_reason(one, after.kind)) for one in alone),
+        *((-one.worst.share, one.metric, _job_reason(one)) for one in jobs if one.change is Change.WORSE),
     ]
     ordered = sorted(weighed, key=lambda one: one[:2])
     single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
@@ -207,7 +207,7 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
     notes = {
         "single recordings": [f"{one.metric} of {one.worst.run}: {one.worst.sentence}{more}" for one in single[:1]],
         "runs": [
-            f"only in {side.path}: {_named(names)}"
+            f"only in {side.path}: {_list_names(names)}"
             for side, names in ((before, only_before), (after, only_after))
             if names
         ],
@@ -218,7 +218,7 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
         note(criterion="comparison", sentence=counted)
         if num_figures or num_verdicts
         else lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides"),
-        *_of_verdicts(verdicts, after),
+        *_verdict_reasons(verdicts, after),
         *(reason for *_, reason in ordered),
         *(note(criterion=name, sentence=sentence) for name, sentences in notes.items() for sentence in sentences),
     ]
@@ -228,7 +228,7 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
             reasons,
             scope=f"{before.path} -> {after.path}",
             passed="no regression",
-            notes=[f"not compared, only in {before.path}: {_named(only_before)}"] if only_before else [],
+            notes=[f"not compared, only in {before.path}: {_list_names(only_before)}"] if only_before else [],
             counts=metrics,
         ),
         verdicts=tuple(verdicts),
@@ -265,7 +265,7 @@ def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
         if before is None or metric not in new.metrics or not new.outcome:
             continue
         scale, after = scales()[new.command][metric], new.metrics[metric]
-        change, share = _judged(scale, before, after)
+        change, share = _judge(scale, before, after)
         yield FigureChange(
             run=new.name,
             recording=new.recording,
@@ -282,7 +282,7 @@ def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
         )
 
 
-def _judged(scale: Scale, before: float, after: float | None) -> tuple[Change, float]:
+def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, float]:
     """Change of a figure, and by how many tolerances it is worse."""
     if after is None:
         return (Change.OTHER, 0.0) if scale.better is Better.NEITHER else (Change.WORSE, math.inf)
@@ -316,7 +316,7 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
         )
 
 
-def _of_verdicts(verdicts: Sequence[Mapping[str, str]], after: Judged) -> Iterator[Reason]:
+def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: Judged) -> Iterator[Reason]:
     for one in verdicts:
         name = f"verdict of {one['run']}"
         words = f"{one['run']}: the verdict went from '{one['before']}' to '{one['after']}'"
@@ -337,7 +337,7 @@ def _of_verdicts(verdicts: Sequence[Mapping[str, str]], after: Judged) -> Iterat
         )
 
 
-def _of_figure(one: FigureChange, kind: str) -> Reason:
+def _figure_reason(one: FigureChange, kind: str) -> Reason:
     return failed(
         criterion=one.metric if kind == "run" else f"{one.metric} of {one.run}",
         sentence=one.sentence,
@@ -351,7 +351,7 @@ def _of_figure(one: FigureChange, kind: str) -> Reason:
     )
 
 
-def _of_job(one: JobChange) -> Reason:
+def _job_reason(one: JobChange) -> Reason:
     harm, worst, unit = one.harm, one.worst, f" {one.worst.unit}" if one.worst.unit else ""
     words = f"{one.job}: {one.metric} is worse by {harm.mean:.3g}{unit} in the mean of {harm.num_pairs} recordings"
     interval = f"{100 * CONFIDENCE:g} % interval {harm.low:.3g} to {harm.high:.3g}"
@@ -380,6 +380,6 @@ def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tupl
     return found
 
 
-def _named(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     more = len(names) - MOST_NAMES
     return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")

@@ -103,11 +103,11 @@ def read_judged(path: Path) -> Judged:
     return Judged(
         path=path,
         kind="run",
-        runs={command: _judged_run(command, path.absolute().name, command, command, run.run, path)},
+        runs={command: _read_run(command, path.absolute().name, command, command, run.run, path)},
     )
 
 
-def _judged_run(
+def _read_run(
     name: str, recording: str, job: str, command: str, document: Mapping[str, Any], folder: Path | None
 ) -> JudgedRun:
     """Run of ``run.json``, or of --json output (`folder` is None)."""
@@ -142,7 +142,7 @@ def _nodes_of(batch: BatchFolder) -> Iterator[JudgedRun]:
         document = open_run(folder).run if has_run else read_object(printed) if printed.is_file() else {}
         if ran.outcome and isinstance(document.get("verdict"), dict):
             yield replace(
-                _judged_run(ran.node, ran.recording, job, command, document, folder if has_run else None),
+                _read_run(ran.node, ran.recording, job, command, document, folder if has_run else None),
                 is_green=is_green,
             )
         else:

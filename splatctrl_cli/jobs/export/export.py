@@ -118,12 +118,12 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=request.force, is_folder=False) as partial:
         kept |= {"exported_from": f"{name} sha256 {sha256(source)}"}
-        back, said = _written(partial, kind, chosen, kept)
+        back, said = _write_scene(partial, kind, chosen, kept)
         before, after = _gaussians(chosen), _gaussians(back)
         held, bound = kind.held(before), kind.bound(before)
         bound = replace(bound, center=bound.center + float(np.abs(exact - before.centers).max()))
-        found = _checked_differences(out, held, after, bound, exact)
-        largest, psnr, covered = _checked_look(out, kind, chosen, back)
+        found = _check_differences(out, held, after, bound, exact)
+        largest, psnr, covered = _check_look(out, kind, chosen, back)
         return ExportResult(
             file=out,
             format=kind.name,
@@ -172,7 +172,7 @@ def _check_colors(source: Path, splats: Splats) -> None:
     refuse(str(source), "colour", largest, largest > EXPORT_MAX_COLOR, f"at most {EXPORT_MAX_COLOR:g}")
 
 
-def _written(
+def _write_scene(
     partial: Path, kind: SplatFormat, splats: Splats, comments: Mapping[str, str]
 ) -> tuple[Splats, Comments]:
     """Write the splats and read them back; isotropic ones in a PLY keep their density."""
@@ -188,7 +188,7 @@ def _gaussians(splats: Splats) -> GaussianSet:
     return as_gaussians(splats) if isinstance(splats, SplatSet) else splats
 
 
-def _checked_differences(
+def _check_differences(
     out: Path, held: GaussianSet, back: GaussianSet, bound: Differences, exact: Float64
 ) -> Differences:
     if len(held) != len(back) or not np.array_equal(held.labels, back.labels):
@@ -199,7 +199,7 @@ def _checked_differences(
     return found
 
 
-def _checked_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> tuple[float, float | None, float]:
+def _check_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> tuple[float, float | None, float]:
     largest, psnr, covered = _look(source, back)
     looks_the_same = psnr is None or psnr >= EXPORT_MIN_PSNR
     if not kind.is_rounded and not (looks_the_same and largest <= EXPORT_DIFFERENCE):
@@ -289,7 +289,7 @@ def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:
     elif (run.path / "field.npz").is_file():
         yield 0, 0, partial(_field, 0, run.parts.checked(run.path / "field.npz"))
     elif (run.path / "splats.ply").is_file():
-        yield from _known_parts([(snapshot.stamp_ns, snapshot) for snapshot in open_scene(run.path).snapshots])
+        yield from _space_parts([(snapshot.stamp_ns, snapshot) for snapshot in open_scene(run.path).snapshots])
     else:
         raise InputError(f"{run.path}: {run.command} leaves nothing to log", remedy="give a replay, scene or field")
 
@@ -299,7 +299,7 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
     grid = run.option("--field")
     if grid is None:
         known = sets_known(run, states, scene_of(run, roots))
-        yield from _known_parts([(start + round(1e9 * time_s), snapshot) for time_s, snapshot in known])
+        yield from _space_parts([(start + round(1e9 * time_s), snapshot) for time_s, snapshot in known])
     elif (place := run.place_of(grid, roots)) is not None:
         yield start, 0, partial(_field, start, place / "field.npz" if place.is_dir() else place)
     robot = robot_of(run, states, roots)
@@ -320,7 +320,7 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
             yield int(event["first_ns"]), 4, methodcaller("add_line", EVENTS, int(event["first_ns"]), level, told)
 
 
-def _known_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:
+def _space_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:
     few = {known[i][0] for i in spread([1e-9 * (stamp - known[0][0]) for stamp, _ in known], math.inf)}
     for stamp, snapshot in known:
         yield stamp, 0, partial(_cloud, stamp, snapshot)

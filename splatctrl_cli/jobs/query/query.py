@@ -250,7 +250,7 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
             out = stack.enter_context(partial.open("w", encoding="utf-8", newline=""))
             out.write(",".join(TITLES) + "\n")
         with stopwatch.stage("read"):
-            asked = _asked(request, progress)
+            asked = _open_source(request, progress)
         with stopwatch.stage("answer"):
             for points in _blocks(request.points, progress):
                 try:
@@ -281,7 +281,7 @@ class _Asked:
     device: Device | None = None
 
 
-def _asked(request: QueryRequest, progress: Progress) -> _Asked:
+def _open_source(request: QueryRequest, progress: Progress) -> _Asked:
     file = _grid_file(request.source)
     if file is None:
         if request.scene is not None:

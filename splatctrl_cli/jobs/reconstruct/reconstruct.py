@@ -72,7 +72,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         run = _identity(request, inputs)
         checkpoint = checkpoint_to_go_on_from(partial, run) if goes_on else None
         with stopwatch.stage("learn"):
-            robot, off = _learned(robot, request, partial, progress, is_new=not goes_on)
+            robot, off = _learn_self(robot, request, partial, progress, is_new=not goes_on)
         fitted = Reconstruction(
             request,
             robot,
@@ -133,7 +133,7 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
     return identity({"seed": request.seed, **request.options, **off}, files, request.config, inputs)
 
 
-def _learned(
+def _learn_self(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
 ) -> tuple[RobotModel | None, dict[str, dict[str, Any]]]:
     """Add the self-model to the robot, and find `displaced_cameras`.

@@ -225,7 +225,10 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
         return
     used = scene.run.get("config", {})
     found = agreement_with_grid(
-        scene.splats(), known, _used(SceneConfig, used.get("scene")), _used(OccupancyConfig, used.get("occupancy"))
+        scene.splats(),
+        known,
+        _read_section(SceneConfig, used.get("scene")),
+        _read_section(OccupancyConfig, used.get("occupancy")),
     )
     if not found.holds and found.num_voxels:
         yield lacking(
@@ -236,7 +239,7 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
         )
 
 
-def _used(section: type[S], values: object) -> S:
+def _read_section(section: type[S], values: object) -> S:
     known = {field.name for field in fields(section)}
     given = values if isinstance(values, dict) else {}
     return section(**{name: value for name, value in given.items() if name in known})

@@ -96,7 +96,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     near, oldest = nearby(judged, judged.replay.near["age"]), judged.request.max_map_age
     if near is not None:
         age, time_s, count = near
-        words, remedy = _after_end(judged, age, time_s)
+        words, remedy = _end_words(judged, age, time_s)
         yield (
             held(f"depth from about the arm at most {age:.2f} s before", age, oldest, "s", count)
             if age <= oldest
@@ -113,7 +113,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
         )
 
 
-def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
+def _end_words(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
     """First words and remedy if the evidence is old because the log ended."""
     lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
@@ -140,7 +140,7 @@ def map_age(judged: Judged) -> Iterator[Reason]:
         yield held(f"at most {most:.2f} s", most, allowed, "s", len(known))
     elif len(known):
         worst = max(events_of(judged.replay, EventKind.STALE_MAP), key=lambda event: event.worst)
-        words, remedy = _after_end(judged, most, worst.worst_s)
+        words, remedy = _end_words(judged, most, worst.worst_s)
         yield lacking(
             sentence=f"{words}the map is up to {most:.2f} s old, allowed {allowed:g} s, from {worst.start_s:.2f} to "
             f"{worst.end_s:.2f} s",

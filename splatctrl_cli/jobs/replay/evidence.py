@@ -305,7 +305,7 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
         stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
         for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
             distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
-            gap = _unexpected(inputs, moving, distance - radii, points, stamp, replay.margin)
+            gap = _drop_expected(inputs, moving, distance - radii, points, stamp, replay.margin)
             nearest = int(np.argmin(gap))
             clearance[index], surface[index] = gap[nearest], points[nearest]
             spheres[index] = moving[nearest]
@@ -330,7 +330,7 @@ def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
     )
 
 
-def _unexpected(
+def _drop_expected(
     inputs: ReplayInputs, moving: NDArray[np.intp], gap: Float64, points: Float64, stamp_ns: int, margin: float
 ) -> Float64:
     if not inputs.declared.expected_contact:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -150,15 +151,15 @@ def known_space(judged: Judged) -> Iterator[Reason]:
     of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
     for limit in LIMITS:
-        yield from _within(judged, limit)
+        yield from _check_limit(judged, limit)
     if judged.request.unseen == OCCUPIED:
-        yield from _within(judged, PROOF, partial(failed, label=MARGIN))
+        yield from _check_limit(judged, PROOF, partial(failed, label=MARGIN))
     elif judged.request.require_proof:
-        yield from _within(judged, PROOF)
+        yield from _check_limit(judged, PROOF)
     yield from _unknown_share(judged)
 
 
-def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
+def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
     """Yield that a limit is kept, or its worst state as `broken`."""
     near = judged.replay.near
     values = limit.values(near)
@@ -305,7 +306,9 @@ def calibration(judged: Judged) -> Iterator[Reason]:
         return
     value = 1e-3 * float(residual)
     judged_links = {link: row for link, row in by_link.items() if row.get("is_judged", True)}
-    link, worst = max(judged_links.items(), key=lambda item: abs(float(item[1]["median_mm"])), default=("", {}))
+    link, worst = max(
+        judged_links.items(), key=lambda row: abs(float(row[1]["median_mm"])), default=("", dict[str, Any]())
+    )
     yield (
         held(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
         if value <= MISPLACED

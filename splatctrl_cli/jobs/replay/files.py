@@ -218,27 +218,27 @@ def write_steps(path: Path, chunks: Iterable[Mapping[str, Sequence[object]]]) ->
     with path.open("w", encoding="utf-8", newline="") as stream:
         for index, columns in enumerate(chunks):
             if index == 0:
-                stream.write(",".join(map(_quoted, columns)) + "\n")
-            parts = [_formatted(values) for values in columns.values()]
+                stream.write(",".join(map(_quote, columns)) + "\n")
+            parts = [_format_cells(values) for values in columns.values()]
             row = ",".join(form for form, _ in parts) + "\n"
             stream.write("".join(map(row.__mod__, zip(*(cells for _, cells in parts), strict=True))))
 
 
-def _formatted(values: Sequence[object]) -> tuple[str, Sequence[object]]:
+def _format_cells(values: Sequence[object]) -> tuple[str, Sequence[object]]:
     kinds = set(map(type, values))
     if kinds == {float} and all(map(math.isfinite, values)):  # type: ignore[arg-type]
         return "%.9g", values
     if kinds == {int}:
         return "%d", values
     if kinds == {str}:
-        known = {value: _quoted(str(value)) for value in set(values)}
+        known = {value: _quote(str(value)) for value in set(values)}
         return "%s", [known[value] for value in values]
     return "%s", [
-        _quoted(str(v)) if not isinstance(v, float) else f"{v:.9g}" if math.isfinite(v) else "" for v in values
+        _quote(str(v)) if not isinstance(v, float) else f"{v:.9g}" if math.isfinite(v) else "" for v in values
     ]
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if _SPECIAL.search(text) else text
 
 

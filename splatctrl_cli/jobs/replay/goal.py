@@ -224,7 +224,7 @@ def check_controller(request: ReplayRequest) -> None:
             "--controller, --controller-command: expected --mode open-loop or closed-loop",
             remedy="an audit does not ask a controller",
         )
-    _named_command(request)
+    _read_command(request)
 
 
 @contextmanager
@@ -244,7 +244,7 @@ def commander_of(
     if request.controller is None and request.controller_command is None:
         yield OURS
         return
-    name, command = _named_command(request)
+    name, command = _read_command(request)
     console.log(f"replay: starting the controller {name}")
     with OutsideController(
         name,
@@ -264,7 +264,7 @@ def commander_of(
             )
 
 
-def _named_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:
+def _read_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:
     if request.controller is not None:
         if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", request.controller):
             raise UsageError(f"--controller: expected module:Class, got {request.controller!r}")

@@ -150,12 +150,14 @@ def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[s
 
 
 def _self_margin_words(robot: MeasuredRobot, kept: Sequence[KeptMargin], config: ControlConfig) -> str:
-    each = ", ".join(f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_told(pair)}" for pair in kept)
+    each = ", ".join(
+        f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_gap_words(pair)}" for pair in kept
+    )
     judged = "" if robot.surfaces is None else "; whether links touch is judged by their surfaces"
     return f"self-collision margin: {1e3 * config.self_margin:g} mm, or what spheres can keep: {each}{judged}"
 
 
-def _told(pair: KeptMargin) -> str:
+def _gap_words(pair: KeptMargin) -> str:
     if pair.surface_gap is None:
         return ""
     if pair.surface_gap <= 0:

@@ -137,7 +137,7 @@ def from_grid(path: Path) -> KnownScene:
     barrier = GridField(grid)
     states = grid.channels.get("observed")
     observed = None if states is None else partial(observed_at, states.astype("uint8"), grid.origin, grid.voxel)
-    seen = None if observed is None else _seen_in_grid(observed, grid)
+    seen = None if observed is None else _grid_seen(observed, grid)
     made_from = made if isinstance(made := grid.header.get("made_from"), dict) else {}
     fields = KnownFields(
         barrier=barrier,
@@ -213,7 +213,7 @@ def seen_of(voxels: SeenVoxels) -> Seen:
     return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel, is_free=voxels.is_free)
 
 
-def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
+def _grid_seen(observed: Observed, grid: DistanceGrid) -> Seen:
     def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
         is_seen = np.isin(observed(points), BY_CAMERA)  # the robot's spheres stick out: swept space is not seen
         classes = np.where(is_seen, EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW).astype(np.uint8)

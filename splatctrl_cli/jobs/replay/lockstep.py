@@ -187,7 +187,7 @@ class Lockstep:
             at=at,
             seen_at=seen_at,
             figures=self._fitted.metrics,
-            observed=self._observed,
+            observed=self._observe,
             first_ns=self._stamps_ns[0] + self._latency_ns,
             cameras=tuple(self._fitted.cameras),
             digests={},
@@ -217,7 +217,7 @@ class Lockstep:
             self._stamps_ns.append(snapshot.stamp_ns)
             self._files.append(snapshot.path)
 
-    def _observed(self, points: Float64) -> UInt8:
+    def _observe(self, points: Float64) -> UInt8:
         while self._ends_with_log and self._next is not None:
             self._take()
         num_taken, known = self._known

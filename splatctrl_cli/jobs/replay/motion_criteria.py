@@ -33,7 +33,7 @@ def clearance(judged: Judged) -> Iterator[Reason]:
     """The exact distance of every moving sphere to the splats keeps the margin."""
     represented = lowest(judged.replay.between["represented"])
     is_starved = represented is not None and represented >= judged.threshold
-    yield from _by_source(judged, "exact", represented if is_starved else None)
+    yield from _check_source(judged, "exact", represented if is_starved else None)
 
 
 def certified_clearance(judged: Judged) -> Iterator[Reason]:
@@ -43,7 +43,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
         return
     least, exact = (lowest(np.asarray(clearance[name])) for name in ("certified", "exact"))
     if least is None or exact is None or not least < judged.threshold <= exact:
-        yield from _by_source(judged, "certified")
+        yield from _check_source(judged, "certified")
         return
     room, loss = exact - judged.threshold, exact - least
     voxel = judged.metrics.get("voxel") or 0.02
@@ -61,16 +61,16 @@ def clearance_of_people(judged: Judged) -> Iterator[Reason]:
     """The arm keeps `control.human_margin` from people; judged if that exceeds the margin."""
     control = judged.request.config.control
     if control.human_margin > control.margin:
-        yield from _by_source(judged, "barrier")
+        yield from _check_source(judged, "barrier")
 
 
 def true_clearance(judged: Judged) -> Iterator[Reason]:
     """The true clearance of every moving sphere keeps the margin; judged with `--truth`."""
     if judged.replay.true_clearance is not None:
-        yield from _by_source(judged, "true")
+        yield from _check_source(judged, "true")
 
 
-def _by_source(judged: Judged, source: str, represented: float | None = None) -> Iterator[Reason]:
+def _check_source(judged: Judged, source: str, represented: float | None = None) -> Iterator[Reason]:
     """A clearance keeps the margin; represented [m]: to splats, if voxels without one alone break it."""
     replay = judged.replay
     least = lowest(np.asarray(replay.true_clearance if source == "true" else replay.audit.clearance[source]))
@@ -92,11 +92,11 @@ def _by_source(judged: Judged, source: str, represented: float | None = None) ->
             remedy="the map is starved: raise --max-splats",
             count=judged.num_states,
         )
-        yield _at_worst(worst, starved)
+        yield _locate(worst, starved)
         return
     states = sum(event.num_states for event in events)
     apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
-    yield _at_worst(
+    yield _locate(
         worst,
         failed(
             sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}, {states} states in "
@@ -110,7 +110,7 @@ def _by_source(judged: Judged, source: str, represented: float | None = None) ->
     )
 
 
-def _at_worst(event: Event, reason: Reason) -> Reason:
+def _locate(event: Event, reason: Reason) -> Reason:
     there = event.obstacle
     return replace(
         reason,
@@ -132,13 +132,13 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
         return
     if not events:
         yield (
-            _beside_fixture(judged)
+            _check_fixture(judged)
             or _brought_together(judged)
             or held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
         )
         return
     worst = min(events, key=lambda event: event.worst)
-    yield _at_worst(
+    yield _locate(
         worst,
         failed(
             sentence=f"{worst.worst_name} overlap by {mm(-worst.worst)}",
@@ -152,7 +152,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     )
 
 
-def _beside_fixture(judged: Judged) -> Reason | None:
+def _check_fixture(judged: Judged) -> Reason | None:
     found = [(gap, stamp, pair) for pair, (gap, stamp) in judged.replay.closest.items() if pair.is_fixture]
     gap, stamp, pair = min(found, key=lambda one: one[0] - one[2].apart, default=(np.inf, 0, None))
     if pair is None or gap >= pair.apart - SLIGHTLY_UNDER:
@@ -225,7 +225,7 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
     least = lowest(judged.replay.audit.figures["limit_margin"])
     if least is not None and least < -judged.request.config.control.limit_tolerance:
         worst = min(events_of(judged.replay, EventKind.OUTSIDE_LIMITS), key=lambda event: event.worst)
-        yield _at_worst(
+        yield _locate(
             worst,
             failed(
                 sentence=f"{worst.worst_name} is {-least:.4f} rad or m outside its limits",
@@ -257,7 +257,7 @@ def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Re
     most = float(np.max(values)) if len(values) else 0.0
     if most > LIMIT_EXCEEDED:
         worst = max(events_of(judged.replay, kind), key=lambda event: event.worst)
-        yield _at_worst(
+        yield _locate(
             worst,
             failed(
                 sentence=f"{worst.worst_name} reaches {most:.2f} times its limit",
@@ -288,7 +288,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             who=bare[0],
             remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {judged.inputs.model.urdf.path}",
         )
-    spheres, surface, between = _of_body(judged)
+    spheres, surface, between = _body_clearance(judged)
     if surface is None:
         return
     if surface < judged.threshold:
@@ -309,7 +309,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
     """A lower bound by the spheres' lever arms keeps the margin; intervals with too low a bound are halved."""
     model, columns = judged.replay.model, judged.replay.between
-    _, surface, between = _of_body(judged)
+    _, surface, between = _body_clearance(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
         return
     if between < judged.threshold <= surface:
@@ -326,7 +326,7 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
         )
 
 
-def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
+def _body_clearance(judged: Judged) -> tuple[float, float | None, float | None]:
     """Least clearance [m] of spheres, surface, and between states.
 
     The last two are None if unknown. If the spheres break the margin, they are None and the first is NaN.

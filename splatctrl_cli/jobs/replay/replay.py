@@ -86,7 +86,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         inputs.scene.finish()
         logged = replace(logged, clock=clock_of(inputs.model, logged, motion))
         with stopwatch.stage("truth"):
-            found, sights = _seen_by_cameras(request, inputs, found)
+            found, sights = _watch(request, inputs, found)
         if evidence is not None:
             with stopwatch.stage("evidence"):
                 found = replace(found, map_error=map_error(evidence, inputs, found.audit, config.verdict))
@@ -126,9 +126,7 @@ def check_request(request: ReplayRequest) -> None:
     check_controller(request)
 
 
-def _seen_by_cameras(
-    request: ReplayRequest, inputs: ReplayInputs, replay: Replay
-) -> tuple[Replay, list[Sight | None]]:
+def _watch(request: ReplayRequest, inputs: ReplayInputs, replay: Replay) -> tuple[Replay, list[Sight | None]]:
     """Add the truth and images of the worst moments in one pass over the frames."""
     off = inputs.scene.figures().get("displaced_cameras") or {}
     recorded = frames_of(inputs.source) if inputs.source.cameras else iter(())

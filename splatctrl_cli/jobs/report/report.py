@@ -68,9 +68,9 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
     Raises InputError if `path` is no run or batch, incomplete, too new, or not comparable with `against`.
     """
     if is_batch(request.path):
-        page = _of_batch(request, open_batch(request.path), progress)
+        page = _page_of_batch(request, open_batch(request.path), progress)
     else:
-        page = _of_run(request, open_run(request.path))
+        page = _page_of_run(request, open_run(request.path))
     file = _write(request, page)
     return WriteReportResult(
         file=file,
@@ -93,10 +93,10 @@ def beside(path: Path) -> Path:
     return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
 
 
-def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
+def _page_of_run(request: WriteReportRequest, run: RunFolder) -> Page:
     section, scenes = section_of(run, anchor="run", title=run.path.absolute().name), dict[str, str]()
     if run.command in WITH_SPACE:
-        section = _in_space(section, run, request.roots, scenes, "scene")
+        section = _add_space(section, run, request.roots, scenes, "scene")
     return Page(
         title=f"{run.command} {run.path.absolute().name}",
         state=section.state,
@@ -108,7 +108,7 @@ def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
     )
 
 
-def _in_space(
+def _add_space(
     section: RunSection, run: RunFolder, roots: tuple[Path, ...], scenes: dict[str, str], name: str
 ) -> RunSection:
     try:
@@ -133,7 +133,7 @@ class _Job:
         return min((float(value) for value in values if isinstance(value, int | float)), default=math.inf)
 
 
-def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
+def _page_of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
     changes, changed = changes_since(request.against, request.path, has_links=True)
     jobs = sorted(
         (_job(batch, ran, ran.node in changed) for ran in batch.runs),
@@ -238,7 +238,7 @@ def _section(
         )
     if not has_space:
         return replace(section, no_space="not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else "")
-    return _in_space(section, run, (batch.path, *request.roots), scenes, f"scene-{len(scenes)}")
+    return _add_space(section, run, (batch.path, *request.roots), scenes, f"scene-{len(scenes)}")
 
 
 def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[Table]:

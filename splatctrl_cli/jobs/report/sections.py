@@ -165,8 +165,8 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
     better = rows([one for one in found.figures if one.change is Change.BETTER])
     first = [
         (
-            (job(one.run), "verdict", one.before, one.after, one.change, None, None, None),
-            STATES.get(one.change, ""),
+            (job(one["run"]), "verdict", one["before"], one["after"], one["change"], None, None, None),
+            STATES.get(one["change"], ""),
         )
         for one in found.verdicts
     ]
@@ -183,4 +183,4 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
         tables.append(
             Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)
         )
-    return tables, frozenset([one.run for one in found.verdicts] + [one.run for one in worse])
+    return tables, frozenset([one["run"] for one in found.verdicts] + [one.run for one in worse])

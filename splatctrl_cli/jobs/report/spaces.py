@@ -60,7 +60,7 @@ def space_of_scene(scene: SceneFolder) -> Space:
     """Final splats of a scene, and unobserved space."""
     if scene.is_anisotropic:
         return Space(splats={0.0: nearest_splats(scene.gaussians())})
-    return _with_unknown(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
+    return _add_unknown(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
 
 
 def space_of_grid(path: Path) -> Space:
@@ -156,7 +156,7 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
     chosen = spread(times, when)
     sets = {times[i] if n else 0.0: used[i].splats() for n, i in enumerate(chosen)}
     at = max((i for i in chosen if times[i] <= when), default=None)
-    return _with_unknown(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
+    return _add_unknown(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
 
 
 def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
@@ -196,7 +196,7 @@ def spread(times: list[float], when: float) -> list[int]:
     return sorted({*even, at})
 
 
-def _with_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
+def _add_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
     if grid is None:
         return space
     used: Mapping[str, Any] = scene.run.get("config", {}).get("occupancy", {})
@@ -237,17 +237,19 @@ def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | N
     for reason in run.verdict.get("reasons", []):
         if reason["outcome"] != "passed" and reason["place"] is not None and reason["time_s"] is not None:
             words = f"{reason['sentence']} at {reason['time_s']:.2f} s, {reason['cause']}"
-            return _decided(states, robot, words, float(reason["time_s"]), reason["place"], str(reason["who"]))
+            return _find_deciding(states, robot, words, float(reason["time_s"]), reason["place"], str(reason["who"]))
     worst = states.worst()
     if worst is None or not states.obstacles or not (place := PLACE.search(states.obstacles[worst])):
         return None
     least = float(np.fmin.reduce([values[worst] for values in states.clearance.values()]))
     time_s = float(states.seconds[worst])
     words = f"least clearance {1e3 * least:.1f} mm at {time_s:.2f} s, near {states.obstacles[worst]}"
-    return _decided(states, robot, words, time_s, [float(part) for part in place.groups()], "")
+    return _find_deciding(states, robot, words, time_s, [float(part) for part in place.groups()], "")
 
 
-def _decided(states: States, robot: RobotModel, words: str, time_s: float, place: list[float], who: str) -> Deciding:
+def _find_deciding(
+    states: States, robot: RobotModel, words: str, time_s: float, place: list[float], who: str
+) -> Deciding:
     state = int(np.argmin(np.abs(states.seconds - time_s)))
     centers, radii = robot.sphere_centers(position_of(states, robot, state)), robot.sphere_set.radii
     names = sphere_names(robot.sphere_set)

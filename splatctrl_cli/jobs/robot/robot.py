@@ -267,7 +267,7 @@ def _verdict(
         unit="m",
         count=num,
     )
-    faults = _uncovered(report, urdf, allowed)
+    faults = _uncovered_links(report, urdf, allowed)
     if faults and not any(parse_gate(requirement)[0] == "max_deficit" for requirement in require):
         covered = replace(
             covered,
@@ -289,7 +289,7 @@ def _verdict(
     )
 
 
-def _uncovered(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[str]:
+def _uncovered_links(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[str]:
     bodies, root = urdf.rigid_bodies(), urdf.root
     bare = [f"{link} moves and has no sphere" for link in report.bare_links if bodies[link][0] != root]
     far = [(link.deficit.proven, link.link) for link in report.links if link.deficit is not None]

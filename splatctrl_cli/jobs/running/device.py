@@ -119,7 +119,7 @@ class FitDevice:
         sizes = [(frame.intrinsics.height, frame.intrinsics.width) for frame in frames]
         sizes += [max(sizes)] * window
         if self._device is None:
-            self._device = self._chosen(num_splats, sizes, progress)
+            self._device = self._choose(num_splats, sizes, progress)
         device, last = self._device, self.history[-1] if self.history else None
         if last is None or any(last.get(name) != device.as_dict().get(name) for name in ("device", "card")):
             begins = fitter.descent.num_iterations
@@ -132,7 +132,7 @@ class FitDevice:
         if device.memory is not None:
             self._fit = fitter.descent.device = DeviceFit(device.memory, num_splats, sizes)
 
-    def _chosen(self, num_splats: int, sizes: Sequence[tuple[int, int]], progress: Progress) -> Device:
+    def _choose(self, num_splats: int, sizes: Sequence[tuple[int, int]], progress: Progress) -> Device:
         last = self.history[-1]["device"] if self.history else ""
         if last == CPU:
             return Device()

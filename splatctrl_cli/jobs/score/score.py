@@ -149,7 +149,7 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
         }
     )
     report = _report(request, scorer, same, protocol | {"definitions": definitions}, as_json(metrics))
-    result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
+    result = _conclude(request, report, is_damaged=bool(reference.source.loss.damaged))
     if folder:
         write_table(folder / "views.csv", list(report["views"][0]), report["views"])
         with stopwatch.stage("pictures"):
@@ -222,7 +222,7 @@ def _free_mass(path: Path, scene: SceneFolder) -> float:
     return free_mass(spheres.splats, scene.occupancy(), free_below)
 
 
-def _concluded(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
+def _conclude(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
     if request.baseline is not None:
         report["metrics"] |= changes(report, request.baseline)
     return ScoreResult(
@@ -283,7 +283,7 @@ def _score_scans(
         "reference": str(request.recording.path),
         **report_of_scans({scan: result.report for scan, result in results.items()}),
     }
-    result = _concluded(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
+    result = _conclude(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
     if folder is not None:
         names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
         rows = ({"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items())

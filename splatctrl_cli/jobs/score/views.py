@@ -123,11 +123,11 @@ class Scorer:
 
     def _score_one(self, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None) -> None:
         frame = view.frame
-        figures, row = self._compared(view, frame, splats, shell)
+        figures, row = self._compare(view, frame, splats, shell)
         doubts.look(view, row.render, row.mask)
         if self.scene.corrections:
             there = corrected_among(frame, view.training, self.scene.corrections)
-            figures_there, _ = self._compared(view, there, splats, shell)
+            figures_there, _ = self._compare(view, there, splats, shell)
             figures |= {f"{n}{CORRECTED}": value for n, value in figures_there.items() if n in CORRECTABLE}
         self.views.append({"view": view.name, "camera": frame.camera, "stamp_ns": frame.stamp_ns})
         self.figures.append(figures)
@@ -142,7 +142,7 @@ class Scorer:
             min(worst, (rank, row), key=itemgetter(0)),
         )
 
-    def _compared(
+    def _compare(
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
     ) -> tuple[dict[str, float], ComparisonRow]:
         protocol = self.reference.protocol

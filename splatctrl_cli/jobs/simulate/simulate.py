@@ -198,7 +198,7 @@ def copied_arm(
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
     copy = folder / "robot.urdf"
-    copy.write_text(_with_own_meshes(original, packages, folder, progress), encoding="utf-8")
+    copy.write_text(_copy_meshes(original, packages, folder, progress), encoding="utf-8")
     spheres = folder / "robot_spheres.yaml"
     if given is not None:
         shutil.copyfile(given, spheres)
@@ -241,7 +241,7 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
     return Motion(times=times, waypoints=np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)]))
 
 
-def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
+def _copy_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
     """Copy a URDF's meshes into the folder, visual ones as STL, and return its text.
 
     A link whose visual mesh is unreadable shows its collision geometry, if any.

@@ -147,7 +147,7 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
         stages[0] = replace(stages[0], options={**stages[0].options, option: f"{{{before.command}}}"})
         stages.insert(0, _stage(before, command_line))
     if simulation is not None:
-        stages = _simulated(simulation, stages, command_line)
+        stages = _add_simulation(simulation, stages, command_line)
     made = {stage.command for stage in stages}
     for name, key in searched.items():
         if not made & key.options.keys():
@@ -210,7 +210,7 @@ def _simulation_of(replayed: Stage) -> RunFolder:
     return simulation
 
 
-def _simulated(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:
+def _add_simulation(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:
     """Prepend the simulation. Raises UsageError if the stages read another recording."""
     folder = simulation.path
     log, logs = folder / "log.mcap", ("log", "source", "seen-by")

@@ -150,8 +150,8 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
         if start.outcome == REFUSED:
             raise InputError(f"{_words(starts)}: is refused: {start.sentence}", remedy="begin at a value that is not")
         _check_settings(run, open_run(out / start.folder), chain)
-        flips = [_alone(name, starts, b, runs, request.tolerance) for name, (_, b) in ranges.items()]
-        least = _together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None
+        flips = [_vary_alone(name, starts, b, runs, request.tolerance) for name, (_, b) in ranges.items()]
+        least = _vary_together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None
         num_new = sum(each.started >= began for each in runs.scheduler.runs.values())
         result = SweepResult(
             out=request.out, before=run.verdict, flips=flips, least=least, num_runs=len(runs.nodes), num_new=num_new
@@ -249,10 +249,10 @@ class Runs:
         self.nodes |= nodes
         self.keys |= self.scheduler.keys
         for values, each in made.items():
-            self.tried[values] = self._tried(new[values], [found[node.name] for node in each])
+            self.tried[values] = self._read_tried(new[values], [found[node.name] for node in each])
         return [self.tried[tuple(point.values())] for point in points]
 
-    def _tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
+    def _read_tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
         """Result of a run. Raises InputError if it failed for another cause than its values."""
         last, unknown = runs[-1], str(Outcome.NOT_EVALUABLE)
         tried = partial(Tried, values=dict(values))
@@ -289,7 +289,7 @@ def _words(values: Mapping[str, float]) -> str:
     return ", ".join(f"{name}={value:g}" for name, value in values.items())
 
 
-def _alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, tolerance: float) -> KeyFlip:
+def _vary_alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, tolerance: float) -> KeyFlip:
     key, at = runs.chain.keys[name], dict[float | None, Tried]()
 
     def judge(values: Sequence[float]) -> list[str]:
@@ -316,7 +316,7 @@ def _alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, toler
     )
 
 
-def _together(
+def _vary_together(
     flips: Sequence[KeyFlip], ranges: Mapping[str, tuple[float, float]], runs: Runs, tolerance: float
 ) -> LeastChange[Tried] | None:
     def values_at(shares: Sequence[float]) -> dict[str, float]:

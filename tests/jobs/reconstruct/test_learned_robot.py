@@ -42,7 +42,7 @@ def learned(request: ReconstructRequest, *, is_new: bool = True) -> tuple[RobotM
     heard, robot = Said(), RobotModel.from_urdf(request.urdf, request.spheres)  # type: ignore[arg-type]
     robot = robot.moved_by(request.source.joint_names)
     request.out.mkdir(exist_ok=True)
-    found, off = reconstruct._learned(robot, request, request.out, heard, is_new=is_new)
+    found, off = reconstruct._learn_self(robot, request, request.out, heard, is_new=is_new)
     assert found is not None
     assert not robot.surface.trees or max(row["distance_mm"] for row in off.values()) < 1.0
     return found, heard.lines
