@@ -38,7 +38,7 @@ LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yam
 class Command:
     """A subcommand or action; `run` names MODULE:FUNCTION of this package.
 
-    With `actions` it has no options of its own. judges: ends in a verdict, for CI.
+    With `actions` it has no options. judges: ends in a verdict.
     """
 
     summary: str

@@ -94,7 +94,6 @@ def numbers(text: str) -> tuple[float, ...]:
 
 
 def _split_list(name: str, text: str) -> str:
-    """Strip a comma list, for argparse. Raises UsageError if empty."""
     names = _names(text)
     if not names:
         raise UsageError(f"{name} {text!r}: expected names, got none", remedy="leave the option out")
@@ -309,7 +308,7 @@ class Console:
         code: int | None = None,
         has_findings: bool = False,
     ) -> int:
-        """Print a verdict, its reasons and notes, then `result` or `lines`; return the exit code.
+        """Print a verdict, then `result` or `lines`; return the exit code.
 
         With --json a failure's sentence also goes to stderr. has_findings: `lines` contain the reasons.
         """

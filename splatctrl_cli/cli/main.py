@@ -121,10 +121,7 @@ class _Lost(io.TextIOBase):
 
 
 def _stand_in_for_closed_streams() -> _Lost:
-    """Replace closed stdout or stderr, and reserve their numbers.
-
-    Returns the stand-in for stdout, never written to if stdout is open.
-    """
+    """Replace closed stdout or stderr, and reserve their numbers; return the stand-in for stdout."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -156,7 +153,6 @@ def _check_outputs(args: argparse.Namespace) -> None:
 
 
 def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
-    """Refuse an output that is unwritable, or that is or contains an input."""
     check_can_be_written(out)
     targets = _places(out)
     for given in inputs:
@@ -174,7 +170,7 @@ def _places(output: Path) -> set[Path]:
 def refuse_endless_files() -> None:
     """Make reading a FIFO, socket or device raise OSError from now on, anywhere.
 
-    A FIFO among images would wait for its writer; a link to /dev/zero would fill the memory.
+    A FIFO would wait for its writer, /dev/zero fill the memory.
     """
     sys.addaudithook(_look)
 

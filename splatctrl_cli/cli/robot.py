@@ -117,7 +117,6 @@ def _learned_row(part: LearnedLink) -> tuple[object, ...]:
 
 
 def _conclude(console: Console, result: CoverageResult) -> int:
-    """Print a coverage by link, and its verdict."""
     report = result.report
     unclosed = (
         f"not closed: {', '.join(report.open_links)}: what is said of the surface holds; an inside there is not, "

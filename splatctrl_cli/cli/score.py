@@ -52,7 +52,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
-    """Read --cloud's settings. Raises UsageError for its options alone."""
     if args.cloud is None:
         for name in ("unit", "masks"):
             if getattr(args, f"cloud_{name}") is not None:
@@ -134,7 +133,6 @@ def _protocol_lines(protocol: Mapping[str, Any]) -> list[str]:
 
 
 def _surface(metrics: Mapping[str, Any]) -> str:
-    """Describe the distances of a surface from its reference."""
     figures = {"accuracy": "accuracy", "completeness": "completeness of all"}
     figures["completeness_seen"] = "completeness of seen"
     lengths = {name: "-" if (v := metrics[name]) is None else f"{1e3 * v:.2f} mm" for name in (*figures, "chamfer")}
@@ -149,7 +147,7 @@ def _cells(columns: Sequence[str], metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _cell(name: str, value: float | None, *, is_change: bool = False) -> str:
-    """A figure in its column's unit; a change has a sign."""
+    """A figure in its column's unit; changes have a sign."""
     if value is None:
         return "-"
     factor, form = next((of for start, of in FORMS.items() if name.startswith(start)), (1.0, ".4f"))

@@ -228,13 +228,12 @@ def compare_with_truth(
 ) -> tuple[dict[str, Any], dict[str, Reliability]]:
     """Accuracy of `FIELDS` where `frames` saw the surface, as in ``field.json``, and reliability by probability form.
 
-    Of Q sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]. name: of the
-    truth, for errors. workspace: where the scene keeps splats. median_radius [m]: of the splats. probabilities:
-    functions of points (Q, 3) and sdf (Q,) [m]. num_blank cells have no distance; num_near of the rest lie outside
-    objects within 20 cm. A training camera saw the nearest surface point of num_seen, and of num_outside_workspace
-    where the scene keeps no splats. reliability: at seen cells within 20 cm of a surface. error_mean, error_sigma
-    [m]: of sdf at seen cells within `PROBABILITY_NEAR`, or None. Raises NotEvaluableError with no cell near an
-    object.
+    Of sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]. name: of the
+    truth. workspace: where the scene keeps splats. probabilities: functions of points (Q, 3) and sdf (Q,) [m].
+    num_blank cells have no distance; num_near of the rest lie outside objects within 20 cm. A training camera saw the
+    nearest surface point of num_seen, and of num_outside_workspace where the scene keeps no splats. reliability: at
+    seen cells within 20 cm of a surface. error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR`,
+    or None. Raises NotEvaluableError with no cell near an object.
     """
     sdf = fields["sdf"]
     is_blank = ~np.isfinite(sdf)
@@ -283,8 +282,8 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
 
     The mesh is in the grid's frame [m]. num_in_reach cells lie in its box widened by 20 cm; num_drawn were sampled.
     Of these num_unknown have no distance, num_inside lie inside the mesh, and the num_near compared lie outside
-    within 20 cm. Inside a closed mesh nothing is compared: the field is a shell. An open mesh's unsigned distance is
-    the truth on both sides. Raises InputError for a file that is no mesh, NotEvaluableError with no cell near it.
+    within 20 cm. Inside a closed mesh nothing is compared: the field is a shell. An open mesh's distance is unsigned.
+    Raises InputError for another file, NotEvaluableError with no cell near it.
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)
@@ -324,7 +323,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
 
 
 def _draw_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
-    """Sampled cells (C, 3), in order, of those in a box, and their number."""
+    """Sampled cells (C, 3) in a box, in order, and their number there."""
     shape = np.array(grid.channels["sdf"].shape)
     first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)
     last = np.minimum(np.floor((upper - grid.origin) / grid.voxel).astype(np.int64), shape - 1)

@@ -1,8 +1,8 @@
 """A baked field against held-out depth, and a scene's surface against reference points.
 
 A depth pixel at point p bounds the distance at x by ``|x - p|``, and the ray up to p is free. A field above the
-distance to the nearest measured point over-estimates. A lower one errs only if the ball around x, up to that point,
-was seen free: else it may know surface that no held-out pixel shows.
+distance to the nearest measured point over-estimates. A lower one errs only if the ball up to that point was seen
+free: else it may know other surface.
 """
 
 import math
@@ -45,9 +45,9 @@ def cloud_score(
 
     As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; others count
     only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference. completeness:
-    the reference to the surface. chamfer: the mean of both. completeness_seen: of reference points that a training
-    camera saw, by seen (R,). nan without points. unit: metres per unit of the reference's file, for messages. Raises
-    NotEvaluableError without near points, or if another unit fits.
+    the reference to the surface. chamfer: the mean of both. completeness_seen: of reference points seen (R,) by a
+    training camera. nan without points. unit: metres per unit of the reference's file. Raises NotEvaluableError
+    without near points, or if another unit fits.
     """
     if not max_distance > 0:
         raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
@@ -89,7 +89,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
 
 
 def _overlap(points: Float64, others: Float64, margin: float) -> float:
-    """Intersection over union of boxes, trimmed by 1 % per end, widened by `margin` [m]."""
+    """Intersection over union of boxes without their ends of 1 %, widened by `margin` [m]."""
     (low, high), (low_other, high_other) = (np.percentile(p, (1, 99), axis=0) for p in (points, others))
     sides = np.minimum(high, high_other) - np.maximum(low, low_other) + 2 * margin
     shared = float(np.prod(np.maximum(sides, 0.0)))
@@ -321,7 +321,7 @@ def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame])
 
 
 def _find_seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
-    """(Q,) True before, or just behind, a frame's measured depth."""
+    """(Q,) True before, or just behind, measured depth."""
     is_free = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:
         asked = np.flatnonzero(~is_free)

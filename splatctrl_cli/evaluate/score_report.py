@@ -237,7 +237,7 @@ def _thumbnail(image: NDArray[np.floating]) -> Float64:
 
 
 def _strangers(thumbnails: Sequence[tuple[str, Float64, Float64]]) -> list[str]:
-    """Views whose photo is clearly nearer another's render; of names, photos and renders."""
+    """Views whose photo is clearly nearer another's render."""
     if len(thumbnails) < 2:
         return []
     names, photos, renders = zip(*thumbnails, strict=True)

@@ -34,9 +34,8 @@ BASE = "the robot's base"
 class CalibrateRequest(RobotOptions):
     """Calibrate the cameras of a recording; several `paths` only for logs of one session.
 
-    out: None for calibration.toml here. urdf: a robot with recorded joint states, to place cameras against. hold: the
-    fixed camera without a robot (None: the first). board: initial poses if the recorded ones are far off.
-    allow_unobserved: write an incomplete calibration.
+    out: None for calibration.toml here. urdf: a recorded robot to place cameras against. hold: the fixed camera
+    without a robot (None: the first). board: for initial poses. allow_unobserved: write an incomplete calibration.
     """
 
     paths: tuple[Path, ...]
@@ -92,8 +91,8 @@ class CalibrateResult:
 def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> CalibrateResult:
     """Find the calibration and write it.
 
-    Raises UsageError for contradictory options, InputError for an unreadable recording. Raises NotEvaluableError,
-    writing nothing, if cameras stay undetermined.
+    Raises UsageError for contradictory options, InputError for an unreadable recording. Raises NotEvaluableError if
+    cameras stay undetermined.
     """
     out = request.out or Path("calibration.toml")
     if request.options.calibration is not None:
@@ -162,10 +161,7 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
 
 
 def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:
-    """Up to `CALIBRATION_FRAMES` simultaneous frames of each camera, without colour, and board sightings.
-
-    Raises NotEvaluableError if no frame shows the board.
-    """
+    """Simultaneous frames of each camera, without colour, and board sightings."""
     stamps = stamps_by_camera(source)
     chosen = frames_nearest(stamps, spread(min(stamps.values(), key=len), fixed.CALIBRATION_FRAMES))
     frames: list[RgbdFrame] = []
@@ -277,7 +273,7 @@ def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotE
 def _calibration(
     source: FrameSource, solution: Solution, begin: Mapping[str, Float64], unknown: Mapping[str, tuple[str, ...]]
 ) -> Calibration:
-    """Build the calibration; begin: initial T_recorded_camera (4, 4) by camera."""
+    """begin: initial T_recorded_camera (4, 4) by camera."""
     evidence, estimate, certainty = solution.adjustment.evidence, solution.estimate, solution.certainty
     cameras = {}
     for camera in evidence.cameras:

@@ -29,8 +29,8 @@ _ALLOWING = {  # the options that take an error on
 class CheckRequest(RobotOptions):
     """One check of a recording; several `paths` only for logs of one session.
 
-    num_images: images to read of each topic, None for all. urdf: robot to compare joint states and depth with; with
-    `spheres` alone the log's own. fail_on: least severity that fails: "error", "warning" or "never".
+    num_images: of each topic, None for all. urdf: robot to compare with; with `spheres` alone the log's. fail_on:
+    least severity that fails: "error", "warning" or "never".
     """
 
     paths: tuple[Path, ...]

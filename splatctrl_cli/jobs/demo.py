@@ -102,7 +102,6 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
 
 
 def _refuse_unusable(data: Path, out: Path) -> None:
-    """Raise InputError if `data` is no recording, UsageError if it is the output."""
     if missing := [name for name in INPUTS if not (data / name).is_file()]:
         raise InputError(
             f"{data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"

@@ -36,7 +36,7 @@ class IngestRequest:
 def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, dict[str, Any]]:
     """Write the capture, or continue an interrupted one to the same bytes; also return its metrics.
 
-    Raises UsageError without a training camera or for another interrupted run, InputError for an unusable recording.
+    Raises UsageError without a camera or for another interrupted run, InputError for an unusable recording.
     """
     stopwatch, options = Stopwatch(), request.options
     out = request.out or Path(request.paths[0].stem + ".capture")

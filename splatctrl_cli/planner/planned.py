@@ -192,7 +192,7 @@ def approach_to(
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:
-    """Margins that start and goals (G, J) keep, and the free goals that keep them."""
+    """Margins that start and goals (G, J) keep, and these goals."""
     rows = room.rows(np.vstack([start, goals])) - fixed.START_ROOM
     num = len(room.moving)
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)

@@ -71,7 +71,7 @@ class Suite:
 def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed") -> list[Case]:
     """A case per criterion of a verdict (`Verdict.as_dict`, or a command's JSON).
 
-    expected: the right outcome; if it occurs and is not "passed", every case passes.
+    expected: outcome other than "passed" with which every case passes.
     """
     by_criterion: dict[str, list[Mapping[str, Any]]] = {}
     for reason in verdict["reasons"]:
@@ -160,7 +160,7 @@ _NOT_XML = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 def write_junit(path: Path, suites: Sequence[Suite]) -> None:
     """Write the suites atomically to `path`, replacing a report.
 
-    Raises UsageError for another file or an unwritable path, WriteError on a full disk.
+    Raises UsageError for another file or path, WriteError on a full disk.
     """
     check_replaceable(path)
     with output_path(path, force=True, is_folder=False) as partial:
@@ -239,7 +239,6 @@ def _seconds(value: float) -> str:
 
 
 def _clean(text: str) -> str:
-    """The text, escaped where XML cannot hold it."""
     return _NOT_XML.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
@@ -251,7 +250,7 @@ MORE = "\n... and {} more that do not fit here\n"
 def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> None:
     """Print annotations, and append a table to the step's summary, in GitHub Actions only.
 
-    is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError if the summary cannot be written.
+    is_fatal: else annotations are warnings. Raises OSError if the summary cannot be written.
     """
     if os.environ.get("GITHUB_ACTIONS") != "true":
         return
@@ -314,7 +313,6 @@ def _cell(text: str) -> str:
 
 
 def _repository_path(path: str, environment: Mapping[str, str]) -> str:
-    """The file's path in the repository, or ""."""
     workspace = environment.get("GITHUB_WORKSPACE", "")
     if not (path and workspace and Path(path).is_file()):
         return ""

@@ -1,8 +1,7 @@
 """One self-contained HTML file: verdict, timelines, pictures, tables, and 3-D scenes.
 
-A scene holds splats by time, a moving arm, and the deciding event; trimesh brings the viewer's three.js. Packed, it
-is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64, and each array's type, first byte and count. Points
-are 16-bit integers within their box.
+trimesh brings the viewer's three.js. A packed scene is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64,
+and each array's type, first byte and count. Points are 16-bit integers within their box.
 """
 
 import base64
@@ -128,7 +127,7 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
 def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
     """Centres (K, 3) and edge [m] of at most `most` cubes on unknown space's border.
 
-    Cubes of 2, 3, ... voxels a side are unknown by half or more.
+    Larger cubes are unknown by half or more.
     """
     factor = 1
     while True:
@@ -188,10 +187,7 @@ def packed(space: Space) -> str:
 
 
 def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
-    """Append values by column, padded to 4 bytes; return [type, first byte, count].
-
-    Columns deflate better than rows.
-    """
+    """Append values by column, which deflates best, padded to 4 bytes; return [type, first byte, count]."""
     array, start = np.asarray(values, kind), len(block)
     block += np.ascontiguousarray(array.T).tobytes()
     block += bytes(-len(block) % 4)

@@ -70,7 +70,7 @@ def _blur(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Flo
 
 
 def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
-    """True where a pixel is occluded from the second imager, right of the first."""
+    """True where occluded from the second imager, right of the first."""
     columns = np.arange(depth.shape[1])
     shifted = np.where(depth > 0, columns - focal_baseline / np.where(depth > 0, depth, 1.0), np.inf)
     least = np.minimum.accumulate(shifted[:, ::-1], axis=1)[:, ::-1]

@@ -68,7 +68,6 @@ def check_references(request: BakeRequest, source: BakeSource) -> None:
 def _compare_with_truth(
     grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest
 ) -> tuple[dict[str, Any], dict[str, Reliability]]:
-    """Compare drawn cells with the truth; neither contains the robot."""
     assert request.truth is not None and request.seen_by is not None
     truth = load_truth(request.truth)
     stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
@@ -95,7 +94,7 @@ def _compare_with_truth(
 
 
 def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
-    """Values of hard and sdf at drawn cells; whole channels may not fit the memory."""
+    """Values of hard and sdf at drawn cells; a whole channel may not fit in memory."""
     channels: dict[str, NDArray[np.generic]] = {
         name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
         for name in ("sdf", "hard", "bound")
@@ -106,7 +105,7 @@ def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
 
 
 def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:
-    """Frames of training cameras (of all if unknown) up to a stamp."""
+    """Frames of training cameras, or all, up to a stamp."""
     for record in open_source(log).records():
         if record.stamp_ns > until_ns:
             return
@@ -115,9 +114,8 @@ def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator
 
 
 def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> dict[str, Any]:
-    """Compare with the newest held-out depth not later than the scene's stamp.
-
-    Pixels outside the scene's box or on the robot do not count: the field has neither.
+    """Compare with the newest held-out depth up to the scene's stamp. Pixels outside the scene's box or on the robot
+    do not count: the field has neither.
     """
     recording = open_source(log)
     cameras = _held_out_cameras(recording, request, source.cameras)
@@ -148,10 +146,7 @@ def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, re
 def _held_out_cameras(
     recording: RecordSource, request: BakeRequest, trained: Sequence[str] | None
 ) -> tuple[str, ...]:
-    """Return the named cameras, or all not known to have trained.
-
-    Raises UsageError for another camera, or if none is left.
-    """
+    """Return the named cameras, or all not known to have trained."""
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
     if wrong := [name for name in names if name not in known]:
         raise UsageError(f"--held-out: {log} has no camera {wrong[0]}", remedy=f"it has: {', '.join(known)}")

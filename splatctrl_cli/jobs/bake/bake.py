@@ -72,7 +72,7 @@ def bake_to_disk(
     """Bake the channels into ``partial/channels``; the baker's counts then cover all slabs.
 
     kept: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last
-    slab. Raises UsageError if that bake had other settings, or if disk or memory lacks room.
+    slab. Raises UsageError for other settings than that bake's, or too little room on disk or in memory.
     """
     baker, request, folder = job.baker, job.request, partial / FOLDER
     layout, config = baker.layout, request.config
@@ -266,7 +266,6 @@ def _read(request: BakeRequest, stopwatch: Stopwatch, progress: Progress) -> _Jo
 
 
 def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...]:
-    """Channels to bake, in order. Raises UsageError if a request needs another."""
     usual = DEFAULT_CHANNELS if previous is None else tuple(previous.grid.channels)
     wanted = usual if request.channels is None else request.channels
     names = {"sdf", *wanted, *(("probability",) if request.with_probability else ())}
@@ -342,7 +341,7 @@ def _draw(
 
 
 def _middle(job: _Job) -> list[float]:
-    """Point [m] where slices are drawn: the middle of the grid's splats without outliers."""
+    """Point [m] of the slices: the middle of the grid's splats without outliers."""
     box, centers = job.baker.layout.box, job.obstacles.splats.centers
     inside = centers[box.contains(centers)]
     lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)

@@ -32,8 +32,8 @@ class BakeRequest(RunOptions):
 
     at: time after the scene's start [s], None for its end. labels: of the splats in the field. The grid covers `box`,
     or the robot's reach, or the splats. channels: besides sdf, None for the usual ones. References: `truth`, where
-    cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out` (`held_out_cameras`, by default all
-    that did not train). update: a field baked from `previous_scene` (None: `scene`), to bake only changes.
+    cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out` (`held_out_cameras`; none: all that did
+    not train). update: a field of `previous_scene` (None: `scene`); only changes are baked.
     """
 
     scene: Path

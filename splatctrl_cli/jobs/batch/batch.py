@@ -40,7 +40,7 @@ class BatchRequest:
     """Run a suite's file into `out` (default: the suite's).
 
     workers: processes at once. shard: (i, n) runs every n-th recording from the i-th on. dask: address of a Dask
-    scheduler that runs the nodes instead. again: rerun finished nodes.
+    scheduler to use instead. again: rerun finished nodes.
     """
 
     suite: Path

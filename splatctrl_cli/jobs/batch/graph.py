@@ -227,7 +227,6 @@ def text_of(value: Any) -> str:
 
 
 def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
-    """Write matrix choices for a node's name, with the job's name if ambiguous."""
     chosen = {
         f"{job.name}.{option}": (option.removeprefix("set."), values)
         for job in jobs
@@ -253,7 +252,7 @@ def _join(variants: Sequence[Variant]) -> Variant | None:
 
 
 def _merge(options: Table, chosen: Variant) -> dict[str, Any]:
-    """Add matrix choices to options; ``set.SECTION.KEY`` and ``perturb.NAME`` add an entry to their table."""
+    """Add matrix choices; ``set.SECTION.KEY`` and ``perturb.NAME`` add to a table."""
     merged = dict(options)
     for key, value in chosen.items():
         table, dot, entry = key.partition(".")
@@ -266,7 +265,7 @@ def _merge(options: Table, chosen: Variant) -> dict[str, Any]:
 
 
 def _fill_places(value: Any, filled: Callable[[str], Any]) -> Any:
-    """Fill each {place}; a text that is one place becomes its value, even a list."""
+    """Fill each {place}; a text that is one place may become a list."""
     if isinstance(value, str):
         alone = _PLACE.fullmatch(value)
         return filled(alone[1]) if alone else _PLACE.sub(lambda match: _one(filled(match[1])), value)

@@ -277,7 +277,7 @@ def _said(words: Sequence[str], named: Mapping[str, str]) -> list[str]:
 
 
 def _digest(path: Path, ledger: Ledger) -> str:
-    """Digest of an input and what it names: an image folder, a URDF's meshes."""
+    """Digest of an input and what it names: images, a URDF's meshes."""
     try:
         digest = ledger.digest(path.parent if path.suffix == ".toml" and path.parent != Path() else path)
         if path.suffix != ".urdf":
@@ -289,7 +289,6 @@ def _digest(path: Path, ledger: Ledger) -> str:
 
 
 def _meshes(urdf: Path) -> Iterator[Path]:
-    """Possible places of a URDF's meshes: next to it, or below a parent."""
     for name in dict.fromkeys(_MESH.findall(urdf.read_text(encoding="utf-8", errors="replace"))):
         if "://" not in name:
             yield urdf.parent / name

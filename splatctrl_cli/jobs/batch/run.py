@@ -108,7 +108,6 @@ class Scheduler:
         return {node.name: self.runs[node.name] for node in nodes}
 
     def _reuse_run(self, node: Node, key: str, before: Run | None) -> Run | None:
-        """The run that stands: earlier, unrecorded, or skipped for a missing need."""
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:
             cause = f"needs {lacking[0]}, which left nothing"

@@ -175,7 +175,7 @@ def _find_files(folder: Path, where: str, pattern: object) -> list[Path]:
 
 
 def _check_names(recordings: Sequence[Recording]) -> list[Recording]:
-    """Name the recordings by file, with as many folders, or the ending, as distinguish them."""
+    """Name the recordings by file, with the folders or ending that distinguish them."""
     files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
     beside = Counter(map(_strip_ending, set(files)))
     places = [path if beside[_strip_ending(path)] > 1 else _strip_ending(path) for path in files]
@@ -254,7 +254,7 @@ def _tables(where: str, table: Table, key: str) -> dict[str, Table]:
 
 
 def _amount(where: str, table: Table, key: str, units: Mapping[str, int], default: float) -> float:
-    """Parse a number, or text such as "10 min" or "4GiB"."""
+    """Parse a number, "10 min" or "4GiB"."""
     value = table.get(key, default)
     match = re.fullmatch(r"\s*([\d.]+)\s*(\w+)\s*", value) if isinstance(value, str) else None
     try:

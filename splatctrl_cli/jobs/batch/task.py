@@ -1,7 +1,7 @@
 """One node's run in a forked child under limits, with log, result and end.
 
-A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time, each a
-line of JSON from stdin, and ends with stdin.
+A runner has imported the commands, so a node costs a fork. It runs one node at a time, a line of JSON from stdin, and
+ends with stdin.
 """
 
 import contextlib
@@ -203,7 +203,7 @@ def _run(function: Entry, task: Task) -> End:
 
 
 def _clear(task: Task) -> None:
-    """Remove outputs of another key, lest they be taken for this run's."""
+    """Remove outputs of another key."""
     begun = Path(task.end).with_suffix(".begun")
     if begun.is_file() and begun.read_text() != task.key and task.out:
         remove(Path(task.out))
@@ -212,7 +212,6 @@ def _clear(task: Task) -> None:
 
 
 def _be_child(function: Entry, task: Task) -> NoReturn:
-    """Run the words in a session of their own, and exit."""
     code = 70
     try:
         os.setsid()
@@ -262,7 +261,7 @@ def _wait(pid: int, task: Task) -> str:
 
 
 def _signal(pid: int, number: signal.Signals) -> None:
-    """Signal a child's group, or the child alone before it has one."""
+    """Signal a child's group, or the child before it has one."""
     try:
         os.killpg(pid, number)
     except ProcessLookupError:
@@ -270,7 +269,7 @@ def _signal(pid: int, number: signal.Signals) -> None:
 
 
 def _memory_of(pid: int) -> int:
-    """Resident memory of a process [bytes], 0 if gone."""
+    """Resident memory [bytes], 0 if gone."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError):

@@ -52,8 +52,7 @@ class CompareRequest:
 class FigureChange:
     """One figure of one run; `after` is None if it lost its value.
 
-    allowed: tolerance, in `unit`. share: by how many tolerances it is worse, infinite without one. where: worst state
-    of a replay.
+    allowed: tolerance, in `unit`. share: tolerances by which it is worse. where: worst state of a replay.
     """
 
     run: str
@@ -94,8 +93,8 @@ class JobChange:
 class CompareResult:
     """Changes of figures, verdicts and jobs, regressions first.
 
-    verdicts: run, recording, change, and labels before and after. jobs: over enough recordings; they then decide in
-    place of the figures. differences: settings, versions and inputs, before and after. only_before: not compared.
+    verdicts: run, recording, change, and labels before and after. jobs: over enough recordings, which decide in place
+    of figures. differences: settings, versions and inputs, before and after. only_before: not compared.
     """
 
     __repr__ = brief
@@ -153,7 +152,6 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
 
 
 def _check_alike(before: Judged, after: Judged) -> None:
-    """Raise InputError for runs of another kind or command, or without a common recording."""
     if before.kind != after.kind:
         raise InputError(f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}")
     if before.kind == "run" and before.runs.keys() != after.runs.keys():
@@ -283,7 +281,6 @@ def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
 
 
 def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, float]:
-    """Change of a figure, and by how many tolerances it is worse."""
     if after is None:
         return (Change.OTHER, 0.0) if scale.better is Better.NEITHER else (Change.WORSE, math.inf)
     harm, allowed = scale.harm(before, after), scale.tolerance(before)
@@ -295,9 +292,8 @@ def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, fl
 
 
 def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
-    """Changes of figures with enough recordings.
-
-    Worse or better if the whole interval is, and the mean exceeds the mean tolerance.
+    """Changes of figures with enough recordings: the whole interval is on one side, and the mean exceeds the mean
+    tolerance.
     """
     by_job: dict[tuple[str, str], list[FigureChange]] = {}
     for one in found:
@@ -370,7 +366,7 @@ def _job_reason(one: JobChange) -> Reason:
 
 
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
-    """Differing settings, versions and inputs, before and after in the first such run."""
+    """Differing settings, versions and inputs, of the first such run."""
     found: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
         for name, value in old.settings.items():

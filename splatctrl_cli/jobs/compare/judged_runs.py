@@ -110,7 +110,6 @@ def read_judged(path: Path) -> Judged:
 def _read_run(
     name: str, recording: str, job: str, command: str, document: Mapping[str, Any], folder: Path | None
 ) -> JudgedRun:
-    """Run of ``run.json``, or of --json output (`folder` is None)."""
     verdict, known = document["verdict"], scales().get(command, {})
     metrics = document["metrics"] if isinstance(document.get("metrics"), dict) else {}
     return JudgedRun(
@@ -278,7 +277,7 @@ def worst_state(folder: Path | None, metric: str) -> WorstState | None:
 
 
 def _badness(where: Shown, text: str) -> float:
-    """Rank a cell: smaller is worse, infinite does not count."""
+    """Rank a cell: smaller is worse."""
     if where.pick not in ("least", "largest"):
         return 0.0 if text == where.pick else math.inf
     if not text:

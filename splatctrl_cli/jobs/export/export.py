@@ -65,9 +65,8 @@ class ExportResult:
     """The written file and its differences from the source.
 
     origin: subtracted from every centre [m], in words. not_kept: attributes the format lacks. num_outside: Gaussians
-    with sigma or colour clamped to its range. allowed: the format's rounding. Over all views:
-    largest_pixel_difference in colour, opacity, or depth over scene size; psnr [dB], None if equal; covered_share,
-    where anything shows. isotropic_psnr [dB]: of the rounded splats.
+    clamped to the range. allowed: the format's rounding. Over all views: largest_pixel_difference in colour, opacity,
+    or depth over scene size; psnr [dB], None if equal; covered_share. isotropic_psnr [dB]: of the rounded splats.
     """
 
     file: Path
@@ -93,7 +92,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     """Write the splats, read them back and compare.
 
     Raises UsageError, InputError or NotEvaluableError for unsuitable splats. Raises WriteError, leaving no file, for
-    errors above the format's rounding, or an exact format that looks different.
+    errors above the format's rounding.
     """
     source = _splat_file(request.scene)
     out = request.out or _beside(request.scene)
@@ -166,7 +165,7 @@ def _format(out: Path, layout: str | None) -> SplatFormat:
 
 
 def _check_colors(source: Path, splats: Splats) -> None:
-    """Raise InputError for a colour so large that float32 would lose the others."""
+    """Raise InputError for a colour so large that float32 loses others."""
     colors = splats.colors if isinstance(splats, SplatSet) else splats.harmonics.reshape(len(splats), -1)
     largest = np.abs(colors).max(axis=1, initial=0.0)
     refuse(str(source), "colour", largest, largest > EXPORT_MAX_COLOR, f"at most {EXPORT_MAX_COLOR:g}")
@@ -175,7 +174,6 @@ def _check_colors(source: Path, splats: Splats) -> None:
 def _write_scene(
     partial: Path, kind: SplatFormat, splats: Splats, comments: Mapping[str, str]
 ) -> tuple[Splats, Comments]:
-    """Write the splats and read them back; isotropic ones in a PLY keep their density."""
     if isinstance(splats, SplatSet) and kind is FORMATS[".ply"]:
         write_ply(partial, splats, comments)
         return read_ply(partial)
@@ -228,7 +226,7 @@ def _num_outside(source: GaussianSet, held: GaussianSet) -> int:
 
 
 def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
-    """Render both sets around `a`: largest difference, PSNR, covered share."""
+    """Largest difference, PSNR and covered share of renders around `a`."""
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:
@@ -241,7 +239,7 @@ def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
 
 
 def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
-    """Cameras around and above the box of most splats, and its diagonal [m]."""
+    """Cameras around most splats, and their diagonal [m]."""
     lower, upper = np.percentile(centers.astype(np.float64), [2, 98], axis=0)
     middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
     width, height = 320, 240

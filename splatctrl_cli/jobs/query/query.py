@@ -209,9 +209,9 @@ OF_GRID = {  # field settings: name and type in a grid's header
 class QueryRequest(RunOptions):
     """One table of points for `source`: a field folder, ``field.npz``, scene folder or splat file.
 
-    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: source of the
-    field, for what the grid lacks. at: time after the scene's start [s], None for its end. labels: of the splats that
-    count. device: for a scene's distances.
+    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: the field's
+    source, for what the grid lacks. at: time after the scene's start [s], None for its end. labels: of splats that
+    count.
     """
 
     source: Path
@@ -227,7 +227,7 @@ class QueryResult:
     """A query's figures; kind: scene, field, or field and scene.
 
     metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision; num_never_seen;
-    min_distance, mean_distance and min_bound [m]. None if unknown.
+    min_distance, mean_distance, min_bound [m]; None if unknown.
     """
 
     out: Path | None
@@ -321,7 +321,7 @@ def _is_enough(points: Path | TextIO) -> bool:
 
 
 def _grid_file(source: Path) -> Path | None:
-    """``field.npz`` of a field, None for a scene. Raises InputError for a field without it."""
+    """``field.npz`` of a field, None for a scene."""
     if source.is_file() and source.suffix == ".npz":
         return source
     file = source / "field.npz"
@@ -379,7 +379,6 @@ def _figures_of(answers: Answers) -> dict[str, Any]:
 
 
 def _metrics_of(figures: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """Metrics over the blocks of a table."""
     counts = ("num_points", "num_answered", "num_outside", "num_in_collision")
     num: dict[str, float | None] = {name: sum(each[name] for each in figures) for name in counts}
     seen = [each["num_never_seen"] for each in figures]

@@ -111,7 +111,7 @@ def _correct_poses(
 
 
 def _describe(bends: FoundBends, scale: float, apart: float, after: float, console: Progress) -> dict[str, Any]:
-    """Log and describe depth bends; apart, after [m]: residuals without and with them."""
+    """apart, after [m]: residuals without and with the depth bends."""
     depth = scale * fixed.SCALE_DEPTH
     rows = {
         camera: {
@@ -178,7 +178,7 @@ def corrected_among(
 def _bend_of(
     frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
 ) -> Float64 | None:
-    """Bend of the frame's camera; held-out views use the only camera with their intrinsics."""
+    """Bend of the frame's camera, or of the only one with its intrinsics."""
     cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
     camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
     return next((row.bend for (name, _), row in corrections.items() if name == camera), None)

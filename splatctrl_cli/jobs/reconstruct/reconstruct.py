@@ -136,9 +136,8 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
 def _learn_self(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
 ) -> tuple[RobotModel | None, dict[str, dict[str, Any]]]:
-    """Add the self-model to the robot, and find `displaced_cameras`.
-
-    The scene's folder keeps the self-model: the given one, the resumed run's, or what the recording shows.
+    """Add the self-model to the robot, and find `displaced_cameras`. It is the given one, the resumed run's, or what
+    the recording shows.
     """
     if robot is None:
         return None, {}
@@ -201,7 +200,6 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
 
 
 def _check_fits(urdf: UrdfFile, source: RecordSource) -> None:
-    """Raise InputError if the log's own robot would stand elsewhere or not move."""
     if words := other_frame(urdf, source):
         raise InputError(
             f"{urdf.path}: {words}", remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one"

@@ -48,10 +48,9 @@ def training_cameras(source: RecordSource) -> list[str]:
 class ReconstructRequest(RunOptions):
     """One reconstruction of `source` into the folder `out`.
 
-    urdf, spheres: the robot, segmented from the splats, by default that of the log `recording`; its reach is the
-    workspace without `box`. points: a coloured cloud to start from instead of depth. declare: a TOML of carried
-    objects. corrections: of a still scene's views. options: what else decides the bytes, by option name; a resumed
-    run must have the same.
+    urdf, spheres: the robot, segmented from the splats (None: the log `recording`'s); its reach is the workspace
+    without `box`. points: a coloured cloud to start from. declare: a TOML of carried objects. corrections: of a still
+    scene's views. options: the rest that decides the bytes, which a resumed run must share.
     """
 
     source: RecordSource
@@ -222,9 +221,8 @@ class Reconstruction:
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Enlarge a default budget that the first step exceeded next to a robot.
-
-        Without a splat, a whole voxel counts as occupied.
+        """Enlarge a default budget that the first step exceeded next to a robot: without a splat, a whole voxel is
+        occupied.
         """
         least = SceneConfig().max_splats
         if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
@@ -350,7 +348,7 @@ class Reconstruction:
             self._first_state_ns = record.stamp_ns
 
     def _fit_to(self, depth: RecordedDepth | None, console: Progress = SILENT) -> None:
-        """Choose map lengths, or a robot's sensor error, by the first frames with depth."""
+        """Choose map lengths, or the sensor error, by the first frames with depth."""
         if depth is None:
             return
         self.depth, before = depth, self.config

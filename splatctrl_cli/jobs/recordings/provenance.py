@@ -138,8 +138,7 @@ def made_from_mismatches(
 ) -> Iterator[Reason]:
     """Mismatches of a scene or field, by its `SceneFolder.made_from`, with a log and robot.
 
-    Compares digests of files and calibration, training cameras' first frames, and the segmented robot's joints and
-    links; also finds corrected depth.
+    Compares digests, training cameras' first frames, and the segmented robot; also finds corrected depth.
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")
@@ -172,7 +171,6 @@ def made_from_mismatches(
 
 
 def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
-    """Calibrations and perturbations among the input files: names by digest."""
     return {
         digest: name.removeprefix(CALIBRATION)
         for name, digest in files.items()
@@ -181,9 +179,8 @@ def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
-    """Describe how a scene's segmented robot differs from a model; empty if alike.
-
-    Links only the scene's robot has are in neither map nor robot; links only the model has are in both.
+    """Describe how a scene's segmented robot differs from a model, or return an empty text. Links of one robot alone
+    are in neither, or in both map and robot.
     """
     joints = made_from.get("robot_joints")
     if joints is None:

@@ -114,7 +114,6 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
 
 
 def _end_words(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
-    """First words and remedy if the evidence is old because the log ended."""
     lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""

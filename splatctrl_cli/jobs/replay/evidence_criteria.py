@@ -160,7 +160,6 @@ def known_space(judged: Judged) -> Iterator[Reason]:
 
 
 def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
-    """Yield that a limit is kept, or its worst state as `broken`."""
     near = judged.replay.near
     values = limit.values(near)
     if limit is PROOF and np.isnan(near["assumed"]).all():

@@ -292,7 +292,7 @@ def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
 def _intervals(
     replay: Replay, is_shown: Callable[[Event], bool], *, at_least: Sequence[str] = ()
 ) -> dict[str, list[tuple[float, float]]]:
-    """Spans [s] of shown events, by kind and measure; kinds in `at_least` always appear."""
+    """Spans [s] of shown events by kind and measure, with all of `at_least`."""
     found: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
     for event in replay.events:
         if is_shown(event):

@@ -71,7 +71,7 @@ def goal_waypoints(
 
 
 def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64:
-    """Configuration (J,) of --goal-joints; omitted gripper fingers stay as logged at the end. Raises InputError."""
+    """Configuration (J,) of --goal-joints; omitted fingers as logged at the end."""
     is_arm = [name not in model.urdf.grippers for name in model.joint_names]
     if len(values) == sum(is_arm):
         posture = logged_end.copy()

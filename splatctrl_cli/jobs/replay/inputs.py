@@ -189,7 +189,6 @@ def coverage_words(model: RobotModel, config: ControlConfig) -> str:
 
 
 def _check_bounded(model: RobotModel) -> None:
-    """Raise InputError for a moving link without a sphere, or without a measurement."""
     wanted = "control.coverage = margin"
     if model.coverage is None:
         raise InputError(
@@ -219,7 +218,7 @@ def _proven(link: LinkCoverage) -> float:
 class LoggedStates:
     """States in the model's joint order, their source, and its checks.
 
-    poses: against forward kinematics, None without logged poses. clock: of cameras against the robot.
+    poses: against forward kinematics, None if unlogged. clock: of cameras against the robot.
     """
 
     source: RecordSource
@@ -278,7 +277,7 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
 def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[ExpectedContact]:
     """Contact of a hand's links with a grasped part where it is taken and left.
 
-    It lasts until `GRASPING` after the part is taken, since the map still shows it there.
+    It lasts `GRASPING` longer: the map still shows the part there.
     """
     bodies = model.urdf.rigid_bodies(set(model.joint_names) - set(model.urdf.grippers))
     first_ns = int(states.stamp_ns[0])

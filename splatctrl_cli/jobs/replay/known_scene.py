@@ -56,10 +56,9 @@ class KnownScene:
     """The scene a replay may use at each time; unknown before `first_ns` (None: always known).
 
     `at(stamp_ns)` returns the same object while a scene is in use. observed, cameras: None if not recorded.
-    stamps_ns: of consecutive scenes, each known `latency_ns` after its stamp; empty for one scene for all times.
-    `advance` to a stamp makes the scenes up to it; call `finish` after the replay. box: of a grid's cell centres.
-    moment_ns: the time of a baked field. seen_at: when space was last seen, as known at a stamp; without
-    has_seen_times only if it ever was.
+    stamps_ns: of scenes, each known `latency_ns` later; empty for one scene for all times. `advance` makes the scenes
+    up to a stamp; call `finish` after the replay. box: of a grid's cell centres. moment_ns: of a baked field.
+    seen_at: when space was last seen, as known at a stamp; without has_seen_times, if it ever was.
     """
 
     at: Callable[[int], KnownFields]

@@ -93,8 +93,8 @@ def from_log(
 ) -> KnownScene:
     """Reconstruct a log as the replay goes, into `folder`/scene.
 
-    source: the log, if open already. observe: called with every frame; those after the replay's end in `finish`.
-    Raises InputError for a log without frames or a clock.
+    source: the log, if open already. observe: called with every frame, at last in `finish`. Raises InputError for a
+    log without frames or a clock.
     """
     config = request.config
     source = _training_source(request, model, source)
@@ -227,7 +227,7 @@ class Lockstep:
         return known(points)
 
     def _finish(self) -> None:
-        """Write a scene folder as `reconstruct` does; later frames go to `observe` alone."""
+        """Write a scene folder; later frames go to `observe` alone."""
         fitted = self._fitted
         if fitted.observe is not None:
             with self._stopwatch.stage("read"):

@@ -80,7 +80,7 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
 
 
 def _add_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -> ReplayTrace:
-    """Add the change to the first scene after the motion: an obstacle may have appeared."""
+    """Add the change to the first scene after the motion."""
     last_ns = int(trace.stamp_ns[-1])
     next_ns = scene.next_ns(last_ns)
     if next_ns is None:
@@ -209,10 +209,6 @@ def _finish(
 
 
 def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
-    """Stamp from which to replay the log.
-
-    Raises InputError for a start after its end, NotEvaluableError if the log ends before the scene.
-    """
     scene, stamps = inputs.scene, inputs.states.stamp_ns
     if scene.first_ns is not None and scene.first_ns > stamps[-1]:
         apart = times_apart(stamps, (scene.first_ns, max((scene.first_ns, *scene.stamps_ns))))

@@ -71,7 +71,7 @@ def true_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def _check_source(judged: Judged, source: str, represented: float | None = None) -> Iterator[Reason]:
-    """A clearance keeps the margin; represented [m]: to splats, if voxels without one alone break it."""
+    """represented [m]: clearance to splats, if voxels without one alone break the margin."""
     replay = judged.replay
     least = lowest(np.asarray(replay.true_clearance if source == "true" else replay.audit.clearance[source]))
     if least is None:
@@ -172,7 +172,6 @@ def _check_fixture(judged: Judged) -> Reason | None:
 
 
 def _brought_together(judged: Judged) -> Reason | None:
-    """The worst pair that our controller brought below its margin and the recording's distance."""
     inputs, replay = judged.inputs, judged.replay
     if replay.outside is not None:
         return None
@@ -327,9 +326,8 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
 
 
 def _body_clearance(judged: Judged) -> tuple[float, float | None, float | None]:
-    """Least clearance [m] of spheres, surface, and between states.
-
-    The last two are None if unknown. If the spheres break the margin, they are None and the first is NaN.
+    """Least clearance [m] of spheres, surface, and between states. The last two are None if unknown, or if the
+    spheres, then NaN, break the margin.
     """
     clearance = judged.replay.audit.clearance
     spheres = lowest(np.asarray(clearance["certified" if "certified" in clearance else "exact"]))  # as `surface` is

@@ -127,7 +127,6 @@ def check_request(request: ReplayRequest) -> None:
 
 
 def _watch(request: ReplayRequest, inputs: ReplayInputs, replay: Replay) -> tuple[Replay, list[Sight | None]]:
-    """Add the truth and images of the worst moments in one pass over the frames."""
     off = inputs.scene.figures().get("displaced_cameras") or {}
     recorded = frames_of(inputs.source) if inputs.source.cameras else iter(())
     replay, surfaces = with_truth(inputs, replay)
@@ -144,7 +143,7 @@ def _watch(request: ReplayRequest, inputs: ReplayInputs, replay: Replay) -> tupl
 def _read(
     request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
 ) -> tuple[ReplayInputs, LoggedStates, Evidence | None, MeasuredRobot]:
-    """Read the inputs; `motion` sees every frame of the log now, or during a lockstep."""
+    """`motion` sees every frame of the log now, or during a lockstep."""
     model, opened = open_log(request, progress)
     if request.urdf is None:  # for who looks at the run
         (folder / ROBOT).write_text(model.urdf.text, encoding="utf-8", newline="")

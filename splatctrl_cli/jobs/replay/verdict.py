@@ -64,7 +64,7 @@ def replay_verdict(judged: Judged) -> Verdict:
 
 
 def _how(judged: Judged) -> str:
-    """Return "waived", "proven" (cameras saw all space within the margin free), or an empty text."""
+    """Return "waived", "proven" (all space within the margin seen free), or an empty text."""
     if any(waivers(judged.request)):
         return "waived"
     assumed = nearby(judged, judged.replay.near["assumed"])

@@ -45,8 +45,8 @@ class ViewRequest(FolderRequest):
 class WriteReportRequest(ViewRequest):
     """A report on a run's or batch's folder into HTML; out: None for PATH.html.
 
-    against: an earlier run, batch or baseline to compare with. all_scenes: every scene of a batch in 3-D, not only
-    failed, changed and worst ones.
+    against: an earlier run, batch or baseline to compare with. all_scenes: of a batch in 3-D, not only failed,
+    changed and worst ones.
     """
 
     against: Path | None = None
@@ -206,7 +206,6 @@ def _job(batch: BatchFolder, ran: Run, is_changed: bool) -> _Job:
 
 
 def _is_told(job: _Job, *, is_seen: bool) -> bool:
-    """True for jobs with a section: replays, unexpected or changed results, and maps to show."""
     if is_seen and job.ran.command == "reconstruct" and job.run is not None:
         return True
     if job.ran.state in ("skipped", "to do"):  # without a run

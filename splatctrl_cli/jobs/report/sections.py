@@ -75,7 +75,6 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
 
 
 def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:
-    """Spans [s] of events by kind and measure: faults, then what shaped a command."""
     found: dict[str, list[tuple[float, float]]] = {}
     shown = [event for event in (run.json_of("events.json") or {}).get("events", []) if event["source"] in SHOWN]
     for event in sorted(shown, key=lambda event: event["kind"] in INTERVENTIONS):

@@ -124,7 +124,7 @@ def _robot(
     packages: tuple[Path, ...],
     _digests: tuple[str, ...],
 ) -> RobotModel:
-    """Cached, since runs of a batch share robots; the digests detect changed files."""
+    """Cached: runs of a batch share robots."""
     T = None if pose is None else transform_from(pose[:3], pose[3:])
     return RobotModel.from_urdf(urdf, spheres, T_world_base=T, locked=dict(locks), packages=packages)
 

@@ -27,8 +27,8 @@ TAKE = "leave --urdf out to take the log's own, or correct the file"
 class RobotOptions:
     """Options to read a robot's URDF.
 
-    spheres: None for the URDF's own. packages: folders of meshes. base: root pose in world, x, y, z, qx, qy, qz, qw.
-    locked: values [rad or m] of unlogged joints.
+    spheres: None for the URDF's. packages: mesh folders. base: root pose in world, x, y, z, qx, qy, qz, qw. locked:
+    values [rad or m] of unlogged joints.
     """
 
     spheres: Path | None = None
@@ -73,7 +73,7 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
 def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = None) -> RobotModel:
     """Add a self-model (`robot learn`): the given file, else the scene's if of this robot.
 
-    `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or one given for another robot.
+    `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or another robot's.
     """
     path = scene / SELF_MODEL if given is None and scene is not None else given
     if path is None or path == NO_SELF_MODEL or (given is None and not path.is_file()):

@@ -92,7 +92,6 @@ class CoverageResult:
 
 
 def _figures(report: CoverageReport) -> dict[str, Any]:
-    """Metrics, and figures by link, for JSON."""
     links = [
         {
             "link": link.link,
@@ -252,9 +251,8 @@ def _verdict(
     require: Sequence[str],
     allowed: float,
 ) -> Verdict:
-    """Judge spheres: uncovered surface, bare links, and each ``--require``.
-
-    Fails for surface more than `allowed` [m] outside, or a bare moving link; a gate on max_deficit replaces that.
+    """Fail for surface more than `allowed` [m] outside the spheres, or a bare moving link; a gate on max_deficit
+    replaces that.
     """
     num, bare = len(report.links), bare_links(report)
     counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)

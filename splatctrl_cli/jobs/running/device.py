@@ -104,8 +104,8 @@ def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
 class FitDevice:
     """The device of a fit, and its earlier ones.
 
-    history: as in ``run.json``, with the first iteration of each. auto starts where the work is worth it, and resumes
-    where it was. Raises UsageError for an unusable device.
+    history: as in ``run.json``, with first iterations. auto starts where the work is worth it, and resumes where it
+    was. Raises UsageError for an unusable device.
     """
 
     def __init__(self, name: str = CPU) -> None:

@@ -41,9 +41,9 @@ from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, vie
 class ScoreRequest:
     """One scene, or a folder of scenes named like scans, to score on views.
 
-    recording: its options' cameras are scored. baseline: score.json of an earlier score. newest: render a view from
-    the newest snapshot not later than it, else from the final splats. images: pictures of ``all`` views, each
-    camera's ``best-worst``, or ``none``. Raises UsageError for ``all`` without `out`.
+    recording: its options' cameras are scored. baseline: score.json of an earlier score. newest: render from the
+    newest snapshot not later than a view, else the final splats. images: of ``all`` views, each camera's
+    ``best-worst``, or ``none``. Raises UsageError for ``all`` without `out`.
     """
 
     scene: Path
@@ -213,7 +213,6 @@ def _protocol(scorer: Scorer) -> dict[str, Any]:
 
 
 def _free_mass(path: Path, scene: SceneFolder) -> float:
-    """Free mass of the scene, NaN without an occupancy grid."""
     if not (path / "occupancy.npz").is_file():
         return nan
     where = str(path / "run.json")
@@ -256,7 +255,7 @@ def _write_result(
 
 
 def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
-    """Scenes by scan in a folder of them; empty for a single scene. Raises InputError."""
+    """Scenes by scan in a folder of them; empty for a single scene."""
     folder, recording = request.scene, request.recording
     if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}

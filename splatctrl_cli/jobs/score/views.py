@@ -38,9 +38,8 @@ Ranked = tuple[float, ComparisonRow]
 class Scorer:
     """Scorer of views of `reference`; `draw` gets every view's row of pictures.
 
-    newest: render from the newest snapshot not later than the view, else from the final splats. Filled by `run`:
-    views, their figures and sizes [px]; skipped: names before the first snapshot; extremes: best and worst by camera;
-    training: frames known at the last view; doubts.
+    newest: as in `ScoreRequest`. Filled by `run`: views, their figures and sizes [px]; skipped: names before the
+    first snapshot; extremes: best and worst by camera; training: frames known at the last view; doubts.
     """
 
     scene: SceneFolder
@@ -207,7 +206,7 @@ class CloudSettings:
     """Reference points or mesh at `path`, or a folder of them by scan.
 
     unit: metres per unit of the file. Points beyond `max_distance` [m] count in a share, not in a mean. Both sides
-    are thinned to `spacing` [m]. masks: DTU's folder of observed space, read for one scan into `space`.
+    are thinned to `spacing` [m]. masks: DTU's folder of observed space, for `space`.
     """
 
     path: Path

@@ -40,9 +40,9 @@ from splatctrl_cli.simulate.truth import Truth, distance_along, truth_document
 class SimulateRequest:
     """One simulation into the folder `out`: log.mcap, truth.json and robot files; dtu: a scan, too.
 
-    urdf: of another arm, its base on the table at the world's origin. spheres: None to fit them. is_slim: images show
-    shapes inside the collision shapes. unmodelled: `UNMODELLED` parts that move along, in images and truth alone.
-    scene: objects and motion in place of the options' table.
+    urdf: of another arm, its base at the world's origin. spheres: None to fit them. is_slim: images show shapes
+    inside the collision shapes. unmodelled: `UNMODELLED` parts, in images and truth alone. scene: objects and motion
+    in place of the options' table.
     """
 
     out: Path
@@ -217,9 +217,8 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
     """Adapt the scene's motion to another arm, whose tip follows the simulated arm's hand.
 
     The tip is the URDF's last link, its z pointing away from the arm. It goes as far as it reaches, turned any way
-    about z, by the shortest clear way through the postures found, or the least slowed one if none keeps the velocity
-    limits. An arm that fits the original postures keeps the original motion. Raises InputError for an unreachable
-    waypoint, or if every way collides.
+    about z, by the shortest clear way, or the least slowed one if none keeps the velocity limits. An arm that fits
+    the original postures keeps the motion. Raises InputError for an unreachable waypoint, or if every way collides.
     """
     times, ours = scene.motion.times, scene.motion.waypoints
     if ours.shape[1] == model.num_joints and all(
@@ -242,9 +241,8 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
 
 
 def _copy_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
-    """Copy a URDF's meshes into the folder, visual ones as STL, and return its text.
-
-    A link whose visual mesh is unreadable shows its collision geometry, if any.
+    """Copy a URDF's meshes, visual ones as STL, and return its text. A link with an unreadable visual mesh shows its
+    collision geometry.
     """
     root, copies = ElementTree.fromstring(urdf.text), dict[tuple[str, str], str]()
     parts = [(link, part) for link in root.iter("link") for tag in ("collision", "visual") for part in link.iter(tag)]
@@ -282,10 +280,8 @@ def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_
 
 
 def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
-    """Find postures (K, J) with the tip at a pose (4, 4).
-
-    If out of reach, the pose moves nearer to the base. q: the simulated arm's, a first guess for an arm of as many
-    joints.
+    """Find postures (K, J) with the tip at a pose (4, 4), moved nearer to the base if out of reach. q: the simulated
+    arm's, a first guess.
     """
     tip = model.frame_names[-1]
     guesses = [model.middle, *random_postures(model, fixed.SIMULATED_GUESSES, seed=0)]
@@ -309,7 +305,7 @@ def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
 
 
 def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
-    """Yield poses turned about z, `nearer` times as far from the base axis."""
+    """Yield poses about z, `nearer` times as far from the base axis."""
     for angle in 2 * np.pi * np.arange(fixed.SIMULATED_TURNS) / fixed.SIMULATED_TURNS:
         T = T_base_hand.copy()
         c, s = np.cos(angle), np.sin(angle)
@@ -319,9 +315,8 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """Cost of a leg: length [rad], more if close or slowed; infinite in collision.
-
-    A slowed leg meets objects at other times: it must avoid all, and is refused if one moves.
+    """Cost of a leg: length [rad], more if close or slowed; infinite in collision. A slowed leg must avoid all, since
+    objects move.
     """
     slowed = leg.within(model.velocity_limit)
     is_late = slowed.times[-1] > leg.times[-1]

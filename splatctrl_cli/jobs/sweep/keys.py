@@ -25,8 +25,7 @@ PLACES = ("obstacle-x", "obstacle-y", "obstacle-radius")  # in the order of simu
 class Key:
     """A varied value: its unit, and the option of each command that takes it.
 
-    lockstep: options for a run that makes its own map. is_monotone: the verdict can turn only once, so few values are
-    tried.
+    lockstep: options for a run that makes its own map. is_monotone: the verdict can turn only once.
     """
 
     name: str
@@ -162,7 +161,7 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
 
 
 def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
-    """Read a command's options with current paths. Raises InputError for moved or changed files."""
+    """Read a command's options with current paths."""
     options = command_line.options_of(run.arguments)
     found: list[Path] = []
 
@@ -199,7 +198,6 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
 
 
 def _simulation_of(replayed: Stage) -> RunFolder:
-    """Simulation of a replay's truth. Raises UsageError without one."""
     folder = Path(replayed.options.get("truth", "")).parent
     simulation = open_run(folder) if (folder / "run.json").is_file() else None
     if simulation is None or simulation.command != SIMULATE:
@@ -211,7 +209,6 @@ def _simulation_of(replayed: Stage) -> RunFolder:
 
 
 def _add_simulation(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:
-    """Prepend the simulation. Raises UsageError if the stages read another recording."""
     folder = simulation.path
     log, logs = folder / "log.mcap", ("log", "source", "seen-by")
     for given in [Path(stage.options[option]) for stage in stages for option in logs if option in stage.options]:

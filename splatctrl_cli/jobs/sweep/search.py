@@ -19,7 +19,7 @@ class Flip(Generic[P]):
     """The flip nearest to the start: last point before it, first after; None without one.
 
     tried: by distance from the start. is_monotone: at most one change. spacing: largest gap tried before the flip (or
-    anywhere without one); a narrower flip may be missed.
+    anywhere).
     """
 
     start: P
@@ -42,8 +42,8 @@ def find_flip(
 ) -> Flip[float]:
     """Find the flip nearest to `start` within `tolerance` (1 for whole values).
 
-    judge: outcomes of values, in parallel. It tries the ends and SWEEP_SAMPLES values evenly between; SWEEP_SEARCHED
-    if the outcome is not declared monotone, or turns back. Then it bisects the nearest pair with different outcomes.
+    judge: outcomes of values, in parallel. It tries the ends and SWEEP_SAMPLES values between; SWEEP_SEARCHED if the
+    outcome may turn back, or does. Then it bisects the nearest pair with different outcomes.
     """
     known: dict[float, str] = {}
 
@@ -106,7 +106,7 @@ def find_least(
 
     Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
     SWEEP_DIRECTIONS of Halton's sequence, then turns the best by a quarter and an eighth towards and away from each
-    value. Each is tried at the best length so far, and bisected to `tolerance` if it flips.
+    value. Each is tried at the best length, and bisected to `tolerance` if it flips.
     """
     num = len(alone)
     start = judge([(0.0,) * num])[0]
@@ -139,7 +139,7 @@ def find_least(
 
 
 def _directions(num: int) -> Iterator[np.ndarray]:
-    """Non-negative unit vectors (num,): the diagonal, then evenly by Halton's points."""
+    """Non-negative unit vectors (num,): the diagonal, then Halton's points."""
     points = qmc.Halton(num, scramble=False).random(SWEEP_DIRECTIONS + 1)[1:]
     for way in (np.ones(num), *ndtri((1.0 + points) / 2.0)):
         yield way / np.linalg.norm(way)

@@ -33,8 +33,8 @@ REFUSED, BY_ITS_VALUES = "refused", (2, 4)  # an outcome, and the exit codes it 
 class SweepRequest:
     """Repeat a replay over ranges KEY=A:B.
 
-    tolerance: distance of a flip's two sides, as a share of the range. out: folder to continue in. workers: parallel
-    runs. dask: address of a scheduler to use instead.
+    tolerance: distance of a flip's sides, as a share of the range. out: may be continued. workers: parallel runs.
+    dask: address of a scheduler instead.
     """
 
     replay: Path
@@ -162,7 +162,7 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
 
 
 def _check_same(out: Path, asked: Mapping[str, Any]) -> None:
-    """Raise UsageError if `out` is of another command, or of other settings; InputError if it is unreadable."""
+    """Raise unless `out` is empty, or a sweep of the same settings."""
     file = out / FILE
     if not file.is_file():
         if any((out / other).exists() for other in (*MARKERS, BATCH)):
@@ -201,7 +201,6 @@ def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def _check_judged(what: str, verdict: Mapping[str, Any]) -> None:
-    """Raise NotEvaluableError without a verdict to flip."""
     if verdict.get("outcome") == Outcome.NOT_EVALUABLE:
         raise NotEvaluableError(
             f"{what}: there is no verdict to flip: {verdict['sentence']}",
@@ -253,7 +252,7 @@ class Runs:
         return [self.tried[tuple(point.values())] for point in points]
 
     def _read_tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
-        """Result of a run. Raises InputError if it failed for another cause than its values."""
+        """Raise InputError if a run failed for another cause than its values."""
         last, unknown = runs[-1], str(Outcome.NOT_EVALUABLE)
         tried = partial(Tried, values=dict(values))
         if not last.outcome and last.exit_code == EXIT_CODES[Outcome.NOT_EVALUABLE]:
@@ -270,7 +269,6 @@ class Runs:
 
 
 def _check_settings(run: RunFolder, again: RunFolder, chain: Chain) -> None:
-    """Raise InputError if settings other than the varied ones changed."""
     varied = {option.removeprefix("set.") for key in chain.keys.values() for option in key.options.values()}
     differs = [
         f"{section}.{name}"
