@@ -92,7 +92,6 @@ class OfThisProgram:
         return tuple(words), tuple(path for path in found if isinstance(path, Path))
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
-        """Options in words, by long name, as `parsed` takes them."""
         parser = _parser_of(words[0])
         found, given = dict[str, Any](), vars(parser.parse_args([*words[1:]]))
         for action in parser._actions:

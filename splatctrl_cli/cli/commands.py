@@ -80,7 +80,6 @@ def _add_commands(parser: Parser, commands: dict[str, Command], *, dest: str, on
 
 
 def judges(words: Sequence[str]) -> bool:
-    """True if the words start a command with a verdict."""
     command = COMMANDS.get(words[0]) if words else None
     if command is not None and command.actions is not None:
         command = command.actions.get(words[1]) if len(words) > 1 else None

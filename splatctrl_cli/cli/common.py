@@ -157,7 +157,6 @@ def _preset(text: str) -> str:
 
 
 def output(what: str, *, default: str) -> tuple[Adds, ...]:
-    """``-o/--out`` and ``--force``."""
     return (
         option("-o/--out PATH", f"{what} (default: {default})", Path),
         option("--force", "replace the output if it exists"),
@@ -165,7 +164,6 @@ def output(what: str, *, default: str) -> tuple[Adds, ...]:
 
 
 def settings(example: str = "") -> tuple[Adds, ...]:
-    """``--set`` and ``--preset``, the first of the settings."""
     paper = "paper: as printed (splatctrl help paper has our departures)"
     return (
         option("--set SECTION.KEY=VALUE ...", f"one setting{example}"),
@@ -333,7 +331,6 @@ class Console:
 
 
 def remarks(*texts: tuple[str, object]) -> list[str]:
-    """Return the texts whose condition holds."""
     return [text for text, holds in texts if holds]
 
 

@@ -165,7 +165,6 @@ def option(
 
 
 def group(title: str, *options: Adds) -> Adds:
-    """Options for ``--help-all`` alone."""
     return lambda container: add_all(container.add_argument_group(title), options)
 
 
@@ -229,7 +228,6 @@ def setting(section: type[Section], key: str) -> Callable[[str], float]:
 
 
 def words(section: type[Section], key: str) -> tuple[str, ...]:
-    """Choices of a configuration key."""
     declared = section.declared[key]
     assert isinstance(declared, OneOf)
     return declared.words

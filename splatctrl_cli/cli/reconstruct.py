@@ -47,7 +47,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
-    """The recording at `path`, or at --dtu."""
     options, is_dtu = source_options(args), args.dtu is not None
     return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=is_dtu, options=options, masks=masks)
 

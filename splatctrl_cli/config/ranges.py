@@ -50,11 +50,9 @@ class OneOf:
 
     @property
     def expected(self) -> str:
-        """The words as text."""
         return f"{', '.join(self.words[:-1])} or {self.words[-1]}"
 
     def holds(self, value: Any) -> bool:
-        """True for one of the words."""
         return value in self.words
 
 
@@ -110,7 +108,6 @@ def check(holds: bool, name: str, expected: str, value: object) -> None:
 
 
 def shown(value: object) -> str:
-    """A value, as shown in errors."""
     try:
         text = repr(value)
     except ValueError:  # an integer of more digits than Python prints
@@ -119,7 +116,6 @@ def shown(value: object) -> str:
 
 
 def cut(text: str) -> str:
-    """A long text's beginning."""
     return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
 
 

@@ -110,8 +110,8 @@ CLOUD_SCALES = {  # by the names of `cloud_score`
 def spaced(points: Float64, spacing: float) -> Float64:
     """Points (P, 3), visited in random order, farther than `spacing` [m] from all kept before.
 
-    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts. Points in one cube of
-    half the edge are merged first (of the whole edge, if more than 6 million points are left).
+    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts. Points in cubes of half
+    the edge are merged first (of the whole edge, if over 6 million are left).
     """
     _check_spacing(spacing)
     some = thinned(points, spacing / 2)
@@ -203,12 +203,11 @@ def compare_with_held_out_depth(
 
     on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
     to the nearest measured point, seen free, so under-estimates count too. over_estimate: over all points. num_edges
-    pixels were left out at depth edges; num_outside points lie outside the grid, num_unknown at a corner without
-    distance.
+    pixels lie at depth edges, num_outside points outside the grid, num_unknown at a corner without distance.
 
-    frames: of held-out cameras, at the bake's stamp, in the grid's frame. counted: per frame (H, W), False on objects
-    that the field leaves out; None: all count. max_points: rays. Raises InputError for masks that do not fit,
-    NotEvaluableError without a measured point in the grid.
+    frames: of held-out cameras, in the grid's frame. counted: per frame (H, W), False on objects that the field
+    leaves out; None: all count. Raises InputError for masks that do not fit, NotEvaluableError without a measured
+    point in the grid.
     """
     distances = grid_distances(grid)
     box = Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1))

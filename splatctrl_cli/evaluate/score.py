@@ -110,8 +110,8 @@ def score_view(
 def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float:
     """Share of the splats' mass with centres in voxels observed free; nan without mass.
 
-    Mass is opacity times squared radius. The robot's splats are left out: they cross free space. free_below:
-    occupancy below which a seen voxel is free.
+    Mass is opacity times squared radius. The robot's splats are left out. free_below: occupancy below which a seen
+    voxel is free.
     """
     mass = np.where(splats.labels == Label.ROBOT, 0.0, splats.opacities * splats.radii.astype(np.float64) ** 2)
     is_free = (grid.num_updates > 0) & (grid.log_odds < math.log(free_below / (1.0 - free_below)))

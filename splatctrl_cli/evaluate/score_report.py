@@ -93,7 +93,6 @@ def sum_of(values: Sequence[float | None]) -> float | None:
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
-    """The mean; None if any value is missing."""
     total = sum_of(values)
     return None if total is None else total / len(values)
 
@@ -163,7 +162,7 @@ THUMBNAIL = (16, 12)  # pixels
 class Doubts:
     """Collected oddities of views: inverted masks, training views, wrong poses.
 
-    is_still: a static scene, with one picture per view; may_train: training views are scored on purpose.
+    is_still: a static scene; may_train: training views are scored on purpose.
     """
 
     is_still: bool
@@ -192,7 +191,6 @@ class Doubts:
         self._thumbnails.append((view.name, photo, drawn))
 
     def lines(self) -> list[str]:
-        """A sentence per doubt, with its figure."""
         lines = []
         if self._masks:
             lines.append(

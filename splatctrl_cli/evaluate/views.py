@@ -21,8 +21,8 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, R
 class View:
     """A frame to score, its name, and the training frames known at its time.
 
-    The name is the camera and a number: within the camera's frames with a clock, else among all views, or the stamp
-    if that is the views' own number.
+    The name is the camera and a number: within its frames with a clock, else among all views, or the views' own, the
+    stamp.
     """
 
     name: str
@@ -41,8 +41,8 @@ def views_to_score(
 ) -> Iterator[View]:
     """The frames of the `scoring` cameras in time order.
 
-    With a clock, each training camera's newest frame up to the view's stamp is known; without, every training frame,
-    in two passes. corrected: a frame with training's pose, exposure and depth.
+    With a clock, each training camera's newest frame up to the view's stamp is known; without, every one. corrected:
+    a frame with training's pose, exposure and depth.
     """
     if not has_clock:
         known = tuple(corrected(frame) for frame in frames_of(source) if frame.camera in training)

@@ -42,7 +42,7 @@ Sight = tuple[Moment, RgbdFrame]
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
     """Indices of at most `num` states with least clearance (T,), the least first.
 
-    Each is the least within 0.5 s on either side, so that an event counts once. NaN does not count.
+    Each is the least within 0.5 s on either side. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])

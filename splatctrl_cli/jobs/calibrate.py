@@ -216,7 +216,6 @@ def _no_board(board: Board, num_frames: int, others: Counter[tuple[int, int]]) -
 
 
 def depth_frame(stored: StoredFrame) -> RgbdFrame:
-    """A frame's depth within `VIEWS_RANGE`, people removed."""
     low, high = VIEWS_RANGE
     is_used = (stored.depth >= low) & (stored.depth <= high)
     if stored.human is not None:

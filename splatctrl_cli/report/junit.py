@@ -64,7 +64,6 @@ class Suite:
     seconds: float = 0.0
 
     def count(self, *kinds: Kind) -> int:
-        """The number of cases of these kinds."""
         return sum(case.kind in kinds for case in self.cases)
 
 

@@ -157,7 +157,6 @@ def three_js() -> str:
 
 
 def packed(space: Space) -> str:
-    """A scene as JSON for the viewer."""
     block = bytearray()
     lower, upper = space.box()
     header: dict[str, Any] = {

@@ -168,7 +168,6 @@ def _strips(axis: _Axis, strips: Mapping[str, Sequence[tuple[float, float, str, 
 
 
 def legend(curves: Mapping[str, Float64]) -> list[tuple[str, str, str]]:
-    """Colour, name and least value, per measure."""
     rows = []
     for name, metres in curves.items():
         known = metres[np.isfinite(metres)]

@@ -233,7 +233,6 @@ class _Job:
 
     @property
     def digests(self) -> dict[str, str]:
-        """sha256 of all input files."""
         return self.source.digests | ({} if self.previous is None else self.previous.digests)
 
 

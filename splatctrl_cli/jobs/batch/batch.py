@@ -148,7 +148,6 @@ def _reason(run: Run) -> Reason:
 
 
 def suites_of(result: BatchResult) -> list[Suite]:
-    """JUnit suites, one for each recording."""
     suites = list[Suite]()
     for recording in dict.fromkeys(run.recording for run in result.runs):
         runs = [run for run in result.runs if run.recording == recording]

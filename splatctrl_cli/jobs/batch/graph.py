@@ -86,7 +86,6 @@ def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
 
 
 def of_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
-    """Nodes of every n-th recording from the i-th on."""
     index, count = shard
     chosen = set(list(dict.fromkeys(node.recording for node in nodes))[index - 1 :: count])
     return [node for node in nodes if node.recording in chosen]

@@ -74,7 +74,6 @@ class Run:
         return self.node.removeprefix(f"{self.recording}/")
 
     def document(self) -> dict[str, Any]:
-        """The run for batch.json; `run_of_document` reads it."""
         plain = asdict(self) | {name: json.loads(getattr(self, name)) for name in _OF_JSON}
         return {"id": plain.pop("node"), **plain, "outcome": self.outcome or None}
 
@@ -165,7 +164,6 @@ class Ledger(AbstractContextManager["Ledger"]):
         return {run.node: run for run in self.runs()}
 
     def mean_seconds(self) -> dict[str, float]:
-        """Mean time of runs that ended by themselves, by job."""
         rows = self._base.execute("SELECT job, avg(seconds) AS mean FROM runs WHERE cause = '' GROUP BY job")
         return {row["job"]: float(row["mean"]) for row in rows}
 
@@ -229,7 +227,6 @@ class Ledger(AbstractContextManager["Ledger"]):
 
 
 def write_csv(path: Path, runs: Iterable[Run]) -> None:
-    """Write runs with every column."""
     write_durably(path, lambda place: write_table(place, COLUMNS, map(asdict, runs)))
 
 

@@ -251,7 +251,6 @@ def _end_of(future: "Future[End]") -> End:
 
 
 def verdict_in(result: Path) -> dict[str, Any]:
-    """Verdict in a command's JSON, else empty."""
     with suppress(OSError, ValueError):
         document = json.loads(result.read_bytes())
         verdict = document.get("verdict") if isinstance(document, dict) else None

@@ -30,7 +30,6 @@ REPLAY_FIELDS = ("exact", "barrier", "certified")
 
 @cache
 def scales() -> Mapping[str, Mapping[str, Scale]]:
-    """Comparison scale of each figure, by command and name."""
     by_mode = [metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True) for mode in MODES]
     return {
         "reconstruct": reconstruct_verdict.GATED,
@@ -43,7 +42,6 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
 
 @cache
 def shown() -> Mapping[str, Shown]:
-    """Columns of a replay's ``steps.csv`` for its figures."""
     return {name: where for mode in MODES for name, where in shown_metrics(mode, REPLAY_FIELDS).items()}
 
 

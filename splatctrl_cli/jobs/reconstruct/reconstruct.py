@@ -240,7 +240,6 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
 
 
 def arm_of(model: RobotModel, source: FrameSource) -> Arm:
-    """The robot with a log's joint positions."""
     return Arm(model, source.states.of_log(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS))
 
 

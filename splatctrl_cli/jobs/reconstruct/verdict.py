@@ -48,7 +48,6 @@ class Reconstructed:
 
 
 def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
-    """Judge a reconstruction by every criterion and each ``--require``."""
     metrics, counts = made.metrics, counts_of(made)
     return verdict_of(
         "reconstruct",

@@ -148,7 +148,6 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
 
 
 def map_error(evidence: Evidence, inputs: ReplayInputs, audit: StoredAudit, config: VerdictConfig) -> MapError:
-    """Bound the map's miss near the judged motion."""
     stamps_ns, misses, num_points = misses_of(evidence.frame_sets(), inputs, audit, config.evidence_reach)
     bound = conformal_bound(misses[:, 0], config.confidence)
     error = MapError(

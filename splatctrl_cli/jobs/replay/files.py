@@ -161,7 +161,6 @@ def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mappin
 
 
 def events_document(replay: Replay) -> dict[str, Any]:
-    """Intervals, static violations and scene changes for events.json."""
     changes = () if replay.closed_loop is None else replay.closed_loop.scene_changes
     numbers = ("worst", "worst_s", "start_s", "end_s")
     return {

@@ -110,7 +110,6 @@ def measured_robot(
 
 
 def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
-    """Sentences on the robot to read before trusting this replay."""
     model = robot.model
     if request.mode == "audit":
         return list(model.doubts)

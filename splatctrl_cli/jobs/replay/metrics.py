@@ -315,7 +315,6 @@ def metric_scales(
 
 
 def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Shown]:
-    """Columns of ``steps.csv`` that show a metric, by metric name."""
     return {metric.name: metric.shown for metric in _list_metrics(mode, of_fields) if metric.shown is not None}
 
 

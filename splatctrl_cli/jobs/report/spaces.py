@@ -43,7 +43,6 @@ def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
 
 
 def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
-    """`space_of` an open run."""
     path = run.path
     if run.command == REPLAY:
         return space_of_replay(run, roots)
@@ -57,7 +56,6 @@ def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 
 
 def space_of_scene(scene: SceneFolder) -> Space:
-    """Final splats of a scene, and unobserved space."""
     if scene.is_anisotropic:
         return Space(splats={0.0: nearest_splats(scene.gaussians())})
     return _add_unknown(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)

@@ -238,7 +238,6 @@ def coverage_summary(report: CoverageReport) -> str:
 
 
 def bare_links(report: CoverageReport) -> str:
-    """Sentence on links without a sphere, else empty."""
     bare = ", ".join(report.bare_links)
     return f"no sphere stands for {bare}: these links are not judged" if bare else ""
 

@@ -148,7 +148,6 @@ class FitDevice:
 
     @contextmanager
     def told_how_to_go_on(self, checkpoint: Path) -> Iterator[None]:
-        """Add device and remedy to its failures."""
         try:
             yield
         except DeviceError as error:

@@ -61,7 +61,6 @@ class RunFolder:
 
     @property
     def verdict(self) -> Mapping[str, Any]:
-        """Verdict in ``run.json``, empty without one."""
         return self._object("verdict")
 
     @property
@@ -80,13 +79,11 @@ class RunFolder:
         return [str(word) for word in given] if isinstance(given, list) else []
 
     def options(self, name: str) -> list[str]:
-        """Values of a repeatable option."""
         words = self.arguments
         found = [words[i + 1] for i, word in enumerate(words[:-1]) if word == name]
         return found + [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
 
     def option(self, name: str) -> str | None:
-        """Last value of an option."""
         return next(iter(self.options(name)[::-1]), None)
 
     def json_of(self, name: str) -> Any:
@@ -181,7 +178,6 @@ def read_object(file: Path) -> dict[str, Any]:
 
 
 def read_columns(file: Path) -> dict[str, tuple[str, ...]]:
-    """Cells of a CSV table by column."""
     with file.open(encoding="utf-8", newline="") as stream:
         rows = csv.reader(stream)
         header = next(rows)

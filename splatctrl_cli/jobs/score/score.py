@@ -76,7 +76,6 @@ class ScoreResult:
 
     @property
     def metrics(self) -> Mapping[str, float | None]:
-        """Mean figures, None without a value."""
         return dict(self.report["metrics"])
 
     @property
@@ -85,7 +84,6 @@ class ScoreResult:
 
     @property
     def notes(self) -> Sequence[str]:
-        """Doubts about the figures."""
         return tuple(self.report["warnings"])
 
 

@@ -96,7 +96,6 @@ class Chain:
     keys: Mapping[str, Key]
 
     def jobs(self, values: Mapping[str, float]) -> tuple[Job, ...]:
-        """The commands with these values of the keys."""
         jobs = list[Job]()
         for stage in self.stages:
             chosen: dict[str, Any] = {
