@@ -40,8 +40,10 @@ def source_options(args: argparse.Namespace) -> SourceOptions:
         args,
         cameras=_names(args.cameras),
         camera_topics=tuple(_topics(text) for text in args.camera),
-        camera_poses=dict(_pose(text) for text in args.camera_pose if not _is_topic(text)),
-        camera_pose_topics=dict(_pose_topic(text) for text in args.camera_pose if _is_topic(text)),
+        camera_poses=dict(_pose(text) for text in args.camera_pose if not text.partition("=")[2].startswith("/")),
+        camera_pose_topics=dict(
+            _pose_topic(text) for text in args.camera_pose if text.partition("=")[2].startswith("/")
+        ),
         human_topics=dict(_human_topic(text) for text in args.human_topic),
         intrinsics=dict(_intrinsics(text) for text in args.intrinsics),
         pairing_tolerance_s=args.pairing_tolerance,
@@ -127,10 +129,6 @@ def _pose(text: str) -> tuple[str, tuple[float, ...]]:
     if not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
         raise UsageError(f"--camera-pose {text}: expected NAME={POSE} with a unit quaternion, or NAME=identity")
     return name, values
-
-
-def _is_topic(text: str) -> bool:
-    return text.partition("=")[2].startswith("/")
 
 
 def _pose_topic(text: str) -> tuple[str, PoseTopic]:

@@ -95,7 +95,9 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
 
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    for name in [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]:
+    for name in [
+        text.partition("=")[2].strip() for text in assignments if text.partition("=")[0].strip() == "preset"
+    ]:
         _check_known(name, PRESETS, "--preset", "")
         yield from ((f"--preset {name}", section, values) for section, values in PRESETS[name].items())
     for section, values in ({} if path is None else _read_toml(path)).items():
@@ -104,7 +106,7 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
             raise UsageError(f"{path}: {section}: expected a table, got {shown(values)}")
         yield str(path), section, values
     for assignment in assignments:
-        if _is_preset(assignment):
+        if assignment.partition("=")[0].strip() == "preset":
             continue
         key, separator, text = assignment.partition("=")
         section, dot, name = key.strip().partition(".")
@@ -115,10 +117,6 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
         where = f"--set {cut(assignment)}"
         _check_known(section, [field.name for field in fields(Config)], where, "")
         yield where, section, {name: _parse_value(text.strip())}
-
-
-def _is_preset(assignment: str) -> bool:
-    return assignment.partition("=")[0].strip() == "preset"
 
 
 def _convert(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from uuid import uuid4
 
 import splatctrl_cli
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults
 from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PACKAGES, sha256, write_durably, write_table
 from splatctrl_cli.jobs.batch.graph import Node
@@ -100,10 +100,8 @@ class Ledger(AbstractContextManager["Ledger"]):
         self.folder, self.path = folder, folder / NAME
         self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
         self._lock: TextIO | None = None
-        try:
+        with refuse_faults(f"{self.path}: is no ledger", sqlite3.DatabaseError, remedy="move it away; outputs stay"):
             self._base = self._open()
-        except sqlite3.DatabaseError as error:
-            raise InputError(f"{self.path}: is no ledger: {error}", remedy="move it away; outputs stay") from None
 
     def _open(self) -> sqlite3.Connection:
         base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)

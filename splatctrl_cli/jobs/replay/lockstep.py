@@ -74,12 +74,10 @@ def opened_scene(
             )
         return from_grid(request.field)
     if request.scene is not None:
-        return from_splats(request.scene, request.config, request.threads, latency_ns=_latency_ns(request))
+        return from_splats(
+            request.scene, request.config, request.threads, latency_ns=int(request.latency * 1e9 + 0.5)
+        )
     return from_log(request, model, folder, console, declared, source, observe)
-
-
-def _latency_ns(request: ReplayRequest) -> int:
-    return int(request.latency * 1e9 + 0.5)
 
 
 def from_log(
@@ -125,7 +123,7 @@ def from_log(
     return Lockstep(
         fitted,
         config,
-        _latency_ns(request),
+        int(request.latency * 1e9 + 0.5),
         console,
         ends_with_log=request.mode != "closed-loop",
         held_out_every=every_of(request.evidence),

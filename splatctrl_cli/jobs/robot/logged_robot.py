@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.formats.arrays import DAMAGE, read_arrays
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.geometry import transform_from
@@ -78,12 +78,9 @@ def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = 
     path = scene / SELF_MODEL if given is None and scene is not None else given
     if path is None or path == NO_SELF_MODEL or (given is None and not path.is_file()):
         return model
-    try:
+    faults, remedy = (*DAMAGE, OSError, TypeError, AttributeError), "write it with: splatctrl robot learn"
+    with refuse_faults(f"{path}: not a self-model", *faults, remedy=remedy):
         found = SelfModel.from_arrays(read_arrays(path, most=2**30))  # bytes
-    except (*DAMAGE, OSError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: not a self-model: {error}", remedy="write it with: splatctrl robot learn"
-        ) from None
     try:
         found.check_robot(model.surface, model.urdf.links, path)
     except InputError:

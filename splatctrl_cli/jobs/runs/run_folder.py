@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.output import PARTIAL, Parts, sha256
 from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Run, run_of_document
 from splatctrl_cli.records import Float64, Stamps
@@ -91,10 +91,8 @@ class RunFolder:
         file = self.path / name
         if not self.parts.has(file):
             return None
-        try:
+        with refuse_faults(f"{file}: is not JSON", ValueError):
             return json.loads(self.parts.checked(file).read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise InputError(f"{file}: is not JSON: {error}") from None
 
     def pictures(self) -> list[Path]:
         found = [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
@@ -106,10 +104,8 @@ class RunFolder:
         file = self.path / "steps.csv"
         if self.command != REPLAY or not self.parts.has(file):
             return None
-        try:
+        with refuse_faults(f"{file}: expected the columns of a replay", ValueError, KeyError, StopIteration):
             return _states(read_columns(self.parts.checked(file)))
-        except (ValueError, KeyError, StopIteration) as error:
-            raise InputError(f"{file}: expected the columns of a replay: {error}") from None
 
     def place_of(self, given: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
         """Find a path of the command line: as typed, above the run, or below `roots`.
@@ -165,10 +161,8 @@ def open_run(path: Path) -> RunFolder:
 
 def read_object(file: Path) -> dict[str, Any]:
     """Read a JSON object. Raises InputError for anything else."""
-    try:
+    with refuse_faults(f"{file}: cannot be read", OSError, ValueError):
         document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
     if not isinstance(document, dict):
         raise InputError(
             f"{file}: expected what a command of splatctrl writes, got {type(document).__name__}",
