@@ -209,14 +209,15 @@ def _check_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> t
 
 
 def _not_kept(source: Splats, back: Splats, held: GaussianSet) -> list[str]:
-    lost = []
-    if (source.labels != back.labels).any():
-        lost.append("labels")
-    if isinstance(source, SplatSet) and isinstance(back, SplatSet) and (source.density != back.density).any():
-        lost.append("density")
-    if isinstance(source, GaussianSet) and held.harmonics.shape[1] < source.harmonics.shape[1]:
-        lost.append("view-dependent colour")
-    return lost
+    lost = {
+        "labels": (source.labels != back.labels).any(),
+        "density": isinstance(source, SplatSet)
+        and isinstance(back, SplatSet)
+        and (source.density != back.density).any(),
+        "view-dependent colour": isinstance(source, GaussianSet)
+        and held.harmonics.shape[1] < source.harmonics.shape[1],
+    }
+    return [name for name, is_lost in lost.items() if is_lost]
 
 
 def _num_outside(source: GaussianSet, held: GaussianSet) -> int:

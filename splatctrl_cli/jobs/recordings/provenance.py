@@ -66,32 +66,30 @@ def changed_files(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """Describe files of equal name but another digest; descriptions (.toml) may change."""
     common = [name for name in then if name in now and not name.endswith(".toml")]
     changed = [name for name in common if then[name] != now[name]]
-    if not changed:
-        return []
     if len(common) == 1:
-        return [f"{changed[0]} has other contents"]
-    return [f"{len(changed)} of {len(common)} files have other contents, such as {changed[0]}"]
+        return [f"{name} has other contents" for name in changed]
+    return [f"{len(changed)} of {len(common)} files have other contents, such as {name}" for name in changed[:1]]
 
 
 def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
-    camera, lines = frame.camera, []
+    camera = frame.camera
     then, now = np.array(first["intrinsics"], np.float64), np.array(first_frame(frame)["intrinsics"])
     if then[4:].tolist() != now[4:].tolist():
         return [f"{camera}: images of {now[4]:g}x{now[5]:g}, not {then[4]:g}x{then[5]:g}"]
     gap = float(np.abs(then[:4] - now[:4]).max())
-    if gap > fixed.SAME_LENS_PIXELS:
-        lines.append(f"{camera}: intrinsics differ by {gap:.1f} px")
-    if apart := (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9:
-        side = "after" if apart > 0 else "before"
-        lines.append(f"{camera}: its nearest frame is {abs(apart):.3g} s {side} the one that trained")
+    apart = (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9
     then_pose = np.array(first["T_world_camera"], np.float64).reshape(4, 4)
     metres, degrees = compare_poses(then_pose, frame.T_world_camera)
-    if metres > fixed.SAME_POSE_METRES or degrees > fixed.SAME_POSE_DEGREES:
-        lines.append(f"{camera}: the pose differs by {1e3 * metres:.0f} mm and {degrees:.1f} degrees")
     levels = float(np.abs(np.array(first["tiles"]) - np.array(_tiles(frame.color))).max())
-    if levels > fixed.SAME_PICTURE_LEVELS:
-        lines.append(f"{camera}: the picture differs by up to {levels:.0f} of 255 levels")
-    return lines
+    side = "after" if apart > 0 else "before"
+    is_moved = metres > fixed.SAME_POSE_METRES or degrees > fixed.SAME_POSE_DEGREES
+    texts = {
+        f"intrinsics differ by {gap:.1f} px": gap > fixed.SAME_LENS_PIXELS,
+        f"its nearest frame is {abs(apart):.3g} s {side} the one that trained": apart != 0,
+        f"the pose differs by {1e3 * metres:.0f} mm and {degrees:.1f} degrees": is_moved,
+        f"the picture differs by up to {levels:.0f} of 255 levels": levels > fixed.SAME_PICTURE_LEVELS,
+    }
+    return [f"{camera}: {text}" for text, differs in texts.items() if differs]
 
 
 def _tiles(color: UInt8) -> list[float]:

@@ -35,10 +35,6 @@ class Judged:
         return self.replay.margin - SLIGHTLY_UNDER
 
     @property
-    def num_states(self) -> int:
-        return len(self.replay.audit.stamp_ns)
-
-    @property
     def past_end_s(self) -> float:
         """Driven time after the log's last state [s]."""
         return max(int(self.replay.audit.stamp_ns[-1]) - int(self.inputs.states.stamp_ns[-1]), 0) * 1e-9
@@ -79,7 +75,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=when,
             remedy="its time of arrival is unknown: cameras must give depth all the time",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
     ahead = nearby(judged, judged.replay.near["ahead"])
     allowed = SAME_MOMENT_NS / 1e9  # frames of one time step differ in time
@@ -133,7 +129,7 @@ def map_age(judged: Judged) -> Iterator[Reason]:
         yield lacking(
             sentence="the field does not say what time it shows",
             remedy="give --scene, or bake a reconstruction instead of bare splats",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
     elif len(known) and most <= allowed:
         yield held(f"at most {most:.2f} s", most, allowed, "s", len(known))
@@ -164,7 +160,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=(worst.stamp_ns - first_ns) * 1e-9,
             remedy="the map comes too late for this motion: lower --latency, or drive more slowly",
-            count=judged.num_states,
+            count=judged.replay.num_states,
             label=CONTACT if worst.clearance < 0 else MARGIN,
         )
     for last in [each for each in found if each.depth_ns > each.stamp_ns][:1]:
@@ -176,7 +172,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=(last.stamp_ns - first_ns) * 1e-9,
             remedy="it may have come earlier: judge a longer time",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
 
 
@@ -230,7 +226,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
             threshold=config.lead_in,
             unit="s",
             remedy="judge the rest alone with --start-time first-map",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
 
 
@@ -345,6 +341,6 @@ def commanded(judged: Judged) -> Reason | None:
         threshold=1.0,
         time_s=seconds_at(judged, int(state)),
         who=name,
-        count=judged.num_states,
+        count=judged.replay.num_states,
         label=LIMITS,
     )

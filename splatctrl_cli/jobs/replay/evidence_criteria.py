@@ -207,7 +207,9 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
     if share is None:
         yield lacking(sentence="the space that cameras saw is not recorded")
     elif share <= allowed:
-        yield held(f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.num_states)
+        yield held(
+            f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.replay.num_states
+        )
     else:
         at = int(np.argmax(judged.replay.audit.figures["unknown_share"] > allowed))
         yield lacking(
@@ -217,7 +219,7 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
             threshold=allowed,
             time_s=seconds_at(judged, at),
             remedy="add a camera, or give a larger --max-unknown",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
 
 

@@ -44,10 +44,7 @@ from splatctrl_cli.voxels import EvidenceClass
 
 Metrics = dict[str, float | None]
 Declared = tuple[Metric[Replay], ...]
-
-
-def num_states(replay: Replay) -> int:
-    return len(replay.audit.stamp_ns)
+num_states: Callable[[Replay], int] = attrgetter("num_states")
 
 
 def is_blank(replay: Replay) -> Bool:

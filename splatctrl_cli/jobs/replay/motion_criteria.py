@@ -53,7 +53,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
         threshold=judged.replay.margin,
         unit="m",
         remedy=f"bake again with --voxel at most {max(voxel * room / loss, 1e-3):.2g}, or give --scene",
-        count=judged.num_states,
+        count=judged.replay.num_states,
     )
 
 
@@ -77,7 +77,7 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     if least is None:
         return
     if least >= judged.threshold:
-        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
+        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.replay.num_states)
         return
     is_contact = least < 0 and represented is None
     events = events_of(replay, EventKind.IN_COLLISION if is_contact else EventKind.BELOW_MARGIN, source)
@@ -90,7 +90,7 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
             threshold=replay.margin,
             unit="m",
             remedy="the map is starved: raise --max-splats",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
         yield _locate(worst, starved)
         return
@@ -104,7 +104,7 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
             value=least,
             threshold=replay.margin,
             unit="m",
-            count=judged.num_states,
+            count=judged.replay.num_states,
             label=CONTACT if least < 0 else MARGIN,
         ),
     )
@@ -134,7 +134,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
         yield (
             _check_fixture(judged)
             or _brought_together(judged)
-            or held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
+            or held(f"at least {mm(least)}", least, 0.0, "m", judged.replay.num_states)
         )
         return
     worst = min(events, key=lambda event: event.worst)
@@ -146,7 +146,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
             threshold=0.0,
             unit="m",
             remedy="pairs that may touch are named by --srdf",
-            count=judged.num_states,
+            count=judged.replay.num_states,
             label=CONTACT,
         ),
     )
@@ -166,7 +166,7 @@ def _check_fixture(judged: Judged) -> Reason | None:
         who=" and ".join(pair.links),
         time_s=float(stamp - int(judged.replay.audit.stamp_ns[0])) * 1e-9,
         remedy="pairs that may touch are named by --srdf",
-        count=judged.num_states,
+        count=judged.replay.num_states,
         label=MARGIN,
     )
 
@@ -189,7 +189,7 @@ def _brought_together(judged: Judged) -> Reason | None:
                 threshold=min(pair.apart, before),
                 unit="m",
                 remedy="fit finer spheres there (splatctrl robot spheres), or lower control.self_margin",
-                count=judged.num_states,
+                count=judged.replay.num_states,
                 label=MARGIN,
                 time_s=float(stamp - int(replay.audit.stamp_ns[0])) * 1e-9,
                 who=" and ".join(pair.links),
@@ -232,12 +232,12 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
                 threshold=0.0,
                 unit="rad",
                 remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
-                count=judged.num_states,
+                count=judged.replay.num_states,
                 label=LIMITS,
             ),
         )
     elif least is not None:
-        yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.num_states)
+        yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.replay.num_states)
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
@@ -263,12 +263,12 @@ def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Re
                 value=most,
                 threshold=1.0,
                 remedy="check the stamps and units of the states, and the URDF's limits",
-                count=judged.num_states,
+                count=judged.replay.num_states,
                 label=LIMITS,
             ),
         )
     elif len(judged.replay.model.joint_names) and (kind is EventKind.TOO_FAST or most > 0):
-        yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.num_states)
+        yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.replay.num_states)
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
@@ -299,10 +299,10 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=seconds_at(judged, int(np.nanargmin(judged.replay.between["surface"]))),
             remedy="use spheres that cover the robot: splatctrl robot spheres",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
     elif between is None or between >= judged.threshold:
-        yield held(f"at least {mm(surface)}", surface, judged.replay.margin, "m", judged.num_states)
+        yield held(f"at least {mm(surface)}", surface, judged.replay.margin, "m", judged.replay.num_states)
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
@@ -321,7 +321,7 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=seconds_at(judged, int(np.nanargmin(columns["lower"]))),
             remedy=SLOW,
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
 
 

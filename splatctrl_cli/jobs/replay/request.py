@@ -163,6 +163,10 @@ class Replay:
     outside: OutsideController | None = None
 
     @property
+    def num_states(self) -> int:
+        return len(self.audit.stamp_ns)
+
+    @property
     def margin(self) -> float:
         """The least clearance allowed [m]."""
         return self.config.control.margin

@@ -67,10 +67,11 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
 
     Raises InputError if `path` is no run or batch, incomplete, too new, or not comparable with `against`.
     """
-    if is_batch(request.path):
-        page = _page_of_batch(request, open_batch(request.path), progress)
-    else:
-        page = _page_of_run(request, open_run(request.path))
+    page = (
+        _page_of_batch(request, open_batch(request.path), progress)
+        if is_batch(request.path)
+        else _page_of_run(request, open_run(request.path))
+    )
     file = _write(request, page)
     return WriteReportResult(
         file=file,

@@ -38,8 +38,7 @@ def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
     if path.suffix == ".npz":
         return space_of_grid(path)
     splats = read_splats(path)[0]
-    chosen = splats if isinstance(splats, SplatSet) else nearest_splats(splats)
-    return Space(splats={0.0: chosen})
+    return Space(splats={0.0: splats if isinstance(splats, SplatSet) else nearest_splats(splats)})
 
 
 def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
@@ -190,7 +189,6 @@ def spread(times: list[float], when: float) -> list[int]:
     nearest = min(range(most), key=lambda i: abs(even[i] - at))
     if 0 < nearest < most - 1:
         even[nearest] = at
-        return sorted(set(even))
     return sorted({*even, at})
 
 
