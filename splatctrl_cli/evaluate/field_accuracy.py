@@ -134,16 +134,14 @@ def field_accuracy(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridDistance:
-    """A distance channel (X, Y, Z) [m], and an offset [m] to add."""
+GridDistance = tuple[NDArray[np.generic], float]
+"""A distance channel (X, Y, Z) [m], and an offset [m] to add."""
 
-    values: NDArray[np.generic]
-    added: float = 0.0
 
-    def at(self, cells: NDArray[np.int64]) -> Float64:
-        """Distances [m] by flat index, without copying a channel on disk."""
-        return np.asarray(self.values.reshape(-1)[cells].astype(np.float64) + self.added)
+def distance_at(distance: GridDistance, cells: NDArray[np.int64]) -> Float64:
+    """Distances [m] by flat index, without copying a channel on disk."""
+    values, added = distance
+    return np.asarray(values.reshape(-1)[cells].astype(np.float64) + added)
 
 
 def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
@@ -153,9 +151,7 @@ def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
     neither.
     """
     found: dict[str, GridDistance] = {
-        name: GridDistance(values=grid.channels[name])
-        for name in ("sdf", "hard", "se", "gpdf")
-        if name in grid.channels
+        name: (grid.channels[name], 0.0) for name in ("sdf", "hard", "se", "gpdf") if name in grid.channels
     }
     if "hard" not in found:
         margin = grid.header.get("bound_margin")
@@ -164,7 +160,7 @@ def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
                 f"distance grid: expected a channel hard or bound, got {', '.join(grid.channels)}",
                 remedy="bake with the channel bound, which is there by default",
             )
-        found["hard"] = GridDistance(values=grid.channels["bound"], added=float(margin))
+        found["hard"] = grid.channels["bound"], float(margin)
     return found
 
 
@@ -291,7 +287,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
         grid, mesh.vertices.min(axis=0) - REACH, mesh.vertices.max(axis=0) + REACH, max_points, seed
     )
     drawn = np.ravel_multi_index(tuple(cells.T), grid.channels["sdf"].shape)
-    is_known = np.isfinite(distances["sdf"].at(drawn))
+    is_known = np.isfinite(distance_at(distances["sdf"], drawn))
     known, points = drawn[is_known], grid.origin + grid.voxel * cells[is_known]
     field = MeshDistance(mesh)
     in_reach = field.distance(points, REACH) < REACH
@@ -304,7 +300,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
             remedy="give the mesh in the frame of the grid (world), in metres",
         )
     accuracy = field_accuracy(
-        {name: values.at(known[is_near]) for name, values in distances.items()},
+        {name: distance_at(values, known[is_near]) for name, values in distances.items()},
         distance[is_near],
         None,
         median_radius=median_radius(grid),

@@ -299,9 +299,8 @@ def depth_edges(depth: NDArray[np.float32]) -> Bool:
 def _interpolate(grid: DistanceGrid, distances: dict[str, GridDistance], points: Float64) -> dict[str, Float64]:
     points = np.ascontiguousarray(points)
     return {
-        name: each.added
-        + interpolate(np.ascontiguousarray(each.values, dtype=np.float32), grid.origin, grid.voxel, points)[0]
-        for name, each in distances.items()
+        name: added + interpolate(np.ascontiguousarray(values, dtype=np.float32), grid.origin, grid.voxel, points)[0]
+        for name, (values, added) in distances.items()
     }
 
 

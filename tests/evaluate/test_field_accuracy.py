@@ -16,6 +16,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import (
     compare_with_mesh,
     compare_with_truth,
+    distance_at,
     field_accuracy,
     grid_distances,
     median_radius,
@@ -78,11 +79,13 @@ def small_grid(header: dict[str, object], **channels: float) -> DistanceGrid:
 
 def test_hard_comes_back_from_the_bound_of_a_grid() -> None:
     grid = small_grid({"bound_margin": 0.0175, "health": {"radius": 0.01}}, sdf=0.0, bound=0.083)
-    np.testing.assert_allclose(grid_distances(grid)["hard"].at(np.array([0, 5])), [0.1005, 0.1005], atol=1e-7)
+    np.testing.assert_allclose(
+        distance_at(grid_distances(grid)["hard"], np.array([0, 5])), [0.1005, 0.1005], atol=1e-7
+    )
     assert median_radius(grid) == 0.01
     distances = grid_distances(small_grid({}, sdf=0.0, hard=0.083, se=0.0))
     assert list(distances) == ["sdf", "hard", "se"]
-    np.testing.assert_array_equal(distances["hard"].at(np.arange(8)), np.float32(0.083))
+    np.testing.assert_array_equal(distance_at(distances["hard"], np.arange(8)), np.float32(0.083))
 
 
 @pytest.mark.parametrize("header", [{}, {"bound_margin": "wide"}])

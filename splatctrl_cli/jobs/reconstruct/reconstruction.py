@@ -113,8 +113,12 @@ class Reconstruction:
         self.corrected: dict[str, Any] = {}  # corrections of the views
         self._early: TimeStep | None = None  # the first step without a workspace
         self.depth: RecordedDepth | None = None  # that chose the map's lengths
-        allowed, still, guess = request.allow_disagreement, not self.source.has_clock, guessed_unit(self.source)
-        self.agreement = CameraAgreement(self.source, is_allowed=allowed, is_still=still, guess=guess)
+        self.agreement = CameraAgreement(
+            self.source,
+            is_allowed=request.allow_disagreement,
+            is_still=not self.source.has_clock,
+            guess=guessed_unit(self.source),
+        )
         self._saved_at, self._save_time = -float("inf"), 0.0
         request.corrections.check(request.source)
         if checkpoint is not None:
@@ -330,8 +334,8 @@ class Reconstruction:
         self.device.history = progress.get("devices", [{**Device().as_dict(), "from_iteration": 0}])
         depth = progress["depth"]
         self._fit_to(None if depth is None else RecordedDepth(**depth))
-        budget = len(checkpoint.state["is_alive"])
-        self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
+        scene = self.config.scene.derived(max_splats=len(checkpoint.state["is_alive"]))
+        self.config = self.config.derived(scene=scene)
         self._fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 
@@ -358,14 +362,13 @@ class Reconstruction:
 
     def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)
-        human, seed, threads = self.config.human, self.request.seed, self.request.threads
         return SceneFitter(
             scene,
             self.config.occupancy,
             workspace,
-            human=human,
-            seed=seed,
-            threads=threads,
+            human=self.config.human,
+            seed=self.request.seed,
+            threads=self.request.threads,
             has_shell=self.robot is not None and scene.shell > 0,
         )
 

@@ -123,7 +123,7 @@ def _provenance(run: RunFolder) -> Table:
 
 
 HEADER = ("job", "what", "before", "now", "", "allowed", "unit", "where")
-STATES = {Change.WORSE: "failed"}  # of a row
+STATES: Mapping[str, str] = {Change.WORSE: "failed"}  # of a row
 
 
 def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple[list[Table], frozenset[str]]:
