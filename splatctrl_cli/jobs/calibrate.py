@@ -258,11 +258,11 @@ def _find_unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
 
 def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotEvaluableError:
     told = "; ".join(f"{', '.join(names)} of {camera}" for camera, names in unknown.items() if names)
-    remedy = "put things of different shapes where all cameras see them"
-    if evidence.moving:
-        remedy += ", turn the moving camera about two axes"
-    if evidence.arm is None:
-        remedy += ", or give --urdf of a robot in view"
+    remedy = (
+        "put things of different shapes where all cameras see them"
+        + (", turn the moving camera about two axes" if evidence.moving else "")
+        + (", or give --urdf of a robot in view" if evidence.arm is None else "")
+    )
     return NotEvaluableError(
         f"calibrate: the recording does not say all: not observed: {told}",
         remedy=f"{remedy}; --allow-unobserved writes the rest, with these as recorded",

@@ -3,6 +3,7 @@
 Recordings are suites; criteria and gates are cases.
 """
 
+import itertools
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -296,12 +297,8 @@ def summary(suites: Sequence[Suite], room: int) -> str:
     left -= len(MORE.encode()) + len(str(len(rows)))
     if left < 0:
         return ""
-    kept: list[str] = []
-    for row in rows:
-        left -= len(row.encode())
-        if left < 0:
-            break
-        kept.append(row)
+    ends = itertools.accumulate(len(row.encode()) for row in rows)
+    kept = [row for row, end in zip(rows, ends, strict=True) if end <= left]
     return head + "".join(kept) + MORE.format(len(rows) - len(kept))
 
 

@@ -170,7 +170,7 @@ def packed(space: Space) -> str:
     if space.unknown is not None and len(space.unknown[0]):
         header["unknown"] = {"points": _points(block, space.unknown[0]), "edge": space.unknown[1]}
     if space.surface is not None:
-        header["surface"] = _mesh(block, space.surface.vertices, space.surface.faces)
+        header["surface"] = _mesh(block, space.surface)
     if space.motion is not None:
         header["motion"] = _motion(block, space.motion)
     if (deciding := space.deciding) is not None:
@@ -222,15 +222,15 @@ def _motion(block: bytearray, motion: Motion) -> dict[str, Any]:
         "seconds": _add(block, motion.seconds, np.float32),
         "clearance": [float(value) if np.isfinite(value) else None for value in motion.clearance.round(6)],
         "margin": motion.margin,
-        "links": [_mesh(block, body.vertices, body.faces) for body in motion.bodies.values()],
+        "links": [_mesh(block, body) for body in motion.bodies.values()],
         "quats": _add(block, np.rint(32767 * quats), np.int16),
         "places": _points(block, motion.poses[:, :, :3, 3]),
         "path": _points(block, motion.path),
     }
 
 
-def _mesh(block: bytearray, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> dict[str, Any]:
-    return {"vertices": _points(block, vertices), "faces": _add(block, faces, np.uint32)}
+def _mesh(block: bytearray, surface: Surface) -> dict[str, Any]:
+    return {"vertices": _points(block, surface.vertices), "faces": _add(block, surface.faces, np.uint32)}
 
 
 def _deflate(data: bytes | bytearray) -> str:
