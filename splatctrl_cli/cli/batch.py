@@ -23,9 +23,9 @@ from splatctrl_cli.jobs.batch.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, of_shard, text_of
+from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, select_shard, text_of
 from splatctrl_cli.jobs.batch.ledger import NAME, Ledger, Run, write_csv
-from splatctrl_cli.jobs.batch.run import DONE, FAILED, told
+from splatctrl_cli.jobs.batch.run import DONE, FAILED, describe_run
 from splatctrl_cli.jobs.batch.suite import Table
 
 PRELOADED = (  # of a runner
@@ -190,7 +190,7 @@ def _list_runs(console: Console, args: argparse.Namespace, request: BatchRequest
     folder, order = request.suite, dict[str, int]()
     if not folder.is_dir():
         _, nodes, folder = planned(request, command_line)
-        order = {node.name: number for number, node in enumerate(of_shard(nodes, request.shard))}
+        order = {node.name: number for number, node in enumerate(select_shard(nodes, request.shard))}
     if not (folder / NAME).is_file():
         raise InputError(f"{folder}: has no {NAME}", remedy="run the batch first")
     conditions = [*args.where, *(["state!=done"] if args.failed else [])]
@@ -201,7 +201,7 @@ def _list_runs(console: Console, args: argparse.Namespace, request: BatchRequest
     if args.csv is not None:
         write_csv(args.csv, runs)
         console.log(f"wrote {len(runs)} runs to {args.csv}")
-    rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
+    rows = [(run.node, run.state, describe_run(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
     return console.result(
         {"nodes": [run.document() for run in runs]},
         table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"],

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several, whole
-from splatctrl_cli.cli.reports import enveloped, report_command
+from splatctrl_cli.cli.reports import report_command, wrap_result
 from splatctrl_cli.config import PRESETS, fixed
-from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, shown
+from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Verdict, gate
 from splatctrl_cli.files.output import plain
@@ -83,7 +83,7 @@ def pose(text: str) -> tuple[float, ...]:
 
 def _device(text: str) -> str:
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
-        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {shown(text)}")
+        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {format_value(text)}")
     return text
 
 
@@ -91,7 +91,9 @@ def numbers(text: str) -> tuple[float, ...]:
     """Finite numbers joined by commas, for argparse."""
     values = several(text)
     if not values:
-        raise argparse.ArgumentTypeError(f"expected finite numbers joined by commas, up to 1e6, got {shown(text)}")
+        raise argparse.ArgumentTypeError(
+            f"expected finite numbers joined by commas, up to 1e6, got {format_value(text)}"
+        )
     return values
 
 
@@ -150,7 +152,7 @@ def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
 
 def _preset(text: str) -> str:
     if text not in PRESETS:
-        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {shown(text)}")
+        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {format_value(text)}")
     return f"preset={text}"
 
 
@@ -287,7 +289,7 @@ class Console:
     def result(self, result: Mapping[str, Any], lines: Iterable[str], *, code: int = 0) -> int:
         """Print `result` as JSON with --json, else `lines`; return `code`."""
         if self.is_json:
-            text = json.dumps(enveloped(result, code), indent=2, allow_nan=False, default=plain)
+            text = json.dumps(wrap_result(result, code), indent=2, allow_nan=False, default=plain)
             self._args.is_printed = True
             print(text)
         else:

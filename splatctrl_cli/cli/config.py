@@ -13,7 +13,7 @@ from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import SCHEMA_FILE
 from splatctrl_cli.config.load import resolved_settings, template_of, toml_of
-from splatctrl_cli.config.ranges import shown
+from splatctrl_cli.config.ranges import format_value
 from splatctrl_cli.errors import UsageError, did_you_mean
 
 
@@ -46,7 +46,7 @@ def run_help(args: argparse.Namespace, console: Console) -> int:
     texts |= {page.stem: partial(page.read_text, encoding="utf-8") for page in folder.glob("*.md")}
     if topic not in texts:
         remedy = did_you_mean(topic, sorted(texts), f"give one of: {', '.join(sorted(texts))}")
-        raise UsageError(f"help: no page {shown(topic)}", remedy=remedy)
+        raise UsageError(f"help: no page {format_value(topic)}", remedy=remedy)
     text = texts[topic]()
     return console.result({"topic": topic, "text": text}, text.splitlines())
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from splatctrl_cli.cli.commands import build_parser, function_of, judges
 from splatctrl_cli.cli.common import Console
-from splatctrl_cli.cli.reports import enveloped, tell_of_failure
+from splatctrl_cli.cli.reports import tell_of_failure, wrap_result
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
 from splatctrl_cli.report.junit import check_replaceable
@@ -82,7 +82,7 @@ def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbo
     if is_json and not isinstance(sys.stdout, _Lost):
         with suppress(OSError):  # the error matters more than a failed print
             print(
-                json.dumps(enveloped({"error": {"message": message, "remedy": remedy}}, code), indent=2), flush=True
+                json.dumps(wrap_result({"error": {"message": message, "remedy": remedy}}, code), indent=2), flush=True
             )
     return line, code
 

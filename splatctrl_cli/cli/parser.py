@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn, TypeVar
 
-from splatctrl_cli.config.ranges import MAX_PLACE, OneOf, Section, Within, shown
+from splatctrl_cli.config.ranges import MAX_PLACE, OneOf, Section, Within, format_value
 from splatctrl_cli.errors import UsageError
 
 T = TypeVar("T", int, float)
@@ -91,9 +91,12 @@ class Parser(argparse.ArgumentParser):
     @property
     def groups(self) -> list[tuple[str, list[argparse.Action]]]:
         """Options by group title; ``--help`` shows the first."""
-        shown = [action for group in self._action_groups[:2] for action in group._group_actions]
+        first = [action for group in self._action_groups[:2] for action in group._group_actions]
         more = [*self._action_groups[2:], self.run_group]
-        return [("", shown), *((group.title or "", group._group_actions) for group in more if group._group_actions)]
+        return [
+            ("", first),
+            *((group.title or "", group._group_actions) for group in more if group._group_actions),
+        ]
 
     def format_usage(self) -> str:
         either = [group for group in self._mutually_exclusive_groups if group.required]
@@ -244,7 +247,7 @@ def several(text: str) -> tuple[float, ...]:
 
 def _parse_within(kind: Callable[[str], T], declared: Within) -> Callable[[str], T]:
     def parse(text: str) -> T:
-        what = f"expected {'a whole number, ' if kind is int else ''}{declared.expected}, got {shown(text)}"
+        what = f"expected {'a whole number, ' if kind is int else ''}{declared.expected}, got {format_value(text)}"
         try:
             value = kind(text)
         except ValueError:

@@ -11,7 +11,7 @@ from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
 from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.running.device import shown
+from splatctrl_cli.jobs.running.device import describe_device
 from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
 from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Box
@@ -66,5 +66,5 @@ def _lines(result: ReconstructResult) -> list[str]:
     return [
         *table(list(columns), [list(columns.values())]),
         f"removed: {', '.join(reasons) or 'none'}",
-        f"computed on {', then '.join(map(shown, metrics['devices']))}",
+        f"computed on {', then '.join(map(describe_device, metrics['devices']))}",
     ]

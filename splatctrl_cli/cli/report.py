@@ -28,14 +28,14 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def run_view(args: argparse.Namespace, console: Console) -> int:
     result = view(request_of(ViewRequest, args, roots=tuple(args.root)))
     found = f"{result.num_splats} splats, {result.num_states} states, {result.num_unknown} cubes never seen"
-    is_opened = not args.no_open and opened(result.file)
+    is_opened = not args.no_open and open_page(result.file)
     console.result({**asdict(result), "is_opened": is_opened}, [f"{result.file}: {found}, {result.bytes} bytes"])
     if not is_opened and not args.no_open:
         console.log(f"no browser here: open {result.file.absolute()}")
     return 0
 
 
-def opened(page: Path) -> bool:
+def open_page(page: Path) -> bool:
     """Open a page in a browser window; False without one."""
     if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in SCREENS):
         return False

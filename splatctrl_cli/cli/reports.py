@@ -18,7 +18,7 @@ SCHEMA = "splatctrl-output 1"
 SCHEMA_FILE = Path(__file__).parent.parent / "report" / "output.schema.json"
 
 
-def enveloped(result: Mapping[str, Any], code: int) -> dict[str, Any]:
+def wrap_result(result: Mapping[str, Any], code: int) -> dict[str, Any]:
     """Put the schema's name and the exit code in front of a result."""
     first = {"schema": SCHEMA, "exit_code": code}
     return {**first, **result, **first}

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from splatctrl_cli.config.ranges import Declared, Section, Within, check, copy_unchecked, cut, shown
+from splatctrl_cli.config.ranges import Declared, Section, Within, check, copy_unchecked, format_value, shorten
 from splatctrl_cli.config.sections import (
     ControlConfig,
     FieldConfig,
@@ -103,7 +103,7 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
     for section, values in ({} if path is None else _read_toml(path)).items():
         _check_known(section, [field.name for field in fields(Config)], str(path), "")
         if not isinstance(values, dict):
-            raise UsageError(f"{path}: {section}: expected a table, got {shown(values)}")
+            raise UsageError(f"{path}: {section}: expected a table, got {format_value(values)}")
         yield str(path), section, values
     for assignment in assignments:
         if assignment.partition("=")[0].strip() == "preset":
@@ -114,7 +114,7 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
             raise UsageError(
                 f"--set {assignment}: expected section.key=value", remedy="write it like --set scene.max_splats=3000"
             )
-        where = f"--set {cut(assignment)}"
+        where = f"--set {shorten(assignment)}"
         _check_known(section, [field.name for field in fields(Config)], where, "")
         yield where, section, {name: _parse_value(text.strip())}
 
@@ -131,7 +131,7 @@ def _convert(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]
         if type(typed[key]) not in [get_origin(option) or option for option in _options(hints[key])]:
             expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
             expected += declared[key].expected
-            raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {shown(value)}")
+            raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {format_value(value)}")
     return typed
 
 

@@ -104,18 +104,20 @@ def _declare(hint: Any) -> Declared:
 def check(holds: bool, name: str, expected: str, value: object) -> None:
     """Raise UsageError with key, expectation and value, unless `holds`."""
     if not holds:
-        raise UsageError(f"{name}: expected {expected}, got {shown(value)}", remedy="see splatctrl config --template")
+        raise UsageError(
+            f"{name}: expected {expected}, got {format_value(value)}", remedy="see splatctrl config --template"
+        )
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     try:
         text = repr(value)
     except ValueError:  # an integer of more digits than Python prints
         return f"{type(value).__name__} too long to show"
-    return cut(text)
+    return shorten(text)
 
 
-def cut(text: str) -> str:
+def shorten(text: str) -> str:
     return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
 
 

@@ -107,16 +107,16 @@ CLOUD_SCALES = {  # by the names of `cloud_score`
 }
 
 
-def spaced(points: Float64, spacing: float) -> Float64:
+def space_out(points: Float64, spacing: float) -> Float64:
     """Points (P, 3), visited in random order, farther than `spacing` [m] from all kept before.
 
     As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts. Points in cubes of half
     the edge are merged first (of the whole edge, if over 6 million are left).
     """
     _check_spacing(spacing)
-    some = thinned(points, spacing / 2)
+    some = thin(points, spacing / 2)
     if len(some) > 6_000_000:
-        some = thinned(points, spacing)
+        some = thin(points, spacing)
     some = some[np.random.default_rng(0).permutation(len(some))]
     low, high = (
         cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else np.empty((0, 2), np.int64)
@@ -133,7 +133,7 @@ def spaced(points: Float64, spacing: float) -> Float64:
     return some[kept]
 
 
-def thinned(points: Float64, spacing: float) -> Float64:
+def thin(points: Float64, spacing: float) -> Float64:
     """The first of points (P, 3) per cube of edge `spacing` [m].
 
     Thinning parts beforehand changes nothing.
@@ -156,10 +156,10 @@ def _check_spacing(spacing: float) -> None:
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
     """Random points (P, 3) [m] by area, four per squared `spacing`, at most 2 million."""
     num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), 2_000_000)
-    return drawn_on(mesh, num, np.random.default_rng(0))[0]
+    return draw_on(mesh, num, np.random.default_rng(0))[0]
 
 
-def drawn_on(mesh: TriangleMesh, num: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.int64]]:
+def draw_on(mesh: TriangleMesh, num: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.int64]]:
     """Random points (num, 3) [m] by area, and their triangles (num,)."""
     corners, doubled = mesh.corners, np.linalg.norm(face_normals(mesh.corners), axis=1)
     face = rng.choice(len(corners), num, p=doubled / doubled.sum())

@@ -18,7 +18,7 @@ from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.jobs.check import posed_robot
+from splatctrl_cli.jobs.check import pose_robot
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
@@ -97,7 +97,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
     out = request.out or Path("calibration.toml")
     if request.options.calibration is not None:
         raise UsageError("--calibration: what is calibrated is the recording as it is", remedy="leave it out")
-    model = posed_robot(request.paths, request.urdf, request)
+    model = pose_robot(request.paths, request.urdf, request)
     source = open_session(request.paths, request.options)
     arm = None if model is None else _arm(model, source)
     with output_path(out, force=request.force, is_folder=False) as partial:

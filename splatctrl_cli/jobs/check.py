@@ -47,7 +47,7 @@ def check(request: CheckRequest) -> tuple[CheckReport, Verdict]:
     """
     if request.num_images is not None and request.num_images < 1:
         raise UsageError(f"--quick {request.num_images}: expected 1 or more")
-    model = posed_robot(request.paths, request.urdf, request)
+    model = pose_robot(request.paths, request.urdf, request)
     other = "" if request.urdf is None or model is None else differs(model.urdf, request.paths)
     report = _report(request, model)
     report = replace(
@@ -77,7 +77,7 @@ def _report(request: CheckRequest, model: RobotModel | None, *, only_errors: boo
     return replace(report, findings=[*report.findings, *_agreement(report)])
 
 
-def posed_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) -> RobotModel | None:
+def pose_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) -> RobotModel | None:
     """Robot of a URDF, with spheres alone the recording's own; None without either.
 
     Raises UsageError for robot options without one.

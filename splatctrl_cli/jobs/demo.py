@@ -16,7 +16,7 @@ from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.score.views import rendered_with_shell
+from splatctrl_cli.jobs.score.views import render_with_shell
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
@@ -156,7 +156,7 @@ def _draw(data: Path, out: Path, threads: int) -> None:
 
 
 def _comparison(frame: RgbdFrame, scene: SceneFolder, threads: int) -> ComparisonRow:
-    view, depth = rendered_with_shell(scene.splats(), scene.shell_at(None), frame, scene.background, threads)
+    view, depth = render_with_shell(scene.splats(), scene.shell_at(None), frame, scene.background, threads)
     figure = psnr(view.color, frame.color / 255.0, depth > 0)
     return ComparisonRow(
         title=f"{frame.camera} ({'scoring only' if frame.camera == SCORED else 'training'})",

@@ -11,7 +11,7 @@ from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import check_same_run, told_how_to_go_on
+from splatctrl_cli.jobs.running.resume import advise_resumption, check_same_run
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.capture.capture_writer import JOURNAL, read_identity, write_capture
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT
@@ -56,7 +56,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
     identity = _identity(options, source.digests())
     journal = partial_path(out) / JOURNAL
     with (
-        told_how_to_go_on(journal, journal.parent),
+        advise_resumption(journal, journal.parent),
         output_path(out, force=request.force, is_folder=True, checkpoint=JOURNAL, resume=request.resume) as partial,
     ):
         if (before := read_identity(partial)) is not None:

@@ -155,13 +155,13 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
     InputError for a start or goal outside the limits, NotEvaluableError for one in collision.
     """
     began = time.perf_counter()
-    roots = checked_postures(clearance, start, goals, config)
+    roots = check_postures(clearance, start, goals, config)
     search = _Search(clearance, config, (_Tree(roots[:1]), _Tree(roots[1:])), np.random.default_rng(seed), began)
     outcome, found, goal = search.run()
     searched = time.perf_counter()
     waypoints = found
     if outcome is PlanOutcome.SOLVED:
-        waypoints, num_edges, num_checks = shortened(clearance, found, config, search.random)
+        waypoints, num_edges, num_checks = shorten_path(clearance, found, config, search.random)
         search.num_edges += num_edges
         search.num_checks += num_checks
     return Plan(
@@ -177,7 +177,7 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
     )
 
 
-def checked_postures(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig) -> Float64:
+def check_postures(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig) -> Float64:
     """Start and goals (1 + G, J) within limits and free. Raises as `plan`."""
     model = clearance.model
     rows = [checked_posture(model, start, what="start")]
@@ -202,7 +202,7 @@ def checked_postures(clearance: Clearance, start: Float64, goals: Float64, confi
     return np.array(rows)
 
 
-def shortened(
+def shorten_path(
     clearance: Clearance, waypoints: Float64, config: PlannerConfig, random: np.random.Generator
 ) -> tuple[Float64, int, int]:
     """A path (W', J) of proved edges, not longer, and the checks made.

@@ -47,7 +47,7 @@ def effector_rates(
     return rates
 
 
-def timed(
+def time_path(
     waypoints: Float64, velocity_limit: Float64, max_acceleration: float, *, max_rate: Float64 | None = None
 ) -> TimedPath:
     """Fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
@@ -127,7 +127,7 @@ def planned_path(
         room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
         outcome, way = _find(room, task, goals, approach, planner, control)
         if outcome is PlanOutcome.SOLVED:
-            path = timed(
+            path = time_path(
                 way,
                 model.velocity_limit,
                 planner.max_acceleration,

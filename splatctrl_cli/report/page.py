@@ -124,7 +124,7 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
     return trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=SIDES)
 
 
-def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
+def coarsen(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
     """Centres (K, 3) and edge [m] of at most `most` cubes on unknown space's border.
 
     Larger cubes are unknown by half or more.
@@ -156,7 +156,7 @@ def three_js() -> str:
     return _deflate(script.encode("utf-8"))
 
 
-def packed(space: Space) -> str:
+def pack(space: Space) -> str:
     block = bytearray()
     lower, upper = space.box()
     header: dict[str, Any] = {
@@ -307,7 +307,7 @@ class Page:
     opens: bool = False
 
 
-def rendered(page: Page) -> str:
+def render_page(page: Page) -> str:
     """The page as HTML, all text escaped."""
     environment = Environment(loader=FileSystemLoader(PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {

@@ -44,14 +44,14 @@ from splatctrl_cli.jobs.bake.request import (
     BakeSource,
     Previous,
     check_same,
-    covered,
+    choose_box,
     device_for,
     read_bake_source,
     read_previous,
 )
-from splatctrl_cli.jobs.running.device import Device, named
+from splatctrl_cli.jobs.running.device import Device, explain_fault
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
-from splatctrl_cli.jobs.running.resume import check_resumption, deciding_versions, told_how_to_go_on
+from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, deciding_versions
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import (
@@ -165,7 +165,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
     checkpoint = partial_path(out) / CHECKPOINT
     check_resumption(checkpoint, "bake", progress, resume=request.resume)
     with (
-        told_how_to_go_on(checkpoint),
+        advise_resumption(checkpoint),
         output_path(
             out, force=request.force, is_folder=True, checkpoint=CHECKPOINT, resume=request.resume
         ) as partial,
@@ -178,7 +178,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
             try:
                 grid, changes = _bake_grid(job, partial, progress)
             except DeviceError as error:
-                raise named(error, job.device, checkpoint) from error
+                raise explain_fault(error, job.device, checkpoint) from error
             finally:
                 job.baker.close()
         with stopwatch.stage("report"):
@@ -246,7 +246,7 @@ def _read(request: BakeRequest, stopwatch: Stopwatch, progress: Progress) -> _Jo
     channels = _channels(request, previous)
     check_references(request, source)
     check_formats(request.formats, channels, unknown=config.field.unknown)
-    layout = GridLayout.over(covered(request, source, previous), config.field.voxel)
+    layout = GridLayout.over(choose_box(request, source, previous), config.field.voxel)
     if previous is not None:
         check_same(previous, layout, config.field, channels, request.label_names)
     with stopwatch.stage("bake"):

@@ -85,7 +85,7 @@ def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
     return nodes
 
 
-def of_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
+def select_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
     index, count = shard
     chosen = set(list(dict.fromkeys(node.recording for node in nodes))[index - 1 :: count])
     return [node for node in nodes if node.recording in chosen]

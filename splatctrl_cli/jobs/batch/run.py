@@ -138,7 +138,7 @@ class Scheduler:
         self.runs[node.name] = run
         line = clock.passed(run)
         if run.started >= clock.started or run.state == SKIPPED:
-            self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
+            self.progress.log(f"{line} {node.name}: {describe_run(run)}{clock.left()}")
 
     def _place(self, node: Node, ending: str) -> str:
         return str((self.ledger.folder / node.name).absolute()) + ending
@@ -188,7 +188,7 @@ def _judge_again(run: Run, node: Node) -> Run:
     return replace(run, state=state, expect=node.expect)
 
 
-def told(run: Run) -> str:
+def describe_run(run: Run) -> str:
     if run.state == SKIPPED:
         return f"skipped: {run.cause}"
     what = run.cause or (run.label.upper() if run.outcome else run.label)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.config.ranges import shown
+from splatctrl_cli.config.ranges import format_value
 from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 
 Table = Mapping[str, Any]
@@ -114,7 +114,7 @@ def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str])
 def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = None) -> Job:
     where = f"[jobs.{name}]"
     if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {shown(table)}")
+        raise UsageError(f"{where}: expected a table, got {format_value(table)}")
     _check_name(where, name)
     command = _worded(where, "command", table.get("command", base.command if base else name))
     if command not in commands:
@@ -126,7 +126,7 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
         raise UsageError(f"{where}: a batch gives {own} itself", remedy="leave it out")
     matrix = table.get("matrix", {})
     if not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()):
-        raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {shown(matrix)}")
+        raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {format_value(matrix)}")
     expect = _worded(where, "expect", table.get("expect", base.expect if base else "passed"))
     if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
         raise UsageError(
@@ -150,7 +150,7 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
 def _recordings(folder: Path, table: Table) -> list[Recording]:
     where = "[[recordings]]"
     if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {shown(table)}", remedy="give it paths = [...]")
+        raise UsageError(f"{where}: expected a table, got {format_value(table)}", remedy="give it paths = [...]")
     _check_keys(where, table, ("name", "paths", "session", "only", "jobs"))
     only = tuple(_worded(where, "only", name) for name in _list(where, table, "only"))
     if ("paths" in table) == ("session" in table):
@@ -235,21 +235,21 @@ def _check_name(where: str, name: str) -> None:
 
 def _worded(where: str, key: str, value: object) -> str:
     if not isinstance(value, str):
-        raise UsageError(f"{where} {key}: expected text, got {shown(value)}")
+        raise UsageError(f"{where} {key}: expected text, got {format_value(value)}")
     return value
 
 
 def _list(where: str, table: Table, key: str) -> list[Any]:
     value = table.get(key, [])
     if not isinstance(value, list) or (key in table and not value):
-        raise UsageError(f"{where} {key}: expected a list, got {shown(value)}")
+        raise UsageError(f"{where} {key}: expected a list, got {format_value(value)}")
     return value
 
 
 def _tables(where: str, table: Table, key: str) -> dict[str, Table]:
     value = table.get(key, {})
     if not isinstance(value, dict) or not all(isinstance(each, dict) for each in value.values()):
-        raise UsageError(f"{where} {key}: expected [{key}.NAME], got {shown(value)}")
+        raise UsageError(f"{where} {key}: expected [{key}.NAME], got {format_value(value)}")
     return value
 
 
@@ -263,5 +263,5 @@ def _amount(where: str, table: Table, key: str, units: Mapping[str, int], defaul
         amount = -1.0
     if isinstance(value, bool) or not 0 <= amount < 1e15:
         example = f" or with one of {', '.join(units)}" if units else ""
-        raise UsageError(f"{where} {key}: expected a number, 0 or more{example}, got {shown(value)}")
+        raise UsageError(f"{where} {key}: expected a number, 0 or more{example}, got {format_value(value)}")
     return amount

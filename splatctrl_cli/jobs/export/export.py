@@ -37,7 +37,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
-from splatctrl_cli.jobs.score.views import rendered
+from splatctrl_cli.jobs.score.views import render_splats
 from splatctrl_cli.recording.container.mcap_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
 
@@ -231,7 +231,7 @@ def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:
-        one, two = (rendered(splats, intrinsics, T_world_camera) for splats in (a, b))
+        one, two = (render_splats(splats, intrinsics, T_world_camera) for splats in (a, b))
         pairs = ((one.color, two.color), (one.opacity, two.opacity), (one.depth / size, two.depth / size))
         largest = max(largest, *(float(np.abs(x.astype(np.float64) - y).max()) for x, y in pairs))
         covered += float(np.mean(one.opacity > 0)) / len(poses)

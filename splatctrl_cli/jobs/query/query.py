@@ -26,7 +26,7 @@ from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.ply import point_blocks
 from splatctrl_cli.formats.scene.scene_folder import run_value
 from splatctrl_cli.jobs.bake.request import BakeSource, read_bake_source, source_of_grid
-from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen, named
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, choose_device, explain_fault
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory
 from splatctrl_cli.records import Bool, Box, DistanceField, DistanceGrid, Float64, Label
@@ -256,7 +256,7 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
                 try:
                     answers = asked.at(points)
                 except DeviceError as error:
-                    raise named(error, asked.device) from error
+                    raise explain_fault(error, asked.device) from error
                 figures.append(_figures_of(answers))
                 if out is not None:
                     out.write(rows_of(points, answers))
@@ -289,7 +289,7 @@ def _open_source(request: QueryRequest, progress: Progress) -> _Asked:
                 f"--scene: belongs to a field, and {request.source} is a scene", remedy="leave --scene out"
             )
         source = read_bake_source(request.source, request.at)
-        device = chosen(request.device, _is_enough(request.points), progress)
+        device = choose_device(request.device, _is_enough(request.points), progress)
         scene = _scene(source, request, request.labels, request.config, device)
         return _Asked(kind="scene", at=scene.at, box=source.workspace, device=device)
     if request.at is not None:
@@ -307,7 +307,7 @@ def _open_source(request: QueryRequest, progress: Progress) -> _Asked:
     )
     baked = {name: run_value(grid.header, (key,), kind, where=where) for name, (key, kind) in OF_GRID.items()}
     config = replace(request.config, field=replace(request.config.field, unknown="free", **baked))
-    device = chosen(request.device, _is_enough(request.points), progress)
+    device = choose_device(request.device, _is_enough(request.points), progress)
     both = _scene(source_of_grid(where, grid, request.scene), request, labels, config, device)
 
     def at(points: Float64) -> Answers:

@@ -51,15 +51,15 @@ class Evidence:
     every: int | None = None
 
     def frame_sets(self) -> Iterator[TimeStep]:
-        return held_out(time_steps(self.source.records(), self.cameras, has_clock=True), self.every)
+        return select_held_out(time_steps(self.source.records(), self.cameras, has_clock=True), self.every)
 
 
-def held_out(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
+def select_held_out(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
     """Select each `every`-th frame set, the held-out ones; None selects all."""
     return islice(iter(steps), None if every is None else every - 1, None, every or 1)
 
 
-def trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
+def select_trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
     """Select the training frame sets; None selects all."""
     return (step for number, step in enumerate(steps, start=1) if every is None or number % every)
 
@@ -275,7 +275,7 @@ class TrueSurfaces:
             yield frame
 
 
-def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
+def add_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
     """Add true clearances and their events; the surfaces are None without a truth."""
     if inputs.truth is None:
         return replay, None
@@ -302,7 +302,7 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
     return replace(replay, true_clearance=truth, events=merged), TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
 
 
-def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
+def add_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
     """Compare the audit with the truth near seen surfaces, after the last frame."""
     truth = np.asarray(replay.true_clearance)
     return replace(

@@ -275,7 +275,7 @@ def belonging(judged: Judged) -> Iterator[Reason]:
     yield from judged.inputs.mismatches
 
 
-def displaced(judged: Judged) -> tuple[str, float] | None:
+def find_displaced(judged: Judged) -> tuple[str, float] | None:
     """The worst uncorrected displaced camera and its offset [m]; None without any."""
     rows = judged.inputs.scene.figures().get("displaced_cameras") or {}
     off = {
@@ -289,7 +289,7 @@ def displaced(judged: Judged) -> tuple[str, float] | None:
 def calibration(judged: Judged) -> Iterator[Reason]:
     """Each camera sees the robot, and all together each link, within 5 mm of where its joints put it."""
     figures = judged.inputs.scene.figures()
-    if (camera := displaced(judged)) is not None:
+    if (camera := find_displaced(judged)) is not None:
         yield lacking(
             sentence=f"{camera[0]} sees the robot {mm(camera[1])} from where its joints put it, allowed "
             f"{mm(MISPLACED)}: obstacles near it in the map may be the robot itself",

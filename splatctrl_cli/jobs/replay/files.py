@@ -184,11 +184,11 @@ def when_and_why(replay: Replay) -> list[str]:
     lines = []
     if replay.steps and replay.outside is None:
         first = first_intervention(replay.events)
-        lines.append("first intervention: none" if first is None else f"first intervention: {told(first)}")
+        lines.append("first intervention: none" if first is None else f"first intervention: {describe_event(first)}")
     troubles = [event for event in replay.events if event.kind not in INTERVENTIONS and event.source in SHOWN]
     for event in list({(event.kind, event.source): event for event in reversed(troubles)}.values())[::-1]:
         count = sum(other.kind == event.kind and other.source == event.source for other in troubles)
-        told_once = told(event, with_kind=False)
+        told_once = describe_event(event, with_kind=False)
         lines.append(
             f"{event.kind}{SHOWN[event.source]}: {told_once}" + (f"; {count} such intervals" if count > 1 else "")
         )
@@ -197,7 +197,7 @@ def when_and_why(replay: Replay) -> list[str]:
     return lines or ["no event: no state is below the margin, outside its limits or in space that is not known"]
 
 
-def told(event: Event, *, with_kind: bool = True) -> str:
+def describe_event(event: Event, *, with_kind: bool = True) -> str:
     unit = UNITS.get(event.kind, "")
     span = f"{event.start_s:.2f} to {event.end_s:.2f} s"
     more = f" and {event.num_names - 1} more" if event.num_names > 1 else ""

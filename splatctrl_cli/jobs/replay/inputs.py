@@ -20,7 +20,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.robot.logged_robot import other_frame, urdf_of, with_self_model
+from splatctrl_cli.jobs.robot.logged_robot import add_self_model, other_frame, urdf_of
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.log.stored_frame import FrameSource
@@ -69,7 +69,7 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
         )
     if request.urdf is None and request.base is None and (words := other_frame(urdf, source)):
         progress.log(f"warning: the robot is placed at the origin: {words}; give --base if it stood elsewhere")
-    return with_self_model(model.moved_by(source.joint_names), request.self_model, request.scene), source
+    return add_self_model(model.moved_by(source.joint_names), request.self_model, request.scene), source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.reconstruct.reconstruct import arm_seen
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import check_pose_jumps
-from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, trained, training_options
+from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, select_trained, training_options
 from splatctrl_cli.jobs.replay.known_scene import (
     KnownFields,
     KnownScene,
@@ -54,7 +54,7 @@ def check_lockstep(request: ReplayRequest) -> None:
         raise UsageError(f"--device {request.device}: expected --lockstep: only a fit is worth a card", remedy=TO_CPU)
 
 
-def opened_scene(
+def choose_scene(
     request: ReplayRequest,
     model: RobotModel,
     declared: Declarations,
@@ -152,7 +152,7 @@ class Lockstep:
         self._stopwatch = Stopwatch()
         self._taking: list[tuple[int, float]] = []  # stamp [ns] and duration [s] of each frame set
         self._held_out_every = held_out_every
-        self._steps = trained(fitted.time_steps(), held_out_every)
+        self._steps = select_trained(fitted.time_steps(), held_out_every)
         self._next = next(self._steps, None)
         self._stamps_ns: list[int] = []
         self._files: list[Path] = []

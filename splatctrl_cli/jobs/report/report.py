@@ -24,7 +24,7 @@ from splatctrl_cli.jobs.runs.run_folder import (
     open_batch,
     open_run,
 )
-from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, packed, picture, rendered
+from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, pack, picture, render_page
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
 MOST_ROWS = 40  # of recordings that are shown at once
@@ -83,13 +83,13 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
 
 
 def _write(request: FolderRequest, page: Page) -> Path:
-    out = request.out or beside(request.path)
+    out = request.out or default_page(request.path)
     with output_path(out, force=request.force, is_folder=False) as partial:
-        partial.write_text(rendered(page), encoding="utf-8")
+        partial.write_text(render_page(page), encoding="utf-8")
     return out
 
 
-def beside(path: Path) -> Path:
+def default_page(path: Path) -> Path:
     place = path.absolute() if not path.name.strip(".") else path
     return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
 
@@ -113,7 +113,7 @@ def _add_space(
     section: RunSection, run: RunFolder, roots: tuple[Path, ...], scenes: dict[str, str], name: str
 ) -> RunSection:
     try:
-        scenes[name] = packed(space_of_run(run, roots))
+        scenes[name] = pack(space_of_run(run, roots))
         return replace(section, space=name)
     except SplatCtrlError as error:
         return replace(section, no_space=f"not in 3-D: {error}")
@@ -308,7 +308,7 @@ def view(request: ViewRequest) -> ViewResult:
         state="",
         sentence="",
         runs=[RunSection(anchor="scene", title="", state="", sentence="", space="scene")],
-        scenes={"scene": packed(space)},
+        scenes={"scene": pack(space)},
         opens=True,
     )
     file = _write(request, page)

@@ -19,7 +19,7 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
 from splatctrl_cli.recording.capture.capture import ROBOT
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
-from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_of, coarsened
+from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_of, coarsen
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
@@ -81,7 +81,7 @@ def space_of_grid(path: Path) -> Space:
     if "observed" not in grid.channels:
         return space
     is_unknown = np.asarray(grid.channels["observed"]) == VoxelState.NEVER_SEEN
-    return replace(space, unknown=coarsened(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN))
+    return replace(space, unknown=coarsen(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN))
 
 
 def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
@@ -197,7 +197,7 @@ def _add_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -
         return space
     used: Mapping[str, Any] = scene.run.get("config", {}).get("occupancy", {})
     states = grid.states(float(used.get("free_below", 0.3)), float(used.get("occupied_above", 0.7)))
-    return replace(space, unknown=coarsened(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN))
+    return replace(space, unknown=coarsen(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN))
 
 
 def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:

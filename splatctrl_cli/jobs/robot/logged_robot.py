@@ -70,7 +70,7 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
     return file
 
 
-def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = None) -> RobotModel:
+def add_self_model(model: RobotModel, given: Path | None, scene: Path | None = None) -> RobotModel:
     """Add a self-model (`robot learn`): the given file, else the scene's if of this robot.
 
     `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or another robot's.

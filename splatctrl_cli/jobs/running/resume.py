@@ -58,7 +58,7 @@ def deciding_versions() -> dict[str, str]:
 
 
 @contextmanager
-def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
+def advise_resumption(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
     """Add to Ctrl-C what was kept, by default the folder two above the checkpoint."""
     try:
         yield

@@ -273,7 +273,9 @@ def _score_scans(
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
         # gates and baseline apply to the means alone
-        alone = replace(request, scene=scene, recording=of_scan(request.recording, scan), require=(), baseline=None)
+        alone = replace(
+            request, scene=scene, recording=select_scan(request.recording, scan), require=(), baseline=None
+        )
         results[scan] = _score_scene(alone, folder and folder / scan, progress)
     report = {
         "scenes": str(request.scene),
@@ -289,7 +291,7 @@ def _score_scans(
     return result
 
 
-def of_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
+def select_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
     """Recording of one scan with its masks in DIR/SCAN.
 
     Raises InputError without them: masks of one scan fit no other.

@@ -14,7 +14,7 @@ import numpy as np
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
+from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, space_out, thin
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
 from splatctrl_cli.evaluate.score import CORRECTABLE, CORRECTED, score_view
 from splatctrl_cli.evaluate.score_report import Doubts
@@ -145,7 +145,7 @@ class Scorer:
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
     ) -> tuple[dict[str, float], ComparisonRow]:
         protocol = self.reference.protocol
-        rendering, depth = rendered_with_shell(splats, shell, frame, self.scene.background, self.threads)
+        rendering, depth = render_with_shell(splats, shell, frame, self.scene.background, self.threads)
         mask = None if self.reference.mask is None else self.reference.mask(frame)
         figures = score_view(
             color=rendering.color,
@@ -173,7 +173,7 @@ def _caption(figures: Mapping[str, float]) -> str:
     return "dB: " + ", ".join(parts)
 
 
-def rendered_with_shell(
+def render_with_shell(
     splats: SplatSet | GaussianSet,
     shell: SplatSet | None,
     frame: RgbdFrame,
@@ -182,14 +182,14 @@ def rendered_with_shell(
 ) -> tuple[Rendering, Float32]:
     """Render splats before a background; their depth (H, W) [m] is without the shell."""
     camera = frame.intrinsics, frame.T_world_camera
-    rendering = rendered(splats, *camera, threads)
+    rendering = render_splats(splats, *camera, threads)
     depth = rendering.normalised_depth()
     if isinstance(splats, SplatSet) and shell is not None:
-        rendering = rendered(splats.joined(shell), *camera, threads)
+        rendering = render_splats(splats.joined(shell), *camera, threads)
     return rendering.before(background), depth
 
 
-def rendered(
+def render_splats(
     splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int = 0
 ) -> Rendering:
     if isinstance(splats, GaussianSet):
@@ -233,7 +233,7 @@ def cloud_figures(
     settings: CloudSettings, scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int
 ) -> dict[str, float]:
     """Surface figures by flat name, seen from training views `frames`."""
-    reference, space, counts = spaced(_reference(settings), settings.spacing), settings.space, None
+    reference, space, counts = space_out(_reference(settings), settings.spacing), settings.space, None
     points = _surface(scene, frames, threads, settings.spacing)
     if space is not None:
         reference, points = reference[space.above(reference)], points[space.near(points)]
@@ -260,7 +260,7 @@ def _surface(scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int, spac
     """World points (P, 3) [m] of the final depth at `frames`, without robot, `spacing` apart."""
     splats = final_splats(scene)
     splats = splats.select(splats.labels != Label.ROBOT)
-    shown = (rendered(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)
+    shown = (render_splats(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)
     seen = (replace(f, depth=image.normalised_depth()) for f, image in zip(frames, shown, strict=True))
-    parts = [thinned(surface_points(frame)[0], spacing / 2) for frame in seen]
-    return spaced(np.concatenate(parts), spacing) if parts else np.empty((0, 3))
+    parts = [thin(surface_points(frame)[0], spacing / 2) for frame in seen]
+    return space_out(np.concatenate(parts), spacing) if parts else np.empty((0, 3))

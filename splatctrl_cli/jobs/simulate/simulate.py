@@ -168,11 +168,11 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
         robot = RobotModel.from_urdf(urdf, spheres)
     else:
         progress.log(f"simulate: reading {request.urdf.name}")
-        robot, surfaces = copied_arm(request.urdf, request.spheres, request.packages, folder, progress)
+        robot, surfaces = copy_arm(request.urdf, request.spheres, request.packages, folder, progress)
     scene = Scene.of(options) if request.scene is None else request.scene(robot)
     if surfaces is not None and request.scene is None:
         progress.log("simulate: looking for a way through the scene")
-        scene = replace(scene, motion=adapted_motion(scene, robot, surfaces))
+        scene = replace(scene, motion=adapt_motion(scene, robot, surfaces))
     return Recording(options, robot, scene, request.unmodelled)
 
 
@@ -188,7 +188,7 @@ LATE = 1e3  # [rad/s] a second longer than its time costs as much: every way in 
 REMEDY = "give the URDF of an arm whose base stands on the table's top"
 
 
-def copied_arm(
+def copy_arm(
     urdf: Path, given: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
 ) -> tuple[RobotModel, SelfSurfaces]:
     """Copy ``robot.urdf``, its ``meshes/`` and ``robot_spheres.yaml`` into a folder and read them.
@@ -213,7 +213,7 @@ def copied_arm(
     return model, SelfSurfaces(model, solids)
 
 
-def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
+def adapt_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
     """Adapt the scene's motion to another arm, whose tip follows the simulated arm's hand.
 
     The tip is the URDF's last link, its z pointing away from the arm. It goes as far as it reaches, turned any way
