@@ -308,7 +308,7 @@ class Console:
     ) -> int:
         """Print a verdict, then `result` or `lines`; return the exit code.
 
-        With --json a failure's sentence also goes to stderr. has_findings: `lines` contain the reasons.
+        has_findings: `lines` contain the reasons.
         """
         code = verdict.exit_code if code is None else code
         self._args.label = verdict.label

@@ -23,7 +23,7 @@ INK, PAPER = (34, 34, 34), (255, 255, 255)
 class Moment:
     """Spheres (S, 3), radii (S,) [m], world, and the worst of them, to draw.
 
-    obstacle (3,): nearest surface point, or NaN. caption: lines under the image. is_moving (S,): moved by a joint.
+    obstacle (3,): nearest surface point, or NaN. is_moving (S,): by a joint.
     """
 
     stamp_ns: int

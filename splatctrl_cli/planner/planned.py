@@ -229,7 +229,7 @@ def goal_postures(
 ) -> Float64:
     """Distinct postures (G, J) within limits that bring `frame` to a pose.
 
-    They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, 0 if no guess (K, J) succeeds.
+    They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, perhaps 0.
     """
     found: list[Float64] = []
     for guess in guesses:

@@ -87,8 +87,7 @@ def gradient_picture(
 ) -> None:
     """Write the gradient's length in a slice across z, and its histogram over the grid.
 
-    histogram: cells by length, bin k about k times `bin_width`, the last for all longer. A distance has length 1
-    (Eikonal equation).
+    histogram: cells by length, bin k about k times `bin_width`, the last for all longer.
     """
     (cut,) = _cuts(grid, point, axes=(2,))
     sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]

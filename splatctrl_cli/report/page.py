@@ -53,31 +53,19 @@ class Motion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deciding:
-    """The deciding event: sentence, time [s], place (3,) [m], world.
-
-    sphere: the arm's there, centre (3,) and radius [m], or None.
-    """
-
-    sentence: str
-    time_s: float
-    place: Float64
-    sphere: tuple[Float64, float] | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class Space:
     """Content of a 3-D page, world [m].
 
     splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) and edge
-    of never-seen cubes. surface: where a baked distance is 0.
+    of never-seen cubes. surface: where a baked distance is 0. deciding: the event's sentence, time [s] and place,
+    with center and radius of the arm's sphere there [m].
     """
 
     splats: Mapping[float, SplatSet] = field(default_factory=dict)
     unknown: tuple[Float32, float] | None = None
     surface: Surface | None = None
     motion: Motion | None = None
-    deciding: Deciding | None = None
+    deciding: Mapping[str, Any] | None = None
 
     def box(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of 90 % of splats, path and surface."""
@@ -173,15 +161,8 @@ def pack(space: Space) -> str:
         header["surface"] = _mesh(block, space.surface)
     if space.motion is not None:
         header["motion"] = _motion(block, space.motion)
-    if (deciding := space.deciding) is not None:
-        header["deciding"] = {
-            "sentence": deciding.sentence,
-            "time": deciding.time_s,
-            "place": np.asarray(deciding.place).tolist(),
-        }
-        if deciding.sphere is not None:
-            center, radius = deciding.sphere
-            header["deciding"] |= {"center": np.asarray(center).tolist(), "radius": radius}
+    if space.deciding is not None:
+        header["deciding"] = space.deciding
     return json.dumps({"header": header, "bytes": _deflate(block)}, allow_nan=False)
 
 

@@ -159,10 +159,7 @@ def _held_out_cameras(
 
 
 def field_document(grid: DistanceGrid, statistics: GridStatistics, changes: Changes | None) -> dict[str, Any]:
-    """Content of ``field.json`` without accuracy: header and place first, an update's changes last.
-
-    Warnings are about splat health, and a box far from all splats.
-    """
+    """Content of ``field.json`` without accuracy: header and place first, an update's changes last."""
     header: Mapping[str, Any] = grid.header
     warnings, lowest, update = tuple(header["health"]["warnings"]), statistics.lowest, {}
     if lowest is not None and lowest > FAR_GRID:

@@ -140,7 +140,7 @@ class Previous:
 def read_previous(path: Path, scene: Path) -> Previous:
     """Read the field in folder `path` and the splats of `scene` it was baked from.
 
-    Raises InputError for a missing, damaged or foreign field, UsageError for another scene or version.
+    Raises InputError for a missing or damaged field, UsageError for another scene or version.
     """
     if not path.is_dir():
         raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")

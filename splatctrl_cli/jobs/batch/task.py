@@ -40,7 +40,7 @@ BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # reported by the batc
 class Task:
     """Work of a runner: call `entry` with `words`, write `result` (stdout), `log` (stderr), `end`.
 
-    key: the node's, kept in `end`. timeout [s], memory [bytes]: 0 for no limit. Plain values, for other machines.
+    key: the node's, kept in `end`. timeout [s], memory [bytes]: 0 for no limit.
     """
 
     entry: str

@@ -136,7 +136,7 @@ class CompareResult:
 def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResult:
     """Compare, and write a requested baseline.
 
-    Raises UsageError for another form of request, InputError for unreadable or unlike runs.
+    Raises UsageError for another request, InputError for unreadable or unlike runs.
     """
     num_needed = 1 if request.against is not None else 2
     if len(request.runs) != num_needed and not (len(request.runs) == 1 and request.update_baseline is not None):

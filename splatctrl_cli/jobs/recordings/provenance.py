@@ -25,8 +25,7 @@ from splatctrl_cli.simulate.truth import Truth
 def first_frame(frame: RgbdFrame) -> dict[str, Any]:
     """Facts of a camera's first training frame for ``run.json``.
 
-    intrinsics [px]: fx, fy, cx, cy, width, height; T_world_camera: 16 numbers by row; tiles: coarse colours (0 to
-    255).
+    intrinsics [px]: fx, fy, cx, cy, width, height; T_world_camera: 16 numbers by row; tiles: colours (0 to 255).
     """
     k = frame.intrinsics
     return {

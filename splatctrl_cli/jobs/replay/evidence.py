@@ -60,7 +60,6 @@ def select_held_out(steps: Iterable[TimeStep], every: int | None) -> Iterator[Ti
 
 
 def select_trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
-    """Select the training frame sets; None selects all."""
     return (step for number, step in enumerate(steps, start=1) if every is None or number % every)
 
 

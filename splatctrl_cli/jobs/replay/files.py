@@ -43,7 +43,6 @@ def chunks_of(replay: Replay) -> Iterator[Columns]:
 
 
 def columns_of(replay: Replay, rows: slice = slice(None)) -> Columns:
-    """Columns of a range of states, by name."""
     first, last, _ = rows.indices(len(replay.audit.stamp_ns))
     audit, names = replay.audit.block(first, last), sphere_names(replay.model.sphere_set)
     columns: Columns = {

@@ -19,7 +19,7 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
 from splatctrl_cli.recording.capture.capture import ROBOT
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
-from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_of, coarsen
+from splatctrl_cli.report.page import Motion, Space, Surface, bodies_of, coarsen
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
@@ -142,14 +142,14 @@ def _file(run: RunFolder, given: str, roots: tuple[Path, ...]) -> Path:
     return place
 
 
-def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding: Deciding | None) -> Space:
+def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding: Mapping[str, Any] | None) -> Space:
     if (grid := run.option("--field")) is not None:
         place = _file(run, grid, roots)
         return space_of_grid(place / "field.npz" if place.is_dir() else place)
     scene = scene_of(run, roots)
     known = sets_known(run, states, scene)
     times, used = [time for time, _ in known], [snapshot for _, snapshot in known]
-    when = 0.0 if deciding is None else deciding.time_s
+    when = 0.0 if deciding is None else deciding["time"]
     chosen = spread(times, when)
     sets = {times[i] if n else 0.0: used[i].splats() for n, i in enumerate(chosen)}
     at = max((i for i in chosen if times[i] <= when), default=None)
@@ -229,7 +229,7 @@ def position_of(states: States, robot: RobotModel, state: int) -> Float64:
         ) from None
 
 
-def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | None:
+def _deciding(run: RunFolder, states: States, robot: RobotModel) -> dict[str, Any] | None:
     for reason in run.verdict.get("reasons", []):
         if reason["outcome"] != "passed" and reason["place"] is not None and reason["time_s"] is not None:
             words = f"{reason['sentence']} at {reason['time_s']:.2f} s, {reason['cause']}"
@@ -245,12 +245,16 @@ def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | N
 
 def _find_deciding(
     states: States, robot: RobotModel, words: str, time_s: float, place: list[float], who: str
-) -> Deciding:
+) -> dict[str, Any]:
     state = int(np.argmin(np.abs(states.seconds - time_s)))
     centers, radii = robot.sphere_centers(position_of(states, robot, state)), robot.sphere_set.radii
     names = sphere_names(robot.sphere_set)
     gaps = np.linalg.norm(centers - np.array(place), axis=1) - radii
     sphere = names.index(who) if who in names else int(np.argmin(np.where(robot.moving_spheres, gaps, np.inf)))
-    return Deciding(
-        sentence=words, time_s=time_s, place=np.array(place), sphere=(centers[sphere], float(radii[sphere]))
-    )
+    return {
+        "sentence": words,
+        "time": time_s,
+        "place": np.array(place).tolist(),
+        "center": centers[sphere].tolist(),
+        "radius": float(radii[sphere]),
+    }

@@ -59,7 +59,6 @@ def deciding_versions() -> dict[str, str]:
 
 @contextmanager
 def advise_resumption(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
-    """Add to Ctrl-C what was kept, by default the folder two above the checkpoint."""
     try:
         yield
     except KeyboardInterrupt:

@@ -193,7 +193,7 @@ def copy_arm(
 ) -> tuple[RobotModel, SelfSurfaces]:
     """Copy ``robot.urdf``, its ``meshes/`` and ``robot_spheres.yaml`` into a folder and read them.
 
-    The spheres come from the file `given`, or are fitted. Raises InputError without collision geometry or meshes.
+    Spheres are `given`, or fitted. Raises InputError without collision geometry or meshes.
     """
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
