@@ -184,7 +184,7 @@ def junit_text(suites: Sequence[Suite]) -> str:
     """The suites as reproducible XML 1.0; characters that XML cannot hold are escaped."""
     root = ElementTree.Element(
         "testsuites",
-        {"name": "splatctrl", **_counts(suites), "time": _seconds(sum(suite.seconds for suite in suites))},
+        {"name": "splatctrl", **_counts(suites), "time": f"{sum(suite.seconds for suite in suites):.3f}"},
     )
     for suite in suites:
         _add_suite(root, suite)
@@ -197,7 +197,7 @@ def _add_suite(root: ElementTree.Element, suite: Suite) -> None:
         "name": _clean(suite.name),
         **_counts([suite]),
         "skipped": str(suite.count(Kind.SKIPPED)),
-        "time": _seconds(suite.seconds),
+        "time": f"{suite.seconds:.3f}",
         **({"timestamp": suite.started} if suite.started else {}),
     }
     element = ElementTree.SubElement(root, "testsuite", attributes)
@@ -215,7 +215,7 @@ def _add_case(suite: ElementTree.Element, case: Case) -> None:
     element = ElementTree.SubElement(
         suite,
         "testcase",
-        {"classname": _clean(case.group), "name": _clean(case.name), "time": _seconds(case.seconds)},
+        {"classname": _clean(case.group), "name": _clean(case.name), "time": f"{case.seconds:.3f}"},
     )
     if case.kind is Kind.PASSED:
         if case.text:
@@ -232,10 +232,6 @@ def _counts(suites: Sequence[Suite]) -> dict[str, str]:
         "failures": str(sum(suite.count(Kind.FAILED) for suite in suites)),
         "errors": str(sum(suite.count(Kind.ERROR, Kind.NOT_EVALUABLE) for suite in suites)),
     }
-
-
-def _seconds(value: float) -> str:
-    return f"{value:.3f}"
 
 
 def _clean(text: str) -> str:
