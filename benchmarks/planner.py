@@ -21,7 +21,7 @@ from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.planner.birrt import Plan, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
-from splatctrl_cli.planner.planned import resampled, timed
+from splatctrl_cli.planner.planned import resampled, time_path
 from splatctrl_cli.records import Bool, Float64
 
 FRAME = "panda_grasptarget"
@@ -102,8 +102,8 @@ class Followed:
 def _followed(solved: Solved, room: Clearance) -> tuple[Followed, Followed]:
     """The path followed in joint space, and by QP-IK without a margin of its own."""
     planner, control = PlannerConfig(), ControlConfig(margin=0.0, self_margin=0.0, max_time=60.0, solver="daqp")
-    path = timed(solved.plan.waypoints, room.model.velocity_limit, planner.max_acceleration)
-    slow = timed(solved.plan.waypoints, room.model.velocity_limit / 4, planner.max_acceleration)
+    path = time_path(solved.plan.waypoints, room.model.velocity_limit, planner.max_acceleration)
+    slow = time_path(solved.plan.waypoints, room.model.velocity_limit / 4, planner.max_acceleration)
     joints, scene = follow_joints(path, room.model, control), solids_of(solved.problem.things)
     guided, _ = follow_with_controller(slow, room.model, lambda stamp_ns: scene, FRAME, planner, control)
     return _figures(joints, path, room, control), _figures(guided, slow, room, control)

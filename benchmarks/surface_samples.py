@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.held_out_depth import drawn_on
+from splatctrl_cli.evaluate.held_out_depth import draw_on
 from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.records import Float64, Index
@@ -36,7 +36,7 @@ def sample_mesh(mesh: TriangleMesh, spacing: float, *, seed: int) -> SurfaceSamp
     cross = face_normals(mesh.corners)
     doubled = np.linalg.norm(cross, axis=1)
     num = int(np.ceil(CANDIDATES * 0.5 * doubled.sum() / spacing**2)) + 1
-    points, face = drawn_on(mesh, num, np.random.default_rng(seed))
+    points, face = draw_on(mesh, num, np.random.default_rng(seed))
     kept = thin(points, spacing)
     return SurfaceSamples(points=points[kept], normals=cross[face[kept]] / doubled[face[kept], None])
 

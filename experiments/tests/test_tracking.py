@@ -9,7 +9,7 @@ from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.planned import resampled, timed
+from splatctrl_cli.planner.planned import resampled, time_path
 from tests.control.fakes import Balls, PlanarArm
 from tests.planner.walls import clearance, one_wall, thin_post
 
@@ -20,7 +20,7 @@ ARM = PlanarArm()
 def test_a_path_is_followed_to_its_end_by_the_joints() -> None:
     room = clearance(one_wall(), margin=0.02)
     planned = plan(room, np.array([0.7, 0.2]), np.array([-0.7, -0.2]), PlannerConfig())
-    path = timed(planned.waypoints, ARM.velocity_limit, 7.5)
+    path = time_path(planned.waypoints, ARM.velocity_limit, 7.5)
     position = follow_joints(path, ARM, ControlConfig())
     np.testing.assert_allclose(position[-1], planned.waypoints[-1], atol=1e-3)
     assert joint_length(position) == pytest.approx(joint_length(planned.waypoints), rel=1e-3)
@@ -32,7 +32,7 @@ def test_a_path_is_followed_to_its_end_by_the_controller() -> None:
     room = clearance(thin_post(), margin=0.03)  # more than the controller's own margin, which may not give way
     field = Balls([[0.62, 0.31, 0.0]], [0.002])
     planned = plan(room, np.array([1.2, 0.3]), np.array([-0.4, 0.5]), PlannerConfig())
-    path = timed(planned.waypoints, ARM.velocity_limit / 3, 3.0)
+    path = time_path(planned.waypoints, ARM.velocity_limit / 3, 3.0)
     config = ControlConfig()
     position, steps = follow_with_controller(path, ARM, lambda stamp_ns: field, "tip", PlannerConfig(), config)
     arrived = pose_error(ARM.frame_pose(position[-1], "tip"), ARM.frame_pose(path.waypoints[-1], "tip"))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.cli.commands import build_parser
-from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
@@ -23,9 +23,9 @@ from splatctrl_cli.jobs.batch.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, of_shard, text_of
+from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, select_shard, text_of
 from splatctrl_cli.jobs.batch.ledger import NAME, Ledger, Run, write_csv
-from splatctrl_cli.jobs.batch.run import DONE, FAILED, told
+from splatctrl_cli.jobs.batch.run import DONE, FAILED, describe_run
 from splatctrl_cli.jobs.batch.suite import Table
 
 PRELOADED = (  # of a runner
@@ -36,13 +36,13 @@ OWN = ("out", "force", "resume", "threads")  # options a batch gives itself
 NOT_OF_A_NODE = (*OWN, "help", "help-all", "json", "verbose", "quiet", "junit", "preset")  # the last is in --set
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args, is_step=True)  # it tells CI of every recording itself
+def run(args: argparse.Namespace, console: Console) -> int:
+    console.reports_to_ci = False  # it tells CI of every recording itself
     workers = args.workers or os.cpu_count() or 1
     request = request_of(BatchRequest, args, workers=workers)
     command_line = OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1))
     if args.list or args.where or args.failed or args.csv is not None:
-        return _listed(console, args, request, command_line)
+        return _list_runs(console, args, request, command_line)
     if args.dry_run:
         planned_nodes = dry_run(request, command_line)
         rows = [(node.name, state, ", ".join(node.needs) or "-") for node, state in planned_nodes]
@@ -92,7 +92,6 @@ class OfThisProgram:
         return tuple(words), tuple(path for path in found if isinstance(path, Path))
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
-        """Options in words, by long name, as `parsed` takes them."""
         parser = _parser_of(words[0])
         found, given = dict[str, Any](), vars(parser.parse_args([*words[1:]]))
         for action in parser._actions:
@@ -164,18 +163,20 @@ def _flat(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any
             yield before + key, value
 
 
-def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:
+def _lines(result: BatchResult, *, is_long: bool) -> list[str]:
     runs = {(run.recording, run.column): run for run in result.runs}
     columns = columns_of(((run.job, column) for (_, column), run in runs.items()), result.jobs)
     recordings = list(dict.fromkeys(recording for recording, _ in runs))
     odd = {run.recording for run in result.runs if run.state != DONE}
     shown = recordings if is_long or len(recordings) <= MOST_ROWS else [name for name in recordings if name in odd]
     rows = [[name, *(_cell(runs.get((name, column))) for column in columns)] for name in shown]
-    yield from table(("recording", *columns), rows) if rows else ()
-    if len(shown) < len(recordings):
-        yield f"{len(recordings) - len(shown)} recordings as expected; -v prints them, too"
-    yield ""
-    yield f"{len(result.runs) - result.num_kept} run, {result.num_kept} as before; wrote {result.out / 'batch.json'}"
+    num = len(recordings) - len(shown)
+    return [
+        *(table(("recording", *columns), rows) if rows else ()),
+        *remarks((f"{num} recordings as expected; -v prints them, too", num)),
+        "",
+        f"{len(result.runs) - result.num_kept} run, {result.num_kept} as before; wrote {result.out / 'batch.json'}",
+    ]
 
 
 def _cell(run: Run | None) -> str:
@@ -185,11 +186,11 @@ def _cell(run: Run | None) -> str:
     return word if run.state == DONE else f"{word.upper()} !" if run.state == FAILED else run.state.upper()
 
 
-def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
+def _list_runs(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
     folder, order = request.suite, dict[str, int]()
     if not folder.is_dir():
         _, nodes, folder = planned(request, command_line)
-        order = {node.name: number for number, node in enumerate(of_shard(nodes, request.shard))}
+        order = {node.name: number for number, node in enumerate(select_shard(nodes, request.shard))}
     if not (folder / NAME).is_file():
         raise InputError(f"{folder}: has no {NAME}", remedy="run the batch first")
     conditions = [*args.where, *(["state!=done"] if args.failed else [])]
@@ -200,7 +201,7 @@ def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, c
     if args.csv is not None:
         write_csv(args.csv, runs)
         console.log(f"wrote {len(runs)} runs to {args.csv}")
-    rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
+    rows = [(run.node, run.state, describe_run(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
     return console.result(
         {"nodes": [run.document() for run in runs]},
         table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"],

@@ -10,8 +10,7 @@ from splatctrl_cli.config import fixed
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args)
+def run(args: argparse.Namespace, console: Console) -> int:
     result = calibrate(
         request_of(
             CalibrateRequest,
@@ -33,21 +32,20 @@ def _lines(result: CalibrateResult) -> Iterator[str]:
     num_unsure = sum(bool(camera.unobserved) for camera in free)
     sure = f"each within {_mm(sigma)} and {turn:.2g} deg (one sigma)"
     unsure = f"{num_unsure} of them only in the directions that the recording shows"
-    yield f"calibrate: {len(free)} of {len(calibration.cameras)} cameras placed, {unsure if num_unsure else sure}"
-    yield ""
-    yield from table(
-        ("camera", "moved mm", "turned deg", "sigma mm", "sigma deg", "depth", ""),
-        [_row(result, name) for name in calibration.cameras],
+    titles = ("camera", "moved mm", "turned deg", "sigma mm", "sigma deg", "depth", "")
+    yield from (
+        f"calibrate: {len(free)} of {len(calibration.cameras)} cameras placed, {unsure if num_unsure else sure}",
+        "",
+        *table(titles, [_row(result, name) for name in calibration.cameras]),
+        "",
     )
-    yield ""
     if result.before is not None and result.after is not None:
         before, after = _mm(result.before), _mm(result.after)
         yield f"points of a camera lie {after} from what another, or the robot, shows there (median); before {before}"
     if calibration.clock is not None:
         sign = f"{1e3 * calibration.clock:+.1f} ms"
         yield f"frames are stamped {sign} against the joint states (sigma {1e3 * calibration.sigma_clock:.1f} ms)"
-    yield f"taken as recorded: {', '.join(calibration.held) or 'nothing'}"
-    yield f"wrote {result.out}"
+    yield from (f"taken as recorded: {', '.join(calibration.held) or 'nothing'}", f"wrote {result.out}")
 
 
 def _row(result: CalibrateResult, name: str) -> list[object]:

@@ -3,32 +3,30 @@
 import argparse
 import textwrap
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
 
 from splatctrl_cli.checks.finding import CheckReport
-from splatctrl_cli.cli.common import Console, format_cell, locked_joints, request_of, source_options, table
+from splatctrl_cli.cli.common import Console, format_cell, locked_joints, remarks, request_of, source_options, table
 from splatctrl_cli.errors import DAMAGED
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
-from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
+from splatctrl_cli.jobs.ingest import IngestRequest, ingest
 from splatctrl_cli.recording.source import describe
 
 WIDTH = 118  # columns of text
 
 
-def run(args: argparse.Namespace) -> int:
-    result = check(
+def run(args: argparse.Namespace, console: Console) -> int:
+    report, verdict = check(
         request_of(
             CheckRequest,
             args,
             paths=tuple(args.source),
             options=source_options(args),
-            num_images=args.quick,
             locked=locked_joints(args),
         )
     )
-    report, lines = result.report.as_dict(), _lines(result.report)
-    return Console(args).concluded(result.verdict, report, lines, code=result.exit_code, has_findings=True)
+    code = 0 if args.fail_on == "never" else verdict.exit_code
+    return console.concluded(verdict, report.as_dict(), _lines(report), code=code, has_findings=True)
 
 
 def _lines(report: CheckReport) -> Iterator[str]:
@@ -36,35 +34,23 @@ def _lines(report: CheckReport) -> Iterator[str]:
     num = f", {report.num_messages} {report.unit}" if report.num_messages else ""
     yield f"{report.path}: {report.kind}{span}{num}"
     for finding in report.sorted_findings:
-        yield ""
         at = report.seconds(finding)
         when = "" if at is None else f", at {at:.3f} s"
-        yield f"{finding.severity}: {finding.where}{when} [{finding.code}]"
+        yield from ("", f"{finding.severity}: {finding.where}{when} [{finding.code}]")
         yield from textwrap.wrap(finding.what, WIDTH, initial_indent="  ", subsequent_indent="  ")
-        if finding.remedy:
-            yield from textwrap.wrap(f"-> {finding.remedy}", WIDTH, initial_indent="  ", subsequent_indent="     ")
+        remedy = f"-> {finding.remedy}" if finding.remedy else ""
+        yield from textwrap.wrap(remedy, WIDTH, initial_indent="  ", subsequent_indent="     ")
     rates = [rate for rate in report.rates if rate.is_read]
-    if rates:
-        yield ""
-        yield from table(
-            ["topic", "messages", "hz", "longest gap s", "delay s"],
-            [
-                (
-                    rate.topic,
-                    rate.messages,
-                    format_cell(rate.hz, ".2f"),
-                    format_cell(rate.longest_s, ".3f"),
-                    format_cell(rate.delay_s, ".3f"),
-                )
-                for rate in rates
-            ],
-        )
-    if len(rates) < len(report.rates):
-        yield from () if rates else ("",)
-        others = len(report.rates) - len(rates)
-        yield f"{others} topic{'' if others == 1 else 's'} that no command reads"
-    yield ""
-    yield from _needs(report)
+    forms = {"hz": ".2f", "longest_s": ".3f", "delay_s": ".3f"}
+    cells = [
+        (rate.topic, rate.messages, *(format_cell(getattr(rate, name), form) for name, form in forms.items()))
+        for rate in rates
+    ]
+    others = len(report.rates) - len(rates)
+    yield from ("", *table(["topic", "messages", "hz", "longest gap s", "delay s"], cells)) if rates else ()
+    unread = f"{others} topic{'' if others == 1 else 's'} that no command reads"
+    yield from remarks(("", others and not rates), (unread, others))
+    yield from ("", *_needs(report))
 
 
 def _needs(report: CheckReport) -> Iterator[str]:
@@ -79,17 +65,14 @@ def _needs(report: CheckReport) -> Iterator[str]:
         yield from textwrap.wrap(f"missing for {command}: {lack}", WIDTH, subsequent_indent="  ") if lack else ()
 
 
-def run_info(args: argparse.Namespace) -> int:
-    return show_described(Console(args), describe(args.path, source_options(args)), is_long=args.verbose > 0)
-
-
-def show_described(console: Console, summary: Summary, *, is_long: bool = False) -> int:
+def run_info(args: argparse.Namespace, console: Console) -> int:
     """Print facts and tables, and what a reconstruction lacks."""
-    code = DAMAGED if summary.damaged else 0
-    return console.result(summary.as_dict(), _described(summary, is_long=is_long), code=code)
+    summary = describe(args.path, source_options(args))
+    lines = _describe(summary, is_long=args.verbose > 0)
+    return console.result(summary.as_dict(), lines, code=DAMAGED if summary.damaged else 0)
 
 
-def _described(summary: Summary, *, is_long: bool) -> Iterator[str]:
+def _describe(summary: Summary, *, is_long: bool) -> Iterator[str]:
     yield f"{summary.path}: {summary.kind}"
     yield from _facts(summary.facts, "  ")
     for grid in summary.grids:
@@ -98,9 +81,7 @@ def _described(summary: Summary, *, is_long: bool) -> Iterator[str]:
         rows = [row for row in grid.rows if not num or row[0] not in grid.unused]
         yield from table(grid.header, rows) if rows else () if num else [f"no {grid.name}"]
         yield from [f"and {num} {grid.name} that no command reads; -v prints them"] if num else ()
-    if summary.missing:
-        yield ""
-        yield from (f"missing for a reconstruction: {item}" for item in summary.missing)
+    yield from ("", *(f"missing for a reconstruction: {item}" for item in summary.missing)) if summary.missing else ()
     yield from (f"note: {note}" for note in summary.notes)
 
 
@@ -116,27 +97,22 @@ def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
 
 
 def _fact(value: object) -> str:
-    """Text of a float with up to six decimals, more if small."""
+    """Text of a float: six decimals, or more."""
     if not isinstance(value, float):
         return "-" if value is None else str(value)
     return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"
 
 
-def run_ingest(args: argparse.Namespace) -> int:
-    console = Console(args)
-    return show_ingested(
-        console,
-        ingest(request_of(IngestRequest, args, paths=tuple(args.source), options=source_options(args)), console),
+def run_ingest(args: argparse.Namespace, console: Console) -> int:
+    capture, metrics = ingest(
+        request_of(IngestRequest, args, paths=tuple(args.source), options=source_options(args)), console
     )
-
-
-def show_ingested(console: Console, result: IngestResult) -> int:
-    lost = asdict(result.summary.loss)
+    lost = metrics["loss"]
     lines = [
-        *table(["camera", "frames"], sorted(result.summary.num_frames.items())),
+        *table(["camera", "frames"], sorted(metrics["frames"].items())),
         *(f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"),
         *(f"note: {note}" for note in lost["notes"]),
-        f"joint states: {result.summary.num_joint_states}",
-        f"wrote {result.capture}",
+        f"joint states: {metrics['joint_states']}",
+        f"wrote {capture}",
     ]
-    return console.result({"capture": str(result.capture), **result.metrics}, lines, code=result.exit_code)
+    return console.result({"capture": str(capture), **metrics}, lines, code=DAMAGED if lost["damaged"] else 0)

@@ -38,7 +38,7 @@ LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yam
 class Command:
     """A subcommand or action; `run` names MODULE:FUNCTION of this package.
 
-    With `actions` it has no options of its own. judges: ends in a verdict, for CI.
+    With `actions` it has no options. judges: ends in a verdict.
     """
 
     summary: str
@@ -80,7 +80,6 @@ def _add_commands(parser: Parser, commands: dict[str, Command], *, dest: str, on
 
 
 def judges(words: Sequence[str]) -> bool:
-    """True if the words start a command with a verdict."""
     command = COMMANDS.get(words[0]) if words else None
     if command is not None and command.actions is not None:
         command = command.actions.get(words[1]) if len(words) > 1 else None
@@ -223,7 +222,7 @@ COMMANDS = {
             "query out/scene points.csv -o out/near.csv",
             "query out/field points.csv --scene out/scene",
         ),
-        run="query:run",
+        run="sdf_bake:run_query",
         options=scene_options.QUERY,
     ),
     "score": Command(
@@ -259,7 +258,7 @@ COMMANDS = {
             "sweep out/audit --over margin=0.02:0.08 -o out/margin",
             "sweep out/audit --over latency=0:1 --over depth-noise=0:0.02 -o out/both",
         ),
-        run="sweep:run",
+        run="compare:run_sweep",
         options=run_options.SWEEP,
     ),
     "compare": Command(

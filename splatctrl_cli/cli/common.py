@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several, whole
-from splatctrl_cli.cli.reports import enveloped, reports_of
+from splatctrl_cli.cli.reports import report_command, wrap_result
 from splatctrl_cli.config import PRESETS, fixed
-from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, shown
+from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Verdict, gate
 from splatctrl_cli.files.output import plain
@@ -40,8 +40,10 @@ def source_options(args: argparse.Namespace) -> SourceOptions:
         args,
         cameras=_names(args.cameras),
         camera_topics=tuple(_topics(text) for text in args.camera),
-        camera_poses=dict(_pose(text) for text in args.camera_pose if not _is_topic(text)),
-        camera_pose_topics=dict(_pose_topic(text) for text in args.camera_pose if _is_topic(text)),
+        camera_poses=dict(_pose(text) for text in args.camera_pose if not text.partition("=")[2].startswith("/")),
+        camera_pose_topics=dict(
+            _pose_topic(text) for text in args.camera_pose if text.partition("=")[2].startswith("/")
+        ),
         human_topics=dict(_human_topic(text) for text in args.human_topic),
         intrinsics=dict(_intrinsics(text) for text in args.intrinsics),
         pairing_tolerance_s=args.pairing_tolerance,
@@ -81,7 +83,7 @@ def pose(text: str) -> tuple[float, ...]:
 
 def _device(text: str) -> str:
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
-        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {shown(text)}")
+        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {format_value(text)}")
     return text
 
 
@@ -89,12 +91,13 @@ def numbers(text: str) -> tuple[float, ...]:
     """Finite numbers joined by commas, for argparse."""
     values = several(text)
     if not values:
-        raise argparse.ArgumentTypeError(f"expected finite numbers joined by commas, up to 1e6, got {shown(text)}")
+        raise argparse.ArgumentTypeError(
+            f"expected finite numbers joined by commas, up to 1e6, got {format_value(text)}"
+        )
     return values
 
 
-def _listed(name: str, text: str) -> str:
-    """Strip a comma list, for argparse. Raises UsageError if empty."""
+def _split_list(name: str, text: str) -> str:
     names = _names(text)
     if not names:
         raise UsageError(f"{name} {text!r}: expected names, got none", remedy="leave the option out")
@@ -130,10 +133,6 @@ def _pose(text: str) -> tuple[str, tuple[float, ...]]:
     return name, values
 
 
-def _is_topic(text: str) -> bool:
-    return text.partition("=")[2].startswith("/")
-
-
 def _pose_topic(text: str) -> tuple[str, tuple[str, str]]:
     name, _, rest = text.partition("=")
     topic, at, frame = rest.partition("@")
@@ -153,12 +152,11 @@ def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
 
 def _preset(text: str) -> str:
     if text not in PRESETS:
-        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {shown(text)}")
+        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {format_value(text)}")
     return f"preset={text}"
 
 
 def output(what: str, *, default: str) -> tuple[Adds, ...]:
-    """``-o/--out`` and ``--force``."""
     return (
         option("-o/--out PATH", f"{what} (default: {default})", Path),
         option("--force", "replace the output if it exists"),
@@ -166,7 +164,6 @@ def output(what: str, *, default: str) -> tuple[Adds, ...]:
 
 
 def settings(example: str = "") -> tuple[Adds, ...]:
-    """``--set`` and ``--preset``, the first of the settings."""
     paper = "paper: as printed (splatctrl help paper has our departures)"
     return (
         option("--set SECTION.KEY=VALUE ...", f"one setting{example}"),
@@ -203,10 +200,12 @@ DEVICE = of_run(
 )
 GATES = option("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
 HOLDOUT = option(
-    "--holdout 0,6", "keep frames of an image folder for judging, as camera holdout", partial(_listed, "--holdout")
+    "--holdout 0,6",
+    "keep frames of an image folder for judging, as camera holdout",
+    partial(_split_list, "--holdout"),
 )
 SOURCE = (  # the options of a source, all but --cameras in a group of their own
-    option("--cameras A,B", "only these cameras", partial(_listed, "--cameras")),
+    option("--cameras A,B", "only these cameras", partial(_split_list, "--cameras")),
     group(
         "input",
         option("--camera NAME=COLOR,DEPTH[,INFO] ...", "topics of a camera, instead of those found"),
@@ -276,16 +275,12 @@ _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
 class Console:
-    """Output of a command: results to stdout, log lines to stderr, verdicts to CI.
+    """Output of a command: results to stdout, log lines to stderr, verdicts to CI."""
 
-    is_step: a step of another command; CI gets no verdict.
-    """
-
-    def __init__(self, args: argparse.Namespace, *, is_step: bool = False) -> None:
+    def __init__(self, args: argparse.Namespace) -> None:
         self._args = args
-        self.is_json = bool(args.json)
-        self.is_quiet = bool(args.quiet)
-        self.reports = reports_of(args) if hasattr(args, "junit") and not is_step else None
+        self.is_json, self.is_quiet = bool(args.json), bool(args.quiet)
+        self.reports_to_ci = hasattr(args, "junit")
 
     def log(self, line: str) -> None:
         if not self.is_quiet:
@@ -294,7 +289,7 @@ class Console:
     def result(self, result: Mapping[str, Any], lines: Iterable[str], *, code: int = 0) -> int:
         """Print `result` as JSON with --json, else `lines`; return `code`."""
         if self.is_json:
-            text = json.dumps(enveloped(result, code), indent=2, allow_nan=False, default=plain)
+            text = json.dumps(wrap_result(result, code), indent=2, allow_nan=False, default=plain)
             self._args.is_printed = True
             print(text)
         else:
@@ -311,11 +306,12 @@ class Console:
         code: int | None = None,
         has_findings: bool = False,
     ) -> int:
-        """Print a verdict, its reasons and notes, then `result` or `lines`; return the exit code.
+        """Print a verdict, then `result` or `lines`; return the exit code.
 
-        With --json a failure's sentence also goes to stderr. has_findings: `lines` contain the reasons.
+        has_findings: `lines` contain the reasons.
         """
         code = verdict.exit_code if code is None else code
+        self._args.label = verdict.label
         if self.is_json:
             self.result({"verdict": verdict.as_dict(), **result}, (), code=code)
         else:
@@ -329,9 +325,13 @@ class Console:
         if code and self.is_json:
             gates = [str(reason) for reason in verdict.decisive[1:] if reason.criterion.startswith("--require")]
             print("\n".join(f"splatctrl: {line}" for line in (verdict.sentence, *gates)), file=sys.stderr, flush=True)
-        if self.reports is not None:
-            self.reports.conclude(verdict.as_dict(), code)
+        if self.reports_to_ci:
+            report_command(self._args, verdict.as_dict(), code)
         return code
+
+
+def remarks(*texts: tuple[str, object]) -> list[str]:
+    return [text for text, holds in texts if holds]
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:

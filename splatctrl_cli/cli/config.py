@@ -13,12 +13,11 @@ from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import SCHEMA_FILE
 from splatctrl_cli.config.load import resolved_settings, template_of, toml_of
-from splatctrl_cli.config.ranges import shown
+from splatctrl_cli.config.ranges import format_value
 from splatctrl_cli.errors import UsageError, did_you_mean
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args)
+def run(args: argparse.Namespace, console: Console) -> int:
     if args.schema:
         text = SCHEMA_FILE.read_text(encoding="utf-8")
         return console.result({"json_schema": json.loads(text)}, text.splitlines())
@@ -29,14 +28,14 @@ def run(args: argparse.Namespace) -> int:
     )
 
 
-def run_completion(args: argparse.Namespace) -> int:
+def run_completion(args: argparse.Namespace, console: Console) -> int:
     parser = build_parser()
     _complete_files(parser)
     script = shtab.complete(parser, shell=args.shell).rstrip("\n")
-    return Console(args).result({"shell": args.shell, "script": script}, [script])
+    return console.result({"shell": args.shell, "script": script}, [script])
 
 
-def run_help(args: argparse.Namespace) -> int:
+def run_help(args: argparse.Namespace, console: Console) -> int:
     """Print a page, every setting, or every option of a command without a page."""
     roots = Path(__file__).parents[1:3]  # of a wheel, of the repository
     folder = next(place / "docs" for place in roots if (place / "docs" / "README.md").is_file())
@@ -47,9 +46,9 @@ def run_help(args: argparse.Namespace) -> int:
     texts |= {page.stem: partial(page.read_text, encoding="utf-8") for page in folder.glob("*.md")}
     if topic not in texts:
         remedy = did_you_mean(topic, sorted(texts), f"give one of: {', '.join(sorted(texts))}")
-        raise UsageError(f"help: no page {shown(topic)}", remedy=remedy)
+        raise UsageError(f"help: no page {format_value(topic)}", remedy=remedy)
     text = texts[topic]()
-    return Console(args).result({"topic": topic, "text": text}, text.splitlines())
+    return console.result({"topic": topic, "text": text}, text.splitlines())
 
 
 def _complete_files(parser: Parser) -> None:

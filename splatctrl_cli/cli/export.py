@@ -2,8 +2,9 @@
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import asdict
 
-from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult, ExportRunRequest, export, export_run
 from splatctrl_cli.records import Label
@@ -18,22 +19,16 @@ SHOWN = {  # of Differences: what the table calls it, and the unit it is shown i
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args)
+def run(args: argparse.Namespace, console: Console) -> int:
     if args.mcap:
         for name in ("labels", "layout", "isotropic"):
             if getattr(args, name):
                 raise UsageError(f"--{name}: not with --mcap", remedy="leave it out")
         logged = export_run(request_of(ExportRunRequest, args, path=args.scene, roots=tuple(args.root)))
-        rows = [*logged.messages.items()]
-        return console.result(
-            logged.as_dict(), [f"{logged.file}: {logged.bytes} bytes", *table(("topic", "messages"), rows)]
-        )
-    return show_exported(console, export(request_of(ExportRequest, args, labels=_labels(args.labels)), console))
-
-
-def show_exported(console: Console, result: ExportResult) -> int:
-    return console.result(result.as_dict(), _lines(result))
+        rows = table(("topic", "messages"), [*logged.messages.items()])
+        return console.result(asdict(logged), [f"{logged.file}: {logged.bytes} bytes", *rows])
+    result = export(request_of(ExportRequest, args, labels=_labels(args.labels)), console)
+    return console.result({n: v for n, v in asdict(result).items() if n != "was_rounded"}, _lines(result))
 
 
 def _labels(names: str | None) -> list[Label] | None:
@@ -49,14 +44,13 @@ def _labels(names: str | None) -> list[Label] | None:
 def _lines(result: ExportResult) -> Iterator[str]:
     left_out = f", {result.num_left_out} left out by label" if result.num_left_out else ""
     yield f"{result.file}: {result.num_splats} splats{left_out}, {result.bytes} bytes, {result.format}"
-    if result.was_rounded:
-        yield f"made isotropic: {_decibels(result.isotropic_psnr)} against the source"
-    if result.origin is not None:
-        yield f"centres are less the origin {result.origin} m: float32 would move them without"
-    if result.not_kept:
-        yield f"not kept: {', '.join(result.not_kept)}"
-    if result.num_outside:
-        yield f"{result.num_outside} splats have a size or colour beyond the format's range: put at its edge"
+    outside = f"{result.num_outside} splats have a size or colour beyond the format's range: put at its edge"
+    yield from remarks(
+        (f"made isotropic: {_decibels(result.isotropic_psnr)} against the source", result.was_rounded),
+        (f"centres are less the origin {result.origin} m: float32 would move them without", result.origin),
+        (f"not kept: {', '.join(result.not_kept)}", result.not_kept),
+        (outside, result.num_outside),
+    )
     found, allowed = vars(result.differences), vars(result.allowed)
     yield from table(
         ["largest difference", "found", "allowed"],

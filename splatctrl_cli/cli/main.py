@@ -16,7 +16,8 @@ from functools import cache
 from pathlib import Path
 
 from splatctrl_cli.cli.commands import build_parser, function_of, judges
-from splatctrl_cli.cli.reports import enveloped, tell_of_failure
+from splatctrl_cli.cli.common import Console
+from splatctrl_cli.cli.reports import tell_of_failure, wrap_result
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
 from splatctrl_cli.report.junit import check_replaceable
@@ -50,7 +51,7 @@ def _run(argv: Sequence[str] | None) -> int:
         args = build_parser(words[0] if words else "").parse_args(words)
         args.began = start
         _check_outputs(args)
-        code = function_of(args.run)(args)
+        code = function_of(args.run)(args, Console(args))
         sys.stdout.flush()
         return code
     except BrokenPipeError:
@@ -70,7 +71,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
     """Print an error on stderr (with --json on stdout); return line and exit code."""
-    message, remedy, code = _told(error)
+    message, remedy, code = _explain(error)
     if code == INTERRUPTED and remedy.endswith(RESUME):
         goes_on = shlex.join([words[0], RESUME, *(word for word in words[1:] if word != RESUME)])
         remedy = f"continue it with: splatctrl {goes_on}"
@@ -81,12 +82,12 @@ def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbo
     if is_json and not isinstance(sys.stdout, _Lost):
         with suppress(OSError):  # the error matters more than a failed print
             print(
-                json.dumps(enveloped({"error": {"message": message, "remedy": remedy}}, code), indent=2), flush=True
+                json.dumps(wrap_result({"error": {"message": message, "remedy": remedy}}, code), indent=2), flush=True
             )
     return line, code
 
 
-def _told(error: BaseException) -> tuple[str, str, int]:
+def _explain(error: BaseException) -> tuple[str, str, int]:
     match error:
         case SplatCtrlError():
             return error.message, error.remedy, error.exit_code
@@ -120,10 +121,7 @@ class _Lost(io.TextIOBase):
 
 
 def _stand_in_for_closed_streams() -> _Lost:
-    """Replace closed stdout or stderr, and reserve their numbers.
-
-    Returns the stand-in for stdout, never written to if stdout is open.
-    """
+    """Replace closed stdout or stderr, and reserve their numbers; return the stand-in for stdout."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -155,7 +153,6 @@ def _check_outputs(args: argparse.Namespace) -> None:
 
 
 def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
-    """Refuse an output that is unwritable, or that is or contains an input."""
     check_can_be_written(out)
     targets = _places(out)
     for given in inputs:
@@ -173,7 +170,7 @@ def _places(output: Path) -> set[Path]:
 def refuse_endless_files() -> None:
     """Make reading a FIFO, socket or device raise OSError from now on, anywhere.
 
-    A FIFO among images would wait for its writer; a link to /dev/zero would fill the memory.
+    A FIFO would wait for its writer, /dev/zero fill the memory.
     """
     sys.addaudithook(_look)
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn, TypeVar
 
-from splatctrl_cli.config.ranges import MAX_PLACE, OneOf, Section, Within, shown
+from splatctrl_cli.config.ranges import MAX_PLACE, OneOf, Section, Within, format_value
 from splatctrl_cli.errors import UsageError
 
 T = TypeVar("T", int, float)
@@ -91,9 +91,12 @@ class Parser(argparse.ArgumentParser):
     @property
     def groups(self) -> list[tuple[str, list[argparse.Action]]]:
         """Options by group title; ``--help`` shows the first."""
-        shown = [action for group in self._action_groups[:2] for action in group._group_actions]
+        first = [action for group in self._action_groups[:2] for action in group._group_actions]
         more = [*self._action_groups[2:], self.run_group]
-        return [("", shown), *((group.title or "", group._group_actions) for group in more if group._group_actions)]
+        return [
+            ("", first),
+            *((group.title or "", group._group_actions) for group in more if group._group_actions),
+        ]
 
     def format_usage(self) -> str:
         either = [group for group in self._mutually_exclusive_groups if group.required]
@@ -165,7 +168,6 @@ def option(
 
 
 def group(title: str, *options: Adds) -> Adds:
-    """Options for ``--help-all`` alone."""
     return lambda container: add_all(container.add_argument_group(title), options)
 
 
@@ -213,23 +215,22 @@ def invocation(action: argparse.Action) -> str:
 
 def real(low: float, high: float, unit: str = "") -> Callable[[str], float]:
     """Parser of a number in [low, high]."""
-    return _bounded(float, Within(low, high, unit, ""))
+    return _parse_within(float, Within(low, high, unit, ""))
 
 
 def whole(low: int, high: int, unit: str = "") -> Callable[[str], int]:
     """Parser of a whole number in [low, high]."""
-    return _bounded(int, Within(low, high, unit, ""))
+    return _parse_within(int, Within(low, high, unit, ""))
 
 
 def setting(section: type[Section], key: str) -> Callable[[str], float]:
     """Parser of a configuration key's number: its type and range."""
     declared = section.declared[key]
     assert isinstance(declared, Within)
-    return _bounded(int if type(getattr(section, key)) is int else float, declared)
+    return _parse_within(int if type(getattr(section, key)) is int else float, declared)
 
 
 def words(section: type[Section], key: str) -> tuple[str, ...]:
-    """Choices of a configuration key."""
     declared = section.declared[key]
     assert isinstance(declared, OneOf)
     return declared.words
@@ -244,9 +245,9 @@ def several(text: str) -> tuple[float, ...]:
     return values if all(abs(value) <= MAX_PLACE for value in values) else ()
 
 
-def _bounded(kind: Callable[[str], T], declared: Within) -> Callable[[str], T]:
+def _parse_within(kind: Callable[[str], T], declared: Within) -> Callable[[str], T]:
     def parse(text: str) -> T:
-        what = f"expected {'a whole number, ' if kind is int else ''}{declared.expected}, got {shown(text)}"
+        what = f"expected {'a whole number, ' if kind is int else ''}{declared.expected}, got {format_value(text)}"
         try:
             value = kind(text)
         except ValueError:

@@ -11,13 +11,13 @@ from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
 from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.running.device import shown
+from splatctrl_cli.jobs.running.device import describe_device
 from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
 from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Box
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace, console: Console) -> int:
     native.keep_freed_memory()
     config = load_config(args.config, args.set)  # refused before the source is opened
     if args.max_splats is not None:
@@ -41,19 +41,14 @@ def run(args: argparse.Namespace) -> int:
         corrections=Corrections(poses=args.refine_poses, exposure=args.refine_exposure),
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},
     )
-    console = Console(args)
-    return show_reconstructed(console, reconstruct(request, console))
+    result = reconstruct(request, console)
+    found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
+    return console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"])
 
 
 def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
-    """The recording at `path`, or at --dtu."""
     options, is_dtu = source_options(args), args.dtu is not None
     return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=is_dtu, options=options, masks=masks)
-
-
-def show_reconstructed(console: Console, result: ReconstructResult) -> int:
-    found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
-    return console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"])
 
 
 def _lines(result: ReconstructResult) -> list[str]:
@@ -71,5 +66,5 @@ def _lines(result: ReconstructResult) -> list[str]:
     return [
         *table(list(columns), [list(columns.values())]),
         f"removed: {', '.join(reasons) or 'none'}",
-        f"computed on {', then '.join(map(shown, metrics['devices']))}",
+        f"computed on {', then '.join(map(describe_device, metrics['devices']))}",
     ]

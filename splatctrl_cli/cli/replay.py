@@ -1,7 +1,8 @@
 """``splatctrl replay``: clearance of motion, and what a controller would do."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from splatctrl_cli.cli.common import (
@@ -9,12 +10,13 @@ from splatctrl_cli.cli.common import (
     format_cell,
     locked_joints,
     long_table,
+    remarks,
     request_of,
     source_options,
     table,
 )
 from splatctrl_cli.config import load_config
-from splatctrl_cli.jobs.replay.files import Columns, chunks_of, when_and_why
+from splatctrl_cli.jobs.replay.files import chunks_of, when_and_why
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replay.request import Replay, ReplayRequest
 
@@ -24,8 +26,7 @@ HEADLINE = (
 )
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args)
+def run(args: argparse.Namespace, console: Console) -> int:
     result = replay(
         request_of(
             ReplayRequest,
@@ -37,43 +38,30 @@ def run(args: argparse.Namespace) -> int:
         ),
         console,
     )
-    return show_replayed(
-        console,
-        result,
+    return console.concluded(
+        result.verdict,
+        {"out": str(result.out), **result.metrics},
+        _lines(result, is_long=args.verbose > 0, with_steps=args.steps),
         code=result.exit_code(report_only=args.report_only),
-        is_long=args.verbose > 0,
-        with_steps=args.steps,
     )
-
-
-def show_replayed(
-    console: Console, result: ReplayResult, *, code: int, is_long: bool = False, with_steps: bool = False
-) -> int:
-    lines = _lines(result, is_long=is_long, with_steps=with_steps)
-    return console.concluded(result.verdict, {"out": str(result.out), **result.metrics}, lines, code=code)
 
 
 def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator[str]:
     replay, metrics = result.replay, result.metrics
     shown = metrics if is_long else {name: metrics[name] for name in HEADLINE if metrics.get(name) is not None}
-    yield from when_and_why(replay)
-    yield ""
-    yield from table(("replay", "value"), [(name, format_cell(value)) for name, value in shown.items()])
-    yield from result.notes
-    if not is_long:
-        yield f"wrote {result.out}; -v prints every figure"
+    yield from (
+        *when_and_why(replay),
+        "",
+        *table(("replay", "value"), [(name, format_cell(value)) for name, value in shown.items()]),
+        *result.notes,
+        *remarks((f"wrote {result.out}; -v prints every figure", not is_long), ("", with_steps)),
+    )
     if with_steps:
-        yield ""
-        yield from _step_lines(replay)
+        names = [n for n in next(chunks_of(replay)) if not n.startswith(("stamp_ns", "q_", "v_", "dv_"))]
+        yield from long_table(names, partial(_step_rows, replay, names))
 
 
-def _step_lines(replay: Replay) -> Iterator[str]:
-    def shown(columns: Columns) -> Columns:
-        hidden = ("stamp_ns", "q_", "v_", "dv_")
-        return {name: values for name, values in columns.items() if not name.startswith(hidden)}
-
-    def rows() -> Iterator[list[str]]:
-        for chunk in chunks_of(replay):
-            yield from ([format_cell(value) for value in row] for row in zip(*shown(chunk).values(), strict=True))
-
-    return long_table([*shown(next(chunks_of(replay)))], rows)
+def _step_rows(replay: Replay, names: Sequence[str]) -> Iterator[list[str]]:
+    for chunk in chunks_of(replay):
+        columns = (chunk[name] for name in names)
+        yield from ([format_cell(value) for value in row] for row in zip(*columns, strict=True))

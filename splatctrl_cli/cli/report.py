@@ -4,39 +4,38 @@ import argparse
 import os
 import sys
 import webbrowser
+from dataclasses import asdict
 from pathlib import Path
 
-from splatctrl_cli.cli.common import Console, request_of
+from splatctrl_cli.cli.common import Console, remarks, request_of
 from splatctrl_cli.jobs.report.report import ViewRequest, WriteReportRequest, view, write_report
 
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # one of which is set on Linux where a browser can open a window
 MOST_NOTES = 5
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args)
+def run(args: argparse.Namespace, console: Console) -> int:
     result = write_report(request_of(WriteReportRequest, args, roots=tuple(args.root)), console)
     more = len(result.notes) - MOST_NOTES
     lines = [
         f"{result.file}: {result.num_runs} runs, {result.num_scenes} in 3-D, {result.bytes} bytes",
         *result.notes[:MOST_NOTES],
-        *([f"and {more} more not in 3-D"] if more > 0 else []),
+        *remarks((f"and {more} more not in 3-D", more > 0)),
     ]
-    return console.result(result.as_dict(), lines)
+    return console.result(asdict(result), lines)
 
 
-def run_view(args: argparse.Namespace) -> int:
-    console = Console(args)
+def run_view(args: argparse.Namespace, console: Console) -> int:
     result = view(request_of(ViewRequest, args, roots=tuple(args.root)))
     found = f"{result.num_splats} splats, {result.num_states} states, {result.num_unknown} cubes never seen"
-    is_opened = not args.no_open and opened(result.file)
-    console.result({**result.as_dict(), "is_opened": is_opened}, [f"{result.file}: {found}, {result.bytes} bytes"])
+    is_opened = not args.no_open and open_page(result.file)
+    console.result({**asdict(result), "is_opened": is_opened}, [f"{result.file}: {found}, {result.bytes} bytes"])
     if not is_opened and not args.no_open:
         console.log(f"no browser here: open {result.file.absolute()}")
     return 0
 
 
-def opened(page: Path) -> bool:
+def open_page(page: Path) -> bool:
     """Open a page in a browser window; False without one."""
     if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in SCREENS):
         return False

@@ -4,7 +4,6 @@ import argparse
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -19,39 +18,34 @@ SCHEMA = "splatctrl-output 1"
 SCHEMA_FILE = Path(__file__).parent.parent / "report" / "output.schema.json"
 
 
-def enveloped(result: Mapping[str, Any], code: int) -> dict[str, Any]:
+def wrap_result(result: Mapping[str, Any], code: int) -> dict[str, Any]:
     """Put the schema's name and the exit code in front of a result."""
     first = {"schema": SCHEMA, "exit_code": code}
     return {**first, **result, **first}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reports:
-    """A command's report: the recording's `path`, --junit file, and start by time.perf_counter."""
+def report_command(args: argparse.Namespace, verdict: Mapping[str, Any] | None, code: int, line: str = "") -> None:
+    """Report a verdict, or a command without one by its error line, to --junit and GitHub.
 
-    command: str
-    path: str
-    junit: Path | None
-    start: float
-
-    def conclude(self, verdict: Mapping[str, Any] | None, code: int, line: str = "") -> None:
-        """Report a verdict, or a command without one by its error line.
-
-        Raises UsageError or WriteError if the file is unwritable.
-        """
-        seconds = time.perf_counter() - self.start
-        group = f"{self.path}/{self.command}" if self.path else self.command
-        properties = {"splatctrl": __version__, "command": self.command, "exit code": str(code)}
-        suite = Suite(
-            name=self.path or self.command,
-            path=self.path,
-            cases=[error_case(group, line, exit_code=code)] if verdict is None else cases_of(verdict, group),
-            notes=() if verdict is None else notes_of(verdict),
-            properties=properties | ({} if verdict is None else {"label": verdict["label"]}),
-            started=(datetime.now(UTC) - timedelta(seconds=seconds)).isoformat(timespec="seconds"),
-            seconds=seconds,
-        )
-        publish([suite], junit=self.junit, is_fatal=code != 0)
+    Raises UsageError or WriteError if the file is unwritable.
+    """
+    action = getattr(args, "action", None)
+    command = f"{args.command} {action}" if action else args.command
+    given = next((value for name in RECORDINGS if (value := getattr(args, name, None))), "")
+    path = " ".join(map(str, given if isinstance(given, list) else [given]))
+    seconds = time.perf_counter() - args.began
+    group = f"{path}/{command}" if path else command
+    properties = {"splatctrl": __version__, "command": command, "exit code": str(code)}
+    suite = Suite(
+        name=path or command,
+        path=path,
+        cases=[error_case(group, line, exit_code=code)] if verdict is None else cases_of(verdict, group),
+        notes=() if verdict is None else notes_of(verdict),
+        properties=properties | ({} if verdict is None else {"label": verdict["label"]}),
+        started=(datetime.now(UTC) - timedelta(seconds=seconds)).isoformat(timespec="seconds"),
+        seconds=seconds,
+    )
+    publish([suite], junit=args.junit, is_fatal=code != 0)
 
 
 def publish(suites: Sequence[Suite], *, junit: Path | None, is_fatal: bool) -> None:
@@ -64,17 +58,6 @@ def publish(suites: Sequence[Suite], *, junit: Path | None, is_fatal: bool) -> N
         print(f"splatctrl: GITHUB_STEP_SUMMARY: cannot be written: {error.strerror}", file=sys.stderr)
 
 
-def reports_of(args: argparse.Namespace) -> Reports:
-    action = getattr(args, "action", None)
-    given = next((value for name in RECORDINGS if (value := getattr(args, name, None))), "")
-    return Reports(
-        command=f"{args.command} {action}" if action else args.command,
-        path=" ".join(map(str, given if isinstance(given, list) else [given])),
-        junit=args.junit,
-        start=args.began,
-    )
-
-
 def tell_of_failure(
     words: Sequence[str], args: argparse.Namespace | None, line: str, code: int, start: float
 ) -> None:
@@ -82,9 +65,9 @@ def tell_of_failure(
 
     args: None for unparsed words. start: by time.perf_counter.
     """
-    unparsed = Reports(command=words[0], path="", junit=_junit_in(words), start=start)
+    args = args or argparse.Namespace(command=words[0], junit=_junit_in(words), began=start)
     try:
-        (unparsed if args is None else reports_of(args)).conclude(None, code, line)
+        report_command(args, None, code, line)
     except (SplatCtrlError, OSError) as error:
         if str(error) != line:
             print(f"splatctrl: {' '.join(str(error).split())}", file=sys.stderr)

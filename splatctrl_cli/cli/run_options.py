@@ -94,9 +94,9 @@ SIMULATE = (
     option("--spheres FILE", "its spheres (default: fitted to it)", Path),
     PACKAGES,
     seed("the noise"),
-    option("--duration S", "length in seconds (default: 7)", real(0.5, 600, "s")),
-    option("--free", "free space: floor and walls, no table and nothing on it"),
-    option("--person", "a walking person with masks, instead of the standing cylinder"),
+    option("--duration S", "length in seconds (default: 7)", real(0.5, 600, "s"), dest="duration_s"),
+    option("--free", "free space: floor and walls, no table and nothing on it", dest="is_free"),
+    option("--person", "a walking person with masks, instead of the standing cylinder", dest="with_person"),
     option(
         "--visitor X,Y,RADIUS",
         "where the standing cylinder is, and its radius [m] (default: 0.42,0.08,0.06)",
@@ -115,6 +115,7 @@ SIMULATE = (
         option(
             "--slim",
             "draw the arm by visual shapes that lie 3 mm (median) to 27 mm (95 %) inside of its collision shapes",
+            dest="is_slim",
         ),
         option(
             "--unmodelled PARTS",
@@ -137,6 +138,7 @@ CHECK = (
         "--quick N",
         f"read the first N images of a topic only (default of N: {QUICK})",
         _num_images,
+        dest="num_images",
         nargs="?",
         const=QUICK,
     ),

@@ -1,16 +1,16 @@
 """``splatctrl score``: renders compared with held-out views."""
 
 import argparse
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.score_report import PREFIX
 from splatctrl_cli.evaluate.verdict import counted
-from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.jobs.score.views import CloudSettings
 from splatctrl_cli.records import MILLIMETRE
 
@@ -31,30 +31,27 @@ COLUMNS = {
     "valid_share": "valid",
     "chamfer": "Chamfer mm",
 }
+SHARE = 100  # printed as per cent
+FORMS = {  # by the start of a figure's name: factor and format
+    **{"depth": (1000, ".1f"), "chamfer": (1000, ".2f"), "psnr": (1, ".2f")},
+    **dict.fromkeys(("seen_share", "in_front_seen", "mask_share", "valid_share"), (SHARE, ".1f")),
+}
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args)
-    return show_scored(console, score(_request(args), console))
-
-
-def show_scored(console: Console, result: ScoreResult) -> int:
-    return console.concluded(result.verdict, result.report, lines_of(result.report))
-
-
-def _request(args: argparse.Namespace) -> ScoreRequest:
+def run(args: argparse.Namespace, console: Console) -> int:
     first, *beside = args.reference or [None]
-    return request_of(
+    request = request_of(
         ScoreRequest,
         args,
         recording=replace(recording_of(args, first, args.masks), beside=tuple(beside)),
         newest=args.snapshots == "newest",
         cloud=_cloud(args),
     )
+    result = score(request, console)
+    return console.concluded(result.verdict, result.report, lines_of(result.report))
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
-    """Read --cloud's settings. Raises UsageError for its options alone."""
     if args.cloud is None:
         for name in ("unit", "masks"):
             if getattr(args, f"cloud_{name}") is not None:
@@ -72,49 +69,40 @@ def _cloud(args: argparse.Namespace) -> CloudSettings | None:
     )
 
 
-def lines_of(report: Mapping[str, Any]) -> Iterable[str]:
-    return _lines_of_scans(report) if "results" in report else _lines_of_views(report)
-
-
-def _lines_of_views(report: Mapping[str, Any]) -> Iterator[str]:
-    metrics, columns = report["metrics"], [name for name in COLUMNS if name in report["views"][0]]
-    stamps = [f"{view['stamp_ns'] / 1e9:.3f}" if report["has_clock"] else "-" for view in report["views"]]
-    rows = [
-        [view["view"], stamp, *_cells(columns, view)] for view, stamp in zip(report["views"], stamps, strict=True)
-    ]
-    yield from _with_mean(("view", "stamp [s]"), columns, rows, [f"mean of {len(rows)}", "-"], metrics)
+def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
+    """Figures by view, or by scan, with their mean, and what they mean."""
+    metrics, scans = report["metrics"], report.get("results", {})
+    views = [] if scans else report["views"]
+    columns = [name for name in COLUMNS if name in (metrics if scans else views[0])]
+    stamps = [f"{view['stamp_ns'] / 1e9:.3f}" if report["has_clock"] else "-" for view in views]
+    rows = [[view["view"], stamp, *_cells(columns, view)] for view, stamp in zip(views, stamps, strict=True)]
+    rows += [[s, one["metrics"]["num_views"], *_cells(columns, one["metrics"])] for s, one in scans.items()]
+    header = ("scan", "views") if scans else ("view", "stamp [s]")
+    num = metrics["num_views"] if scans else "-"
+    yield from _add_mean(header, columns, rows, [f"mean of {len(rows)}", num], metrics)
     yield from ("", *_protocol_lines(report["protocol"]))
-    yield (
-        f"{counted(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot; "
-        f"depth: median of the absolute error; seen: by {', '.join(report['training_cameras'])} within 2 cm"
-    )
-    if "chamfer" in metrics:
-        yield from _cloud_lines(metrics, report["protocol"]["definitions"]["cloud"])
-    if "psnr_all_corrected" in columns:
+    if views:
         yield (
+            f"{counted(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot;"
+            f" depth: median of the absolute error; seen: by {', '.join(report['training_cameras'])} within 2 cm"
+        )
+    if "chamfer" in metrics:
+        clouds = [one["protocol"]["definitions"]["cloud"] for one in (scans.values() if scans else [report])]
+        yield from (_surface(metrics), f"cloud: {'; '.join(clouds)}")
+    if views:
+        corrected = (
             "corrected: all pixels, at the pose and exposure that the view has among the training views, its depth"
             " freed of the bend that theirs was"
         )
-    yield "in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one"
-    if metrics["free_mass"] is not None:
-        yield f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free"
-
-
-def _lines_of_scans(report: Mapping[str, Any]) -> Iterator[str]:
-    metrics, results = report["metrics"], report["results"]
-    columns = [name for name in COLUMNS if name in metrics]
-    rows = [[s, one["metrics"]["num_views"], *_cells(columns, one["metrics"])] for s, one in results.items()]
-    yield from _with_mean(
-        ("scan", "views"), columns, rows, [f"mean of {len(results)}", metrics["num_views"]], metrics
-    )
-    yield from ("", *_protocol_lines(report["protocol"]))
-    if "chamfer" in metrics:
-        yield from _cloud_lines(
-            metrics, "; ".join(one["protocol"]["definitions"]["cloud"] for one in results.values())
+        mass = metrics["free_mass"]
+        yield from remarks(
+            (corrected, "psnr_all_corrected" in columns),
+            ("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one", True),
+            (f"{100 * (mass or 0.0):.2f}% of the splats' mass is in space observed free", mass is not None),
         )
 
 
-def _with_mean(
+def _add_mean(
     header: Sequence[str],
     columns: Sequence[str],
     rows: Sequence[Sequence[Any]],
@@ -123,7 +111,8 @@ def _with_mean(
 ) -> list[str]:
     last = [[*mean, *_cells(columns, metrics)]]
     if f"{PREFIX}num_views" in metrics:
-        last.append(["change", "-", *(_change(name, metrics.get(PREFIX + name)) for name in columns)])
+        changes = {name: metrics.get(PREFIX + name) for name in columns}
+        last.append(["change", "-", *(_cell(name, value, is_change=True) for name, value in changes.items())])
     lines = table((*header, *(COLUMNS[name] for name in columns)), [*rows, *last])
     lines.insert(2 + len(rows), lines[1])
     return lines
@@ -131,10 +120,9 @@ def _with_mean(
 
 def _protocol_lines(protocol: Mapping[str, Any]) -> list[str]:
     color = ", ".join(f"{value:.2f}" for value in protocol["background"])
-    published = protocol["published_resolution"]
+    published, scans = protocol["published_resolution"], protocol["published_scans"]
     resolution = ", ".join(protocol["resolution"])
     differs = "" if published in (None, resolution) else f" (published figures: {published})"
-    scans = protocol["published_scans"]
     return [
         f"protocol: {protocol['name']}" + ("" if protocol["name"] == "none" else f" ({protocol['source']})"),
         f"split: {protocol['split']}",
@@ -144,34 +132,25 @@ def _protocol_lines(protocol: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _cloud_lines(metrics: Mapping[str, Any], words: str) -> list[str]:
-    def length(name: str) -> str:
-        return "-" if metrics[name] is None else f"{1e3 * metrics[name]:.2f} mm"
-
-    def share(name: str) -> str:
-        return "-" if metrics[name] is None else f"{100 * metrics[name]:.1f}% farther"
-
+def _surface(metrics: Mapping[str, Any]) -> str:
     figures = {"accuracy": "accuracy", "completeness": "completeness of all"}
     figures["completeness_seen"] = "completeness of seen"
-    parts = [f"{words} {length(name)} ({share(name + '_beyond')})" for name, words in figures.items()]
-    return [f"surface: {', '.join(parts)}, Chamfer {length('chamfer')}", f"cloud: {words}"]
+    lengths = {name: "-" if (v := metrics[name]) is None else f"{1e3 * v:.2f} mm" for name in (*figures, "chamfer")}
+    beyond = {name: metrics[f"{name}_beyond"] for name in figures}
+    shares = {name: "-" if share is None else f"{100 * share:.1f}% farther" for name, share in beyond.items()}
+    parts = [f"{words} {lengths[name]} ({shares[name]})" for name, words in figures.items()]
+    return f"surface: {', '.join(parts)}, Chamfer {lengths['chamfer']}"
 
 
 def _cells(columns: Sequence[str], metrics: Mapping[str, Any]) -> list[str]:
     return [_cell(name, metrics.get(name)) for name in columns]
 
 
-def _change(name: str, value: float | None) -> str:
-    return "-" if value is None else ("-" if value < 0 else "+") + _cell(name, abs(value))
-
-
-def _cell(name: str, value: float | None) -> str:
+def _cell(name: str, value: float | None, *, is_change: bool = False) -> str:
+    """A figure in its column's unit; changes have a sign."""
     if value is None:
         return "-"
-    if name.startswith("depth"):
-        return f"{1000 * value:.1f}"
-    if name == "chamfer":
-        return f"{1000 * value:.2f}"
-    if name in ("seen_share", "in_front_seen", "mask_share", "valid_share"):
-        return f"{100 * value:.1f}%"
-    return f"{value:.2f}" if name.startswith("psnr") else f"{value:.4f}"
+    factor, form = next((of for start, of in FORMS.items() if name.startswith(start)), (1.0, ".4f"))
+    sign = "" if not is_change else "-" if value < 0 else "+"
+    text = f"{factor * (abs(value) if is_change else value):{form}}"
+    return sign + text + "%" * (factor == SHARE)

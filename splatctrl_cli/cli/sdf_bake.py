@@ -1,42 +1,36 @@
-"""``splatctrl sdf-bake``: splats as a distance grid, with its accuracy."""
+"""``splatctrl sdf-bake`` and ``query``: a distance grid with its accuracy, and answers at points."""
 
 import argparse
+import shutil
+import sys
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from splatctrl_cli.cli.common import Console, format_cell, names_of, request_of, table
+from splatctrl_cli.cli.common import Console, format_cell, names_of, remarks, request_of, table
 from splatctrl_cli.config import fixed, load_config
-from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, TruthComparison
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.formats.grid.grid_formats import FORMATS
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
+from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 from splatctrl_cli.records import Box, Label
 
 SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options
 ERRORS = ("mean", "rmse", "over_95", "over_max")
+Band = Mapping[str, Any]
+"""Errors in a band of true distance, as in ``field.json``."""
+
 COLUMNS = ("count", "mean mm", "rmse mm", "95 % mm", "max mm")
 
 
-def run(args: argparse.Namespace) -> int:
-    console = Console(args)
-    return show_baked(console, bake(_request(args), console))
-
-
-def show_baked(console: Console, result: BakeResult) -> int:
-    console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
-    compared = result.accuracy.as_dict()
-    return console.concluded(
-        result.verdict, {**result.summary, **({"accuracy": compared} if compared else {})}, _lines(result)
-    )
-
-
-def _request(args: argparse.Namespace) -> BakeRequest:
+def run(args: argparse.Namespace, console: Console) -> int:
     config = load_config(args.config, args.set)
     given = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
     log, cameras = (None, ()) if args.held_out is None else split_cameras(args.held_out)
-    return request_of(
+    request = request_of(
         BakeRequest,
         args,
         out=args.out or Path("field"),
@@ -49,6 +43,10 @@ def _request(args: argparse.Namespace) -> BakeRequest:
         held_out=log,
         held_out_cameras=cameras,
     )
+    result = bake(request, console)
+    console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
+    found = {**result.summary, **({"accuracy": result.accuracy} if result.accuracy else {})}
+    return console.concluded(result.verdict, found, _lines(result))
 
 
 def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
@@ -60,51 +58,47 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
 
 
 def _lines(result: BakeResult) -> Iterator[str]:
-    shown_values = {**result.summary, "shape": " x ".join(map(str, result.summary["shape"]))}
-    yield from table(
-        ("field", ""), [(name.replace("_", " "), format_cell(value)) for name, value in shown_values.items()]
-    )
-    truth, mesh, held_out = result.accuracy.truth, result.accuracy.reference_mesh, result.accuracy.held_out_depth
-    if truth is not None:
-        yield from ("", *_truth_lines(truth))
+    values = {**result.summary, "shape": " x ".join(map(str, result.summary["shape"]))}
+    yield from table(("field", ""), [(name.replace("_", " "), format_cell(value)) for name, value in values.items()])
+    truth, mesh, held_out = (result.accuracy.get(name) for name in ("truth", "reference_mesh", "held_out_depth"))
+    yield from () if truth is None else ("", *_truth_lines(truth))
     if mesh is not None:
-        cells = [(name, _band(band), *_errors(band)) for name, band in _each(mesh.accuracy.everywhere)]
+        cells = [(name, _band(band), *_errors(band)) for name, band in _each(mesh["everywhere"])]
         yield from ("", *table(("field", "from mesh cm", *COLUMNS), cells))
     if held_out is not None:
         note = "before it: points whose ball up to it was seen to be free"
-        yield from ("", f"held-out depth of {held_out.num_frames} frames; {note}")
-        places = {name: [("on it", band)] for name, band in held_out.on_surface.items()}
-        for name, band in _each(held_out.before.seen):
+        places = {name: [("on it", band)] for name, band in held_out["on_surface"].items()}
+        for name, band in _each(held_out["before"]["seen"]):
             places[name].append((_band(band), band))
         cells = [(name, place, *_errors(band)) for name, bands in places.items() for place, band in bands]
-        yield from table(("field", "from depth cm", *COLUMNS), cells)
+        titled = f"held-out depth of {held_out['num_frames']} frames; {note}"
+        yield from ("", titled, *table(("field", "from depth cm", *COLUMNS), cells))
 
 
-def _truth_lines(compared: TruthComparison) -> list[str]:
-    accuracy, figures = compared.accuracy, ("mean", "rmse", "median", "over_95", "over_max")
+def _truth_lines(compared: Mapping[str, Any]) -> list[str]:
+    figures, over = ("mean", "rmse", "median", "over_95", "over_max"), compared["over_estimate"]
     rows = [
         (where, name, _band(band), *_errors(band, figures))
-        for where, fields in (("seen", accuracy.seen), ("all", accuracy.everywhere))
-        for name, band in _each(fields)
+        for where, place in (("seen", "seen"), ("all", "everywhere"))
+        for name, band in _each(compared[place])
     ]
-    over = accuracy.over_estimate
     verdict = (
-        f"hard exceeds the truth by more than {over.allowance * 1e3:.1f} mm at {over.count_beyond} of {over.count} "
-        "seen cells"
+        f"hard exceeds the truth by more than {over['allowance'] * 1e3:.1f} mm at {over['count_beyond']} of "
+        f"{over['count']} seen cells"
     )
-    if over.median_beyond is not None and over.max_error is not None:
+    if over["median_beyond"] is not None and over["max_error"] is not None:
         verdict += (
-            f": in the median by {over.median_beyond * 1e3:.1f} mm more than that; "
-            f"the largest error is {over.max_error * 1e3:.1f} mm"
+            f": in the median by {over['median_beyond'] * 1e3:.1f} mm more than that; "
+            f"the largest error is {over['max_error'] * 1e3:.1f} mm"
         )
-    if compared.num_outside_workspace:
-        verdict += f"; {compared.num_outside_workspace} cells before seen surfaces outside the workspace do not count"
+    if outside := compared["num_outside_workspace"]:
+        verdict += f"; {outside} cells before seen surfaces outside the workspace do not count"
     expected = [
-        f"probability, {name}: calibration error {curve.calibration_error:.3f} at seen cells"
-        for name, curve in compared.reliability.items()
+        f"probability, {name}: calibration error {curve['calibration_error']:.3f} at seen cells"
+        for name, curve in compared["reliability"].items()
     ]
-    if compared.error_mean is not None and compared.error_sigma:
-        mean, sigma = compared.error_mean, compared.error_sigma
+    mean, sigma = compared["error_mean"], compared["error_sigma"]
+    if mean is not None and sigma:
         expected.append(
             f"within {fixed.PROBABILITY_NEAR * 100:g} cm of seen surfaces sdf errs by {mean * 1e3:.1f} +- "
             f"{sigma * 1e3:.1f} mm: calibrate the probability with --set "
@@ -119,21 +113,64 @@ def _truth_lines(compared: TruthComparison) -> list[str]:
     ]
 
 
-def _each(fields: Mapping[str, Iterable[BandAccuracy]]) -> Iterator[tuple[str, BandAccuracy]]:
+def _each(fields: Mapping[str, Iterable[Band]]) -> Iterator[tuple[str, Band]]:
     return ((name, band) for name, bands in fields.items() for band in bands)
 
 
-def _band(band: BandAccuracy) -> str:
-    return f"{band.lower * 100:g}-{band.upper * 100:g}"
+def _band(band: Band) -> str:
+    return f"{band['lower'] * 100:g}-{band['upper'] * 100:g}"
 
 
-def _errors(band: BandAccuracy, figures: Sequence[str] = ERRORS) -> list[object]:
+def _errors(band: Band, figures: Sequence[str] = ERRORS) -> list[object]:
     """Count and errors [mm]."""
-    values = (getattr(band, name) for name in figures)
-    return [band.count, *("-" if value is None else f"{value * 1e3:.1f}" for value in values)]
+    values = (band[name] for name in figures)
+    return [band["count"], *("-" if value is None else f"{value * 1e3:.1f}" for value in values)]
 
 
 def labels_of(text: str) -> frozenset[Label]:
     """Labels in a field: objects and those of ``--include``. Raises UsageError for others."""
     names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
     return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})
+
+
+def run_query(args: argparse.Namespace, console: Console) -> int:
+    """Run; without an output answers go to stdout, figures to stderr."""
+    request = request_of(
+        QueryRequest,
+        args,
+        points=sys.stdin if str(args.points) == "-" else args.points,
+        config=load_config(args.config, args.set),
+        labels=labels_of(args.include),
+    )
+    if args.out is not None or console.is_json:
+        result = query(request, console)
+        out = None if result.out is None else str(result.out)
+        found = {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}
+        return console.result(found, _query_lines(result))
+    with tempfile.TemporaryDirectory() as folder:  # a table with a wrong line is refused before anything is printed
+        answers = Path(folder) / "answers.csv"
+        result = query(replace(request, out=answers), console)
+        with answers.open(encoding="utf-8", newline="") as stream:
+            shutil.copyfileobj(stream, sys.stdout)
+    for line in _query_lines(replace(result, out=None)):
+        console.log(line)
+    return 0
+
+
+def _query_lines(result: QueryResult) -> list[str]:
+    num = result.metrics["num_points"] or 0
+    rate = f"{num / max(result.seconds['answer'], 1e-9):,.0f} points/s"  # of fewer points it says nothing
+    return [
+        *table(
+            (result.kind, ""),
+            [(name.replace("_", " "), _format_figure(name, v)) for name, v in result.metrics.items()],
+        ),
+        *(f"note: {note}" for note in result.notes),
+        *remarks((rate, num >= 1000), (f"wrote {result.out}", result.out)),
+    ]
+
+
+def _format_figure(name: str, value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if name.startswith("num_") else f"{value * 1e3:.1f} mm"

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from splatctrl_cli.config.ranges import Declared, Section, Within, check, copy_unchecked, cut, shown
+from splatctrl_cli.config.ranges import Declared, Section, Within, check, copy_unchecked, format_value, shorten
 from splatctrl_cli.config.sections import (
     ControlConfig,
     FieldConfig,
@@ -89,22 +89,24 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
     """
     given: dict[str, dict[str, Any]] = {}
     for where, section, values in _tables(path, assignments):
-        given.setdefault(section, {}).update(_typed(where, section, values))
+        given.setdefault(section, {}).update(_convert(where, section, values))
     default = Config()
     return replace(default, **{name: replace(getattr(default, name), **values) for name, values in given.items()})
 
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    for name in [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]:
+    for name in [
+        text.partition("=")[2].strip() for text in assignments if text.partition("=")[0].strip() == "preset"
+    ]:
         _check_known(name, PRESETS, "--preset", "")
         yield from ((f"--preset {name}", section, values) for section, values in PRESETS[name].items())
     for section, values in ({} if path is None else _read_toml(path)).items():
         _check_known(section, [field.name for field in fields(Config)], str(path), "")
         if not isinstance(values, dict):
-            raise UsageError(f"{path}: {section}: expected a table, got {shown(values)}")
+            raise UsageError(f"{path}: {section}: expected a table, got {format_value(values)}")
         yield str(path), section, values
     for assignment in assignments:
-        if _is_preset(assignment):
+        if assignment.partition("=")[0].strip() == "preset":
             continue
         key, separator, text = assignment.partition("=")
         section, dot, name = key.strip().partition(".")
@@ -112,16 +114,12 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
             raise UsageError(
                 f"--set {assignment}: expected section.key=value", remedy="write it like --set scene.max_splats=3000"
             )
-        where = f"--set {cut(assignment)}"
+        where = f"--set {shorten(assignment)}"
         _check_known(section, [field.name for field in fields(Config)], where, "")
         yield where, section, {name: _parse_value(text.strip())}
 
 
-def _is_preset(assignment: str) -> bool:
-    return assignment.partition("=")[0].strip() == "preset"
-
-
-def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
+def _convert(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
     """Typed values. Raises UsageError for unknown keys or types."""
     kind = type(getattr(Config(), section))
     assert issubclass(kind, Section)
@@ -129,11 +127,11 @@ def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
     typed: dict[str, Any] = {}
     for key, value in values.items():
         _check_known(key, declared, where, f"{section}.")
-        typed[key] = _of_type(value, hints[key])
+        typed[key] = _has_type(value, hints[key])
         if type(typed[key]) not in [get_origin(option) or option for option in _options(hints[key])]:
             expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
             expected += declared[key].expected
-            raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {shown(value)}")
+            raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {format_value(value)}")
     return typed
 
 
@@ -171,13 +169,13 @@ def _options(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
 
 
-def _of_type(value: Any, hint: Any) -> Any:
+def _has_type(value: Any, hint: Any) -> Any:
     """The value; integers to floats, lists to tuples, by type."""
     options = _options(hint)
     if str in options and isinstance(value, float) and math.isnan(value):
         return "nan"  # a word here, which TOML takes for a number
     if isinstance(value, list) and tuple[float, ...] in options:
-        numbers = tuple(_of_type(item, float) for item in value)
+        numbers = tuple(_has_type(item, float) for item in value)
         return numbers if all(type(number) is float for number in numbers) else value
     if float in options and type(value) is int and abs(value) < 1 << 1023:  # what a float holds
         return float(value)
@@ -238,7 +236,7 @@ def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Se
 
 def toml_of(settings: Sequence[Setting]) -> Iterator[str]:
     """TOML lines of every key; changed ones with source and default."""
-    for section, setting in _with_sections(settings):
+    for section, setting in _add_headers(settings):
         yield from section
         changed = f"  # {setting.source} (default: {toml_value(setting.default)})"
         yield f"{setting.key} = {toml_value(setting.value)}" + ("" if setting.source == DEFAULT else changed)
@@ -246,7 +244,7 @@ def toml_of(settings: Sequence[Setting]) -> Iterator[str]:
 
 def template_of(settings: Sequence[Setting]) -> Iterator[str]:
     """TOML lines of every default as a comment, with meaning and range."""
-    for section, setting in _with_sections(settings):
+    for section, setting in _add_headers(settings):
         yield from section
         yield f"# {setting.declared.reason}; {setting.declared.expected}"
         yield f"# {setting.key} = {toml_value(setting.default)}"
@@ -258,7 +256,7 @@ def toml_value(value: Value) -> str:
     return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
-def _with_sections(settings: Sequence[Setting]) -> Iterator[tuple[list[str], Setting]]:
+def _add_headers(settings: Sequence[Setting]) -> Iterator[tuple[list[str], Setting]]:
     before = ""
     for setting in settings:
         blank = [""] if before else []

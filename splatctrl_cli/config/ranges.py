@@ -50,11 +50,9 @@ class OneOf:
 
     @property
     def expected(self) -> str:
-        """The words as text."""
         return f"{', '.join(self.words[:-1])} or {self.words[-1]}"
 
     def holds(self, value: Any) -> bool:
-        """True for one of the words."""
         return value in self.words
 
 
@@ -82,7 +80,7 @@ class Section:
     def __init_subclass__(cls, *, section: str) -> None:
         """Raises TypeError for a key without a range."""
         hints = get_type_hints(cls, include_extras=True)
-        cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
+        cls.section, cls.declared = section, {key: _declare(hints[key]) for key in cls.__annotations__}
 
     derived = copy_unchecked
 
@@ -96,7 +94,7 @@ class Section:
             check(least <= most, f"{self.section}.{low}", expected, least)
 
 
-def _declared(hint: Any) -> Declared:
+def _declare(hint: Any) -> Declared:
     for note in get_args(hint)[1:]:
         if isinstance(note, Within | OneOf):
             return note
@@ -106,20 +104,20 @@ def _declared(hint: Any) -> Declared:
 def check(holds: bool, name: str, expected: str, value: object) -> None:
     """Raise UsageError with key, expectation and value, unless `holds`."""
     if not holds:
-        raise UsageError(f"{name}: expected {expected}, got {shown(value)}", remedy="see splatctrl config --template")
+        raise UsageError(
+            f"{name}: expected {expected}, got {format_value(value)}", remedy="see splatctrl config --template"
+        )
 
 
-def shown(value: object) -> str:
-    """A value, as shown in errors."""
+def format_value(value: object) -> str:
     try:
         text = repr(value)
     except ValueError:  # an integer of more digits than Python prints
         return f"{type(value).__name__} too long to show"
-    return cut(text)
+    return shorten(text)
 
 
-def cut(text: str) -> str:
-    """A long text's beginning."""
+def shorten(text: str) -> str:
     return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
 
 

@@ -82,17 +82,18 @@ class FieldAccuracy:
     def as_dict(self) -> dict[str, object]:
         return {**asdict(self), "holds": self.over_estimate.holds}
 
-    def figures(self) -> dict[str, float | None]:
-        """The numbers by the names of `metric_scales`."""
-        found = {
-            f"{where}.{name}.{band_name(band.lower, band.upper)}.{figure}": value
-            for where, fields_ in (("everywhere", self.everywhere), ("seen", self.seen))
-            for name, bands in fields_.items()
-            for band in bands
-            for figure, value in vars(band).items()
-            if figure not in {"lower", "upper"}
-        }
-        return found | {f"over_estimate.{name}": value for name, value in vars(self.over_estimate).items()}
+
+def figures_of(document: Mapping[str, Any]) -> dict[str, float | None]:
+    """The numbers of an accuracy, as in ``field.json``, by the names of `metric_scales`."""
+    found = {
+        f"{where}.{name}.{band_name(band['lower'], band['upper'])}.{figure}": value
+        for where in ("everywhere", "seen")
+        for name, bands in document[where].items()
+        for band in bands
+        for figure, value in band.items()
+        if figure not in {"lower", "upper"}
+    }
+    return found | {f"over_estimate.{name}": value for name, value in document["over_estimate"].items()}
 
 
 def metric_scales(field_names: Sequence[str]) -> dict[str, Scale]:
@@ -133,16 +134,14 @@ def field_accuracy(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridDistance:
-    """A distance channel (X, Y, Z) [m], and an offset [m] to add."""
+GridDistance = tuple[NDArray[np.generic], float]
+"""A distance channel (X, Y, Z) [m], and an offset [m] to add."""
 
-    values: NDArray[np.generic]
-    added: float = 0.0
 
-    def at(self, cells: NDArray[np.int64]) -> Float64:
-        """Distances [m] by flat index, without copying a channel on disk."""
-        return np.asarray(self.values.reshape(-1)[cells].astype(np.float64) + self.added)
+def distance_at(distance: GridDistance, cells: NDArray[np.int64]) -> Float64:
+    """Distances [m] by flat index, without copying a channel on disk."""
+    values, added = distance
+    return np.asarray(values.reshape(-1)[cells].astype(np.float64) + added)
 
 
 def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
@@ -152,9 +151,7 @@ def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
     neither.
     """
     found: dict[str, GridDistance] = {
-        name: GridDistance(values=grid.channels[name])
-        for name in ("sdf", "hard", "se", "gpdf")
-        if name in grid.channels
+        name: (grid.channels[name], 0.0) for name in ("sdf", "hard", "se", "gpdf") if name in grid.channels
     }
     if "hard" not in found:
         margin = grid.header.get("bound_margin")
@@ -163,7 +160,7 @@ def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
                 f"distance grid: expected a channel hard or bound, got {', '.join(grid.channels)}",
                 remedy="bake with the channel bound, which is there by default",
             )
-        found["hard"] = GridDistance(values=grid.channels["bound"], added=float(margin))
+        found["hard"] = grid.channels["bound"], float(margin)
     return found
 
 
@@ -213,133 +210,84 @@ _CURVES = ("edges", "predicted", "observed")
 REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrueCells:
-    """Q sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]."""
-
-    points: Float64
-    fields: Mapping[str, Float64]
-    distance: Float64
-    surface: Float64
-
-
-@dataclass(frozen=True, kw_only=True)
-class TruthComparison:
-    """The accuracy against the truth, and its cell counts.
-
-    num_drawn cells were sampled; num_blank have no distance; num_near of the rest lie outside objects within 20 cm. A
-    training camera saw the nearest surface point of num_seen, and of num_outside_workspace where the scene keeps no
-    splats. reliability: by probability form, at seen cells within 20 cm of a surface. error_mean, error_sigma [m]: of
-    sdf at seen cells within `PROBABILITY_NEAR`, or None.
-    """
-
-    accuracy: FieldAccuracy
-    num_drawn: int
-    num_blank: int
-    num_near: int
-    num_seen: int
-    num_outside_workspace: int
-    reliability: Mapping[str, Reliability]
-    error_mean: float | None
-    error_sigma: float | None
-
-    def as_dict(self) -> dict[str, Any]:
-        counts = {name: value for name, value in vars(self).items() if name.startswith("num_")}
-        error = {"error_mean": self.error_mean, "error_sigma": self.error_sigma}
-        curves = {name: _curve(curve) for name, curve in self.reliability.items()}
-        return {**counts, **self.accuracy.as_dict(), **error, "reliability": curves}
-
-
 def compare_with_truth(
-    cells: TrueCells,
+    points: Float64,
+    fields: Mapping[str, Float64],
+    distance: Float64,
+    surface: Float64,
     frames: Iterable[RgbdFrame],
     *,
     name: str,
     workspace: Box | None,
     median_radius: float,
     probabilities: Mapping[str, Callable[[Float64, Float64], Float64]],
-) -> TruthComparison:
-    """Accuracy of `FIELDS`, and reliability of probabilities, where `frames` saw the surface.
+) -> tuple[dict[str, Any], dict[str, Reliability]]:
+    """Accuracy of `FIELDS` where `frames` saw the surface, as in ``field.json``, and reliability by probability form.
 
-    name: of the truth, for errors. workspace: where the scene keeps splats. median_radius [m]: of the splats.
-    probabilities: functions of points (Q, 3) and sdf (Q,) [m]. Raises NotEvaluableError with no cell near an object.
+    Of sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]. name: of the
+    truth. workspace: where the scene keeps splats. probabilities: functions of points (Q, 3) and sdf (Q,) [m].
+    num_blank cells have no distance; num_near of the rest lie outside objects within 20 cm. A training camera saw the
+    nearest surface point of num_seen, and of num_outside_workspace where the scene keeps no splats. reliability: at
+    seen cells within 20 cm of a surface. error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR`,
+    or None. Raises NotEvaluableError with no cell near an object.
     """
-    sdf, distance = cells.fields["sdf"], cells.distance
+    sdf = fields["sdf"]
     is_blank = ~np.isfinite(sdf)
     is_around = (np.abs(distance) < BANDS[-1][1]) & ~is_blank
     is_near = (distance >= BANDS[0][0]) & is_around
     if not is_near.any():
         raise NotEvaluableError(f"{name}: no cell of the grid lies within {BANDS[-1][1]} m outside an object")
     seen, in_workspace = np.zeros_like(is_near), np.ones_like(is_near)
-    seen[is_around] = seen_by(cells.surface[is_around], frames)
+    seen[is_around] = seen_by(surface[is_around], frames)
     if workspace is not None:
-        in_workspace[is_around] = workspace.contains(cells.surface[is_around])
+        in_workspace[is_around] = workspace.contains(surface[is_around])
     is_counted = seen & in_workspace
     error = (sdf - distance)[is_counted & (np.abs(distance) < PROBABILITY_NEAR)]
-    return TruthComparison(
-        accuracy=field_accuracy(
-            {name: cells.fields[name][is_near] for name in FIELDS},
-            distance[is_near],
-            is_counted[is_near],
-            median_radius=median_radius,
-        ),
-        num_drawn=len(cells.points),
-        num_blank=int(np.count_nonzero(is_blank)),
-        num_near=int(np.count_nonzero(is_near)),
-        num_seen=int(np.count_nonzero(is_counted & is_near)),
-        num_outside_workspace=int(np.count_nonzero(seen & ~in_workspace & is_near)),
-        reliability={
-            form: reliability(probability(cells.points[is_counted], sdf[is_counted]), distance[is_counted] <= 0)
-            for form, probability in probabilities.items()
-            if is_counted.any()
-        },
-        error_mean=float(error.mean()) if len(error) else None,
-        error_sigma=float(error.std()) if len(error) else None,
+    accuracy = field_accuracy(
+        {name: fields[name][is_near] for name in FIELDS},
+        distance[is_near],
+        is_counted[is_near],
+        median_radius=median_radius,
     )
+    curves = {
+        form: reliability(probability(points[is_counted], sdf[is_counted]), distance[is_counted] <= 0)
+        for form, probability in probabilities.items()
+        if is_counted.any()
+    }
+    document = {
+        "num_drawn": len(points),
+        "num_blank": int(np.count_nonzero(is_blank)),
+        "num_near": int(np.count_nonzero(is_near)),
+        "num_seen": int(np.count_nonzero(is_counted & is_near)),
+        "num_outside_workspace": int(np.count_nonzero(seen & ~in_workspace & is_near)),
+        **accuracy.as_dict(),
+        "error_mean": float(error.mean()) if len(error) else None,
+        "error_sigma": float(error.std()) if len(error) else None,
+        "reliability": {form: _curve(curve) for form, curve in curves.items()},
+    }
+    return document, curves
 
 
-def _curve(found: Reliability) -> dict[str, object]:
-    values = {name: [None if np.isnan(v) else float(v) for v in getattr(found, name)] for name in _CURVES}
-    return {**values, "count": found.count, "calibration_error": found.calibration_error}
+def _curve(curve: Reliability) -> dict[str, object]:
+    values = {name: [None if np.isnan(v) else float(v) for v in getattr(curve, name)] for name in _CURVES}
+    return {**values, "count": curve.count, "calibration_error": curve.calibration_error}
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeshComparison:
-    """The accuracy against the mesh `file`, and its cell counts.
+def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_points: int = 50_000) -> dict[str, Any]:
+    """Errors of cells sampled by `seed`, against the exact mesh distance, as in ``field.json``.
 
-    num_in_reach cells lie in the mesh's box widened by 20 cm; num_drawn were sampled. Of these num_unknown have no
-    distance, num_inside lie inside the mesh, and the num_near compared lie outside within 20 cm.
-    """
-
-    file: str
-    accuracy: FieldAccuracy
-    is_closed: bool
-    num_faces: int
-    num_in_reach: int
-    num_drawn: int
-    num_unknown: int
-    num_inside: int
-    num_near: int
-
-    def as_dict(self) -> dict[str, Any]:
-        counts = {name: value for name, value in vars(self).items() if name != "accuracy"}
-        return {**counts, **self.accuracy.as_dict()}
-
-
-def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_points: int = 50_000) -> MeshComparison:
-    """Errors of the grid's distances at cells sampled by `seed`, against the exact mesh distance.
-
-    The mesh is in the grid's frame [m]. Inside a closed mesh nothing is compared: the field is a shell. An open
-    mesh's unsigned distance is the truth on both sides. Raises InputError for a file that is no mesh,
-    NotEvaluableError with no cell near it.
+    The mesh is in the grid's frame [m]. num_in_reach cells lie in its box widened by 20 cm; num_drawn were sampled.
+    Of these num_unknown have no distance, num_inside lie inside the mesh, and the num_near compared lie outside
+    within 20 cm. Inside a closed mesh nothing is compared: the field is a shell. An open mesh's distance is unsigned.
+    Raises InputError for another file, NotEvaluableError with no cell near it.
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)
-    cells, num_in_reach = _drawn_cells(
+    cells, num_in_reach = _draw_cells(
         grid, mesh.vertices.min(axis=0) - REACH, mesh.vertices.max(axis=0) + REACH, max_points, seed
     )
     drawn = np.ravel_multi_index(tuple(cells.T), grid.channels["sdf"].shape)
-    is_known = np.isfinite(distances["sdf"].at(drawn))
+    is_known = np.isfinite(distance_at(distances["sdf"], drawn))
     known, points = drawn[is_known], grid.origin + grid.voxel * cells[is_known]
     field = MeshDistance(mesh)
     in_reach = field.distance(points, REACH) < REACH
@@ -351,26 +299,27 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
             f"{mesh_path}: no cell of the grid lies within {REACH:g} m outside the mesh",
             remedy="give the mesh in the frame of the grid (world), in metres",
         )
-    return MeshComparison(
-        file=mesh_path.name,
-        accuracy=field_accuracy(
-            {name: values.at(known[is_near]) for name, values in distances.items()},
-            distance[is_near],
-            None,
-            median_radius=median_radius(grid),
-        ),
-        is_closed=mesh.is_closed,
-        num_faces=len(mesh.faces),
-        num_in_reach=num_in_reach,
-        num_drawn=len(drawn),
-        num_unknown=int(np.count_nonzero(~is_known)),
-        num_inside=int(np.count_nonzero(is_inside)),
-        num_near=int(np.count_nonzero(is_near)),
+    accuracy = field_accuracy(
+        {name: distance_at(values, known[is_near]) for name, values in distances.items()},
+        distance[is_near],
+        None,
+        median_radius=median_radius(grid),
     )
+    return {
+        "file": mesh_path.name,
+        "is_closed": mesh.is_closed,
+        "num_faces": len(mesh.faces),
+        "num_in_reach": num_in_reach,
+        "num_drawn": len(drawn),
+        "num_unknown": int(np.count_nonzero(~is_known)),
+        "num_inside": int(np.count_nonzero(is_inside)),
+        "num_near": int(np.count_nonzero(is_near)),
+        **accuracy.as_dict(),
+    }
 
 
-def _drawn_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
-    """Sampled cells (C, 3), in order, of those in a box, and their number."""
+def _draw_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
+    """Sampled cells (C, 3) in a box, in order, and their number there."""
     shape = np.array(grid.channels["sdf"].shape)
     first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)
     last = np.minimum(np.floor((upper - grid.origin) / grid.voxel).astype(np.int64), shape - 1)

@@ -1,13 +1,13 @@
 """A baked field against held-out depth, and a scene's surface against reference points.
 
 A depth pixel at point p bounds the distance at x by ``|x - p|``, and the ray up to p is free. A field above the
-distance to the nearest measured point over-estimates. A lower one errs only if the ball around x, up to that point,
-was seen free: else it may know surface that no held-out pixel shows.
+distance to the nearest measured point over-estimates. A lower one errs only if the ball up to that point was seen
+free: else it may know other surface.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,6 @@ from scipy.spatial import cKDTree
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.field_accuracy import (
-    BandAccuracy,
-    FieldAccuracy,
     GridDistance,
     band_accuracy,
     field_accuracy,
@@ -47,9 +45,9 @@ def cloud_score(
 
     As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; others count
     only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference. completeness:
-    the reference to the surface. chamfer: the mean of both. completeness_seen: of reference points that a training
-    camera saw, by seen (R,). nan without points. unit: metres per unit of the reference's file, for messages. Raises
-    NotEvaluableError without near points, or if another unit fits.
+    the reference to the surface. chamfer: the mean of both. completeness_seen: of reference points seen (R,) by a
+    training camera. nan without points. unit: metres per unit of the reference's file. Raises NotEvaluableError
+    without near points, or if another unit fits.
     """
     if not max_distance > 0:
         raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
@@ -91,7 +89,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
 
 
 def _overlap(points: Float64, others: Float64, margin: float) -> float:
-    """Intersection over union of boxes, trimmed by 1 % per end, widened by `margin` [m]."""
+    """Intersection over union of boxes without their ends of 1 %, widened by `margin` [m]."""
     (low, high), (low_other, high_other) = (np.percentile(p, (1, 99), axis=0) for p in (points, others))
     sides = np.minimum(high, high_other) - np.maximum(low, low_other) + 2 * margin
     shared = float(np.prod(np.maximum(sides, 0.0)))
@@ -109,16 +107,16 @@ CLOUD_SCALES = {  # by the names of `cloud_score`
 }
 
 
-def spaced(points: Float64, spacing: float) -> Float64:
+def space_out(points: Float64, spacing: float) -> Float64:
     """Points (P, 3), visited in random order, farther than `spacing` [m] from all kept before.
 
-    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts. Points in one cube of
-    half the edge are merged first (of the whole edge, if more than 6 million points are left).
+    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts. Points in cubes of half
+    the edge are merged first (of the whole edge, if over 6 million are left).
     """
     _check_spacing(spacing)
-    some = thinned(points, spacing / 2)
+    some = thin(points, spacing / 2)
     if len(some) > 6_000_000:
-        some = thinned(points, spacing)
+        some = thin(points, spacing)
     some = some[np.random.default_rng(0).permutation(len(some))]
     low, high = (
         cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else np.empty((0, 2), np.int64)
@@ -135,7 +133,7 @@ def spaced(points: Float64, spacing: float) -> Float64:
     return some[kept]
 
 
-def thinned(points: Float64, spacing: float) -> Float64:
+def thin(points: Float64, spacing: float) -> Float64:
     """The first of points (P, 3) per cube of edge `spacing` [m].
 
     Thinning parts beforehand changes nothing.
@@ -158,10 +156,10 @@ def _check_spacing(spacing: float) -> None:
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
     """Random points (P, 3) [m] by area, four per squared `spacing`, at most 2 million."""
     num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), 2_000_000)
-    return drawn_on(mesh, num, np.random.default_rng(0))[0]
+    return draw_on(mesh, num, np.random.default_rng(0))[0]
 
 
-def drawn_on(mesh: TriangleMesh, num: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.int64]]:
+def draw_on(mesh: TriangleMesh, num: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.int64]]:
     """Random points (num, 3) [m] by area, and their triangles (num,)."""
     corners, doubled = mesh.corners, np.linalg.norm(face_normals(mesh.corners), axis=1)
     face = rng.choice(len(corners), num, p=doubled / doubled.sum())
@@ -193,32 +191,6 @@ def _box(points: Float64) -> str:
 REACH = fixed.BANDS[-1][1]  # [m] before the surface that points are put on a ray
 
 
-@dataclass(frozen=True, kw_only=True)
-class HeldOutComparison:
-    """Errors [m] against held-out depth, and counts of points.
-
-    on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
-    to the nearest measured point, seen free, so under-estimates count too. over_estimate: over all points. num_edges
-    pixels were left out at depth edges; num_outside points lie outside the grid, num_unknown at a corner without
-    distance.
-    """
-
-    on_surface: dict[str, BandAccuracy]
-    before: FieldAccuracy
-    reference: str
-    num_frames: int
-    num_measured: int
-    num_edges: int
-    num_drawn: int
-    num_outside: int
-    num_unknown: int
-
-    def as_dict(self) -> dict[str, Any]:
-        counts = {name: value for name, value in vars(self).items() if name not in {"on_surface", "before"}}
-        on_surface = {name: asdict(band) for name, band in self.on_surface.items()}
-        return {**counts, "on_surface": on_surface, "before": self.before.as_dict()}
-
-
 def compare_with_held_out_depth(
     grid: DistanceGrid,
     frames: Sequence[RgbdFrame],
@@ -226,16 +198,20 @@ def compare_with_held_out_depth(
     seed: int,
     counted: Sequence[Bool] | None = None,
     max_points: int = 20_000,
-) -> HeldOutComparison:
-    """Errors of interpolated distances on `max_points` held-out rays, sampled by `seed`.
+) -> dict[str, Any]:
+    """Errors [m] of interpolated distances on held-out rays sampled by `seed`, as in ``field.json``.
 
-    frames: of held-out cameras, at the bake's stamp, in the grid's frame. counted: per frame (H, W), False on objects
-    that the field leaves out; None: all count. Raises InputError for masks that do not fit, NotEvaluableError without
-    a measured point in the grid.
+    on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
+    to the nearest measured point, seen free, so under-estimates count too. over_estimate: over all points. num_edges
+    pixels lie at depth edges, num_outside points outside the grid, num_unknown at a corner without distance.
+
+    frames: of held-out cameras, in the grid's frame. counted: per frame (H, W), False on objects that the field
+    leaves out; None: all count. Raises InputError for masks that do not fit, NotEvaluableError without a measured
+    point in the grid.
     """
     distances = grid_distances(grid)
     box = Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1))
-    measured, eyes, num_edges = _measured(frames, counted, Box(lower=box.lower - REACH, upper=box.upper + REACH))
+    measured, eyes, num_edges = _measure(frames, counted, Box(lower=box.lower - REACH, upper=box.upper + REACH))
     if not box.contains(measured).any():
         raise NotEvaluableError(
             f"held-out depth: no pixel of {len(frames)} frames shows a point in the grid",
@@ -247,27 +223,28 @@ def compare_with_held_out_depth(
     length = np.linalg.norm(ray, axis=1)
     back = np.minimum(rng.uniform(0.0, REACH, len(drawn)), length)
     points = measured[drawn] - (back / length)[:, None] * ray
-    at_surface = _interpolated(grid, distances, measured[drawn][box.contains(measured[drawn])])
-    values = _interpolated(grid, distances, points[box.contains(points)])
+    at_surface = _interpolate(grid, distances, measured[drawn][box.contains(measured[drawn])])
+    values = _interpolate(grid, distances, points[box.contains(points)])
     points = points[box.contains(points)]
     is_known = np.isfinite(values["sdf"])
     points, values = points[is_known], {name: value[is_known] for name, value in values.items()}
     reference = np.asarray(cKDTree(measured).query(points)[0])
     radius = median_radius(grid)
-    return HeldOutComparison(
-        on_surface={name: band_accuracy(value[np.isfinite(value)], 0.0, 0.0) for name, value in at_surface.items()},
-        before=replace(
-            field_accuracy(values, reference, _ball_is_free(points, reference, frames), median_radius=radius),
-            over_estimate=field_accuracy(values, reference, None, median_radius=radius).over_estimate,
-        ),
-        reference="nearest measured depth point",
-        num_frames=len(frames),
-        num_measured=len(measured),
-        num_edges=num_edges,
-        num_drawn=len(drawn),
-        num_outside=len(drawn) - len(is_known),
-        num_unknown=int(np.count_nonzero(~is_known)),
+    accuracy = replace(
+        field_accuracy(values, reference, _ball_is_free(points, reference, frames), median_radius=radius),
+        over_estimate=field_accuracy(values, reference, None, median_radius=radius).over_estimate,
     )
+    return {
+        "reference": "nearest measured depth point",
+        "num_frames": len(frames),
+        "num_measured": len(measured),
+        "num_edges": num_edges,
+        "num_drawn": len(drawn),
+        "num_outside": len(drawn) - len(is_known),
+        "num_unknown": int(np.count_nonzero(~is_known)),
+        "on_surface": {n: asdict(band_accuracy(v[np.isfinite(v)], 0.0, 0.0)) for n, v in at_surface.items()},
+        "before": accuracy.as_dict(),
+    }
 
 
 def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float64, Float64] | None) -> Bool:
@@ -285,7 +262,7 @@ def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float
     return counted
 
 
-def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
+def _measure(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
     """Surface points (M, 3) in a box, their eyes, and the edges left out."""
     if counted is not None and [mask.shape for mask in counted] != [frame.depth.shape for frame in frames]:
         raise InputError(
@@ -319,12 +296,11 @@ def depth_edges(depth: NDArray[np.float32]) -> Bool:
     return is_edge
 
 
-def _interpolated(grid: DistanceGrid, distances: dict[str, GridDistance], points: Float64) -> dict[str, Float64]:
+def _interpolate(grid: DistanceGrid, distances: dict[str, GridDistance], points: Float64) -> dict[str, Float64]:
     points = np.ascontiguousarray(points)
     return {
-        name: each.added
-        + interpolate(np.ascontiguousarray(each.values, dtype=np.float32), grid.origin, grid.voxel, points)[0]
-        for name, each in distances.items()
+        name: added + interpolate(np.ascontiguousarray(values, dtype=np.float32), grid.origin, grid.voxel, points)[0]
+        for name, (values, added) in distances.items()
     }
 
 
@@ -338,12 +314,12 @@ def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame])
     for share in fixed.FREE_PROBES:
         for direction in directions:
             asked = np.flatnonzero(is_free)
-            is_free[asked] = _seen_free(points[asked] + share * radius[asked, None] * direction, frames)
+            is_free[asked] = _find_seen_free(points[asked] + share * radius[asked, None] * direction, frames)
     return is_free
 
 
-def _seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
-    """(Q,) True before, or just behind, a frame's measured depth."""
+def _find_seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
+    """(Q,) True before, or just behind, measured depth."""
     is_free = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:
         asked = np.flatnonzero(~is_free)

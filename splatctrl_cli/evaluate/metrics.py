@@ -91,7 +91,7 @@ class Fold:
     accumulate: Callable[[Float64], Float64] | None = None
 
 
-def _of_known(fold: Callable[[Float64], np.floating], values: Float64) -> float | None:
+def _fold_known(fold: Callable[[Float64], np.floating], values: Float64) -> float | None:
     there = values[~np.isnan(values)]
     return float(fold(there)) if len(there) else None
 
@@ -104,7 +104,7 @@ def least(values: Float64) -> float | None:
 
 def lowest(values: Float64) -> float | None:
     """The least value that is not NaN, perhaps infinite; None without one."""
-    return _of_known(np.min, values)
+    return _fold_known(np.min, values)
 
 
 def largest(values: Float64) -> float | None:
@@ -122,7 +122,7 @@ def last(values: Float64) -> float | None:
 LEAST = Fold(of=least, start=np.inf, accumulate=np.fmin.accumulate)
 LOWEST = Fold(of=lowest, start=np.inf, accumulate=np.fmin.accumulate)
 LARGEST = Fold(of=largest, start=-np.inf, accumulate=np.fmax.accumulate)
-MEAN, P95 = (Fold(of=partial(_of_known, fold)) for fold in (np.mean, partial(np.percentile, q=95)))
+MEAN, P95 = (Fold(of=partial(_fold_known, fold)) for fold in (np.mean, partial(np.percentile, q=95)))
 LAST = Fold(of=last)
 TOTAL = Fold(of=lambda values: int(np.nansum(values)))
 

@@ -42,10 +42,10 @@ class Split:
 class ScoreProtocol:
     """A named scoring protocol.
 
-    mask: pixels of the published figure: of a mask if given, of the object (mask required), or with reference depth.
-    fill: colour outside the mask in the published SSIM; is_zero_padded: without a mask, that SSIM has zeros beyond
-    the border. size (width, height) [px], scans: as published. Without scored views, every `every`-th view from
-    `first` on is scored, with 0 all views, which also train. Without training views, those not scored train.
+    mask: pixels of the published figure: of a mask if given, of the object, or with reference depth. fill: outside
+    the mask in the published SSIM; is_zero_padded: without a mask, it has zeros beyond the border. size (width,
+    height) [px], scans: as published. Without scored views, every `every`-th view from `first` on is scored, with 0
+    all views, which also train. Without training views, those not scored train.
     """
 
     name: str

@@ -1,8 +1,7 @@
 """Scores of rendered against recorded views, over all pixels and those seen in training."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from splatctrl_cli.evaluate.metrics import (
     Better,
     Scale,
 )
-from splatctrl_cli.evaluate.views import DepthErrors, depth_errors, psnr, published_ssim, ssim_map
+from splatctrl_cli.evaluate.views import depth_errors, psnr, published_ssim, ssim_map
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, SplatSet
 from splatctrl_cli.voxels import OccupancyGrid
 
@@ -47,21 +46,6 @@ PROTOCOL = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class RegionScore:
-    """Figures of a region: `share` of the view's pixels; psnr [dB]; nan if empty.
-
-    in_front: share of pixels with both depths where the render lies before the measured surface.
-    """
-
-    share: float
-    psnr: float
-    ssim: float
-    depth: DepthErrors
-    depth_coverage: float
-    in_front: float
-
-
 REGION = {
     "psnr": DECIBELS,
     "ssim": SIMILARITY,
@@ -78,56 +62,8 @@ CORRECTED = "_corrected"  # of a figure of a view whose pose, exposure or depth 
 CORRECTABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixels" for region in REGIONS)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewScore:
-    """One view: valid_share of its pixels have reference depth; `all`, `seen` and `masked` are regions.
-
-    ssim_published: filled outside a mask; without one, if the protocol has it. size: width, height [px]. corrected:
-    with corrected pose, exposure and depth bend.
-    """
-
-    view: str
-    camera: str
-    stamp_ns: int
-    size: tuple[int, int]
-    valid_share: float
-    seen: RegionScore
-    all: RegionScore
-    masked: RegionScore | None = None
-    ssim_published: float | None = None
-    corrected: "ViewScore | None" = None
-
-    def figures(self) -> dict[str, float]:
-        """Figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
-        found = {
-            "valid_share": self.valid_share,
-            "seen_share": self.seen.share,
-            "mask_share": None if self.masked is None else self.masked.share,
-            "ssim_published": self.ssim_published,
-        }
-        figures = {name: value for name, value in found.items() if value is not None}
-        for name, region in {"seen": self.seen, "all": self.all, "masked": self.masked}.items():
-            if region is None:
-                continue
-            depth = asdict(region.depth)
-            figures |= {
-                f"psnr_{name}": region.psnr,
-                f"ssim_{name}": region.ssim,
-                f"depth_pixels_{name}": depth.pop("num_pixels"),
-                **{f"depth_{key}_{name}": value for key, value in depth.items()},
-                f"depth_coverage_{name}": region.depth_coverage,
-                f"in_front_{name}": region.in_front,
-            }
-        if self.corrected is not None:
-            figures |= {
-                f"{name}{CORRECTED}": value for name, value in self.corrected.figures().items() if name in CORRECTABLE
-            }
-        return figures
-
-
 def score_view(
     *,
-    view: str,
     color: Float32,
     depth: Float32,
     frame: RgbdFrame,
@@ -135,52 +71,47 @@ def score_view(
     mask: Bool | None = None,
     fill: float = 0.0,
     is_zero_padded: bool = False,
-) -> ViewScore:
+) -> dict[str, float]:
     """Score a rendering against `frame`, by `PROTOCOL`.
 
-    color (H, W, 3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen, mask (H, W):
-    pixels seen in training, and of the mask rule. The published SSIM has grey `fill` outside the mask; without a
-    mask, it exists only if is_zero_padded. Invalid pixels of `frame` are in no region.
+    Returns figures by flat name (``psnr_seen`` [dB], ``depth_median_all`` [m]), nan for an empty region. color (H, W,
+    3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen, mask (H, W): pixels seen in
+    training, and of the mask rule. The published SSIM has grey `fill` outside the mask; without a mask, it exists
+    only if is_zero_padded. Invalid pixels of `frame` are in no region.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
     valid = np.ones(frame.depth.shape, dtype=np.bool_) if frame.valid is None else frame.valid
     rendered[~valid] = photo[~valid]  # so that windows across the border see no difference there
     similarity = ssim_map(rendered, photo).mean(axis=-1)
-
-    def score_region(region: Bool) -> RegionScore:
-        mask = region & valid
-        errors = depth_errors(depth, frame.depth, mask)
-        num_reference = int(np.count_nonzero(mask & (frame.depth > 0)))
-        return RegionScore(
-            share=float(mask.mean()),
-            psnr=psnr(rendered, photo, mask),
-            ssim=float(similarity[mask].mean()) if mask.any() else math.nan,
-            depth=errors,
-            depth_coverage=errors.num_pixels / num_reference if num_reference else math.nan,
-            in_front=in_front(depth, frame.depth, mask),
-        )
-
-    return ViewScore(
-        view=view,
-        camera=frame.camera,
-        stamp_ns=frame.stamp_ns,
-        size=(frame.intrinsics.width, frame.intrinsics.height),
-        valid_share=float(np.mean(frame.depth > 0)),
-        seen=score_region(seen),
-        all=score_region(valid),
-        masked=None if mask is None else score_region(mask),
-        ssim_published=published_ssim(rendered, photo, mask, fill)
-        if mask is not None
-        else (float(ssim_map(rendered, photo, is_zero_padded=True).mean()) if is_zero_padded else None),
-    )
+    figures = {"valid_share": float(np.mean(frame.depth > 0)), "seen_share": float((seen & valid).mean())}
+    if mask is not None:
+        figures["mask_share"] = float((mask & valid).mean())
+        figures["ssim_published"] = published_ssim(rendered, photo, mask, fill)
+    elif is_zero_padded:
+        figures["ssim_published"] = float(ssim_map(rendered, photo, is_zero_padded=True).mean())
+    for name, pixels in {"seen": seen, "all": valid, "masked": mask}.items():
+        if pixels is None:
+            continue
+        region = pixels & valid
+        errors = depth_errors(depth, frame.depth, region)
+        num_reference = int(np.count_nonzero(region & (frame.depth > 0)))
+        found = {
+            "psnr": psnr(rendered, photo, region),
+            "ssim": float(similarity[region].mean()) if region.any() else math.nan,
+            **errors,
+            "depth_coverage": errors["depth_pixels"] / num_reference if num_reference else math.nan,
+            "in_front": in_front(depth, frame.depth, region),
+        }
+        figures |= {f"{figure}_{name}": value for figure, value in found.items()}
+    return figures
 
 
 def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float:
     """Share of the splats' mass with centres in voxels observed free; nan without mass.
 
-    Mass is opacity times squared radius. The robot's splats are left out: they cross free space. free_below:
-    occupancy below which a seen voxel is free.
+    Mass is opacity times squared radius. The robot's splats are left out. free_below: occupancy below which a seen
+    voxel is free.
     """
     mass = np.where(splats.labels == Label.ROBOT, 0.0, splats.opacities * splats.radii.astype(np.float64) ** 2)
     is_free = (grid.num_updates > 0) & (grid.log_odds < math.log(free_below / (1.0 - free_below)))
@@ -210,12 +141,11 @@ def metric_scales() -> dict[str, Scale]:
     }
 
 
-def total_score(views: Sequence[ViewScore]) -> dict[str, float]:
+def total_score(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Each figure's mean over views that have it, or nan. Raises NotEvaluableError without a view."""
-    if not views:
+    if not rows:
         raise NotEvaluableError("no view was scored: expected at least one, got 0")
-    rows = [view.figures() for view in views]
-    totals: dict[str, float] = {"num_views": len(views)}
+    totals: dict[str, float] = {"num_views": len(rows)}
     for name in rows[0]:
         values = [row[name] for row in rows if not math.isnan(row[name])]
         totals[name] = float(np.mean(values)) if values else math.nan

@@ -93,7 +93,6 @@ def sum_of(values: Sequence[float | None]) -> float | None:
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
-    """The mean; None if any value is missing."""
     total = sum_of(values)
     return None if total is None else total / len(values)
 
@@ -163,7 +162,7 @@ THUMBNAIL = (16, 12)  # pixels
 class Doubts:
     """Collected oddities of views: inverted masks, training views, wrong poses.
 
-    is_still: a static scene, with one picture per view; may_train: training views are scored on purpose.
+    is_still: a static scene; may_train: training views are scored on purpose.
     """
 
     is_still: bool
@@ -192,7 +191,6 @@ class Doubts:
         self._thumbnails.append((view.name, photo, drawn))
 
     def lines(self) -> list[str]:
-        """A sentence per doubt, with its figure."""
         lines = []
         if self._masks:
             lines.append(
@@ -237,7 +235,7 @@ def _thumbnail(image: NDArray[np.floating]) -> Float64:
 
 
 def _strangers(thumbnails: Sequence[tuple[str, Float64, Float64]]) -> list[str]:
-    """Views whose photo is clearly nearer another's render; of names, photos and renders."""
+    """Views whose photo is clearly nearer another's render."""
     if len(thumbnails) < 2:
         return []
     names, photos, renders = zip(*thumbnails, strict=True)

@@ -83,7 +83,6 @@ class Criterion(Generic[E]):
     broken: str
 
     def reasons(self, found: E) -> Iterator[Reason]:
-        """Its reasons, under its name unless they have one."""
         return (replace(reason, criterion=reason.criterion or self.name) for reason in self.find(found))
 
     @property

@@ -21,8 +21,8 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, R
 class View:
     """A frame to score, its name, and the training frames known at its time.
 
-    The name is the camera and a number: within the camera's frames with a clock, else among all views, or the stamp
-    if that is the views' own number.
+    The name is the camera and a number: within its frames with a clock, else among all views, or the views' own, the
+    stamp.
     """
 
     name: str
@@ -41,8 +41,8 @@ def views_to_score(
 ) -> Iterator[View]:
     """The frames of the `scoring` cameras in time order.
 
-    With a clock, each training camera's newest frame up to the view's stamp is known; without, every training frame,
-    in two passes. corrected: a frame with training's pose, exposure and depth.
+    With a clock, each training camera's newest frame up to the view's stamp is known; without, every one. corrected:
+    a frame with training's pose, exposure and depth.
     """
     if not has_clock:
         known = tuple(corrected(frame) for frame in frames_of(source) if frame.camera in training)
@@ -113,21 +113,6 @@ def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tupl
     return landing, points_camera[landing, 2], frame.depth[v, u]
 
 
-@dataclass(frozen=True, kw_only=True)
-class DepthErrors:
-    """Absolute depth errors where both images have depth; nan without any.
-
-    median, mean, p90 [m]; within_1cm and within_2cm are shares.
-    """
-
-    num_pixels: int
-    median: float
-    mean: float
-    p90: float
-    within_1cm: float
-    within_2cm: float
-
-
 def psnr(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None) -> float:
     """Peak signal-to-noise ratio [dB] for a peak of 1: ``-10 log10(mean squared error)``.
 
@@ -186,24 +171,24 @@ def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating],
 
 def depth_errors(
     depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None
-) -> DepthErrors:
-    """Errors of `depth` [m] against `reference` [m], where both are above 0 in the mask."""
+) -> dict[str, float]:
+    """Absolute errors of `depth` [m] against `reference` [m], where both are above 0 in the mask.
+
+    depth_median, depth_mean, depth_p90 [m]; depth_within_1cm and depth_within_2cm are shares; nan without a pixel.
+    """
     both = (depth > 0) & (reference > 0)
     if mask is not None:
         both &= mask
     errors = np.abs(depth[both].astype(np.float64) - reference[both])
-    if not errors.size:
-        return DepthErrors(
-            num_pixels=0, **dict.fromkeys(("median", "mean", "p90", "within_1cm", "within_2cm"), math.nan)
-        )
-    return DepthErrors(
-        num_pixels=int(errors.size),
-        median=float(np.median(errors)),
-        mean=float(errors.mean()),
-        p90=float(np.percentile(errors, 90)),
-        within_1cm=float(np.mean(errors <= 0.01)),
-        within_2cm=float(np.mean(errors <= 0.02)),
-    )
+    is_empty = not errors.size
+    return {
+        "depth_pixels": int(errors.size),
+        "depth_median": math.nan if is_empty else float(np.median(errors)),
+        "depth_mean": math.nan if is_empty else float(errors.mean()),
+        "depth_p90": math.nan if is_empty else float(np.percentile(errors, 90)),
+        "depth_within_1cm": math.nan if is_empty else float(np.mean(errors <= 0.01)),
+        "depth_within_2cm": math.nan if is_empty else float(np.mean(errors <= 0.02)),
+    }
 
 
 def _window_mean(image: Float64, border: Literal["reflect", "constant"]) -> Float64:

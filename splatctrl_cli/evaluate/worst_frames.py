@@ -23,7 +23,7 @@ INK, PAPER = (34, 34, 34), (255, 255, 255)
 class Moment:
     """Spheres (S, 3), radii (S,) [m], world, and the worst of them, to draw.
 
-    obstacle (3,): nearest surface point, or NaN. caption: lines under the image. is_moving (S,): moved by a joint.
+    obstacle (3,): nearest surface point, or NaN. is_moving (S,): by a joint.
     """
 
     stamp_ns: int
@@ -42,7 +42,7 @@ Sight = tuple[Moment, RgbdFrame]
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
     """Indices of at most `num` states with least clearance (T,), the least first.
 
-    Each is the least within 0.5 s on either side, so that an event counts once. NaN does not count.
+    Each is the least within 0.5 s on either side. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])
@@ -98,7 +98,7 @@ def draw_sight(path: Path, moment: Moment, frame: RgbdFrame) -> None:
             picture,
             *(_pixel(point, frame.intrinsics, zoom) for point in (_surface(worst, obstacle, moment), obstacle)),
         )
-    if not cv2.imwrite(str(path), np.vstack([picture, _captioned(moment.caption, picture.shape[1])])):
+    if not cv2.imwrite(str(path), np.vstack([picture, _add_caption(moment.caption, picture.shape[1])])):
         raise WriteError(f"{path}: could not be written")
 
 
@@ -173,7 +173,7 @@ def _join(picture: UInt8, start: Float64, end: Float64) -> None:
         cv2.drawMarker(picture, b, color, cv2.MARKER_TILTED_CROSS, 16, thickness, cv2.LINE_AA)
 
 
-def _captioned(lines: Sequence[str], width: int) -> UInt8:
+def _add_caption(lines: Sequence[str], width: int) -> UInt8:
     strip = np.full((LINE_HEIGHT * len(lines) + 2 * EDGE, width, 3), PAPER, np.uint8)
     for number, line in enumerate(lines):
         (length, _), _ = cv2.getTextSize(line, FONT, FONT_SCALE, 1)

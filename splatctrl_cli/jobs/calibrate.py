@@ -18,7 +18,7 @@ from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.jobs.check import posed_robot
+from splatctrl_cli.jobs.check import pose_robot
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
@@ -34,9 +34,8 @@ BASE = "the robot's base"
 class CalibrateRequest(RobotOptions):
     """Calibrate the cameras of a recording; several `paths` only for logs of one session.
 
-    out: None for calibration.toml here. urdf: a robot with recorded joint states, to place cameras against. hold: the
-    fixed camera without a robot (None: the first). board: initial poses if the recorded ones are far off.
-    allow_unobserved: write an incomplete calibration.
+    out: None for calibration.toml here. urdf: a recorded robot to place cameras against. hold: the fixed camera
+    without a robot (None: the first). board: for initial poses. allow_unobserved: write an incomplete calibration.
     """
 
     paths: tuple[Path, ...]
@@ -92,13 +91,13 @@ class CalibrateResult:
 def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> CalibrateResult:
     """Find the calibration and write it.
 
-    Raises UsageError for contradictory options, InputError for an unreadable recording. Raises NotEvaluableError,
-    writing nothing, if cameras stay undetermined.
+    Raises UsageError for contradictory options, InputError for an unreadable recording. Raises NotEvaluableError if
+    cameras stay undetermined.
     """
     out = request.out or Path("calibration.toml")
     if request.options.calibration is not None:
         raise UsageError("--calibration: what is calibrated is the recording as it is", remedy="leave it out")
-    model = posed_robot(request.paths, request.urdf, request)
+    model = pose_robot(request.paths, request.urdf, request)
     source = open_session(request.paths, request.options)
     arm = None if model is None else _arm(model, source)
     with output_path(out, force=request.force, is_folder=False) as partial:
@@ -123,7 +122,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
         progress.log(f"calibrate: {len(frames)} frames of {', '.join(evidence.cameras)}")
         start = Estimate(corrections={camera: np.eye(4) for camera in evidence.cameras})
         solution = solved(evidence, start, held)
-        unknown = _unobserved(solution)
+        unknown = _find_unobserved(solution)
         if any(unknown.values()):
             if not request.allow_unobserved:
                 raise _refusal(unknown, evidence)
@@ -162,10 +161,7 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
 
 
 def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:
-    """Up to `CALIBRATION_FRAMES` simultaneous frames of each camera, without colour, and board sightings.
-
-    Raises NotEvaluableError if no frame shows the board.
-    """
+    """Simultaneous frames of each camera, without colour, and board sightings."""
     stamps = stamps_by_camera(source)
     chosen = frames_nearest(stamps, spread(min(stamps.values(), key=len), fixed.CALIBRATION_FRAMES))
     frames: list[RgbdFrame] = []
@@ -220,7 +216,6 @@ def _no_board(board: Board, num_frames: int, others: Counter[tuple[int, int]]) -
 
 
 def depth_frame(stored: StoredFrame) -> RgbdFrame:
-    """A frame's depth within `VIEWS_RANGE`, people removed."""
     low, high = VIEWS_RANGE
     is_used = (stored.depth >= low) & (stored.depth <= high)
     if stored.human is not None:
@@ -251,7 +246,7 @@ def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool
     return (cameras[0],)
 
 
-def _unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
+def _find_unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
     evidence = solution.adjustment.evidence
     found = {}
     for camera in solution.adjustment.unknowns.poses:
@@ -263,11 +258,11 @@ def _unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
 
 def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotEvaluableError:
     told = "; ".join(f"{', '.join(names)} of {camera}" for camera, names in unknown.items() if names)
-    remedy = "put things of different shapes where all cameras see them"
-    if evidence.moving:
-        remedy += ", turn the moving camera about two axes"
-    if evidence.arm is None:
-        remedy += ", or give --urdf of a robot in view"
+    remedy = (
+        "put things of different shapes where all cameras see them"
+        + (", turn the moving camera about two axes" if evidence.moving else "")
+        + (", or give --urdf of a robot in view" if evidence.arm is None else "")
+    )
     return NotEvaluableError(
         f"calibrate: the recording does not say all: not observed: {told}",
         remedy=f"{remedy}; --allow-unobserved writes the rest, with these as recorded",
@@ -277,7 +272,7 @@ def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotE
 def _calibration(
     source: FrameSource, solution: Solution, begin: Mapping[str, Float64], unknown: Mapping[str, tuple[str, ...]]
 ) -> Calibration:
-    """Build the calibration; begin: initial T_recorded_camera (4, 4) by camera."""
+    """begin: initial T_recorded_camera (4, 4) by camera."""
     evidence, estimate, certainty = solution.adjustment.evidence, solution.estimate, solution.certainty
     cameras = {}
     for camera in evidence.cameras:

@@ -29,8 +29,8 @@ _ALLOWING = {  # the options that take an error on
 class CheckRequest(RobotOptions):
     """One check of a recording; several `paths` only for logs of one session.
 
-    num_images: images to read of each topic, None for all. urdf: robot to compare joint states and depth with; with
-    `spheres` alone the log's own. fail_on: least severity that fails: "error", "warning" or "never".
+    num_images: of each topic, None for all. urdf: robot to compare with; with `spheres` alone the log's. fail_on:
+    least severity that fails: "error", "warning" or "never".
     """
 
     paths: tuple[Path, ...]
@@ -40,33 +40,21 @@ class CheckRequest(RobotOptions):
     fail_on: str = "error"
 
 
-@dataclass(frozen=True, kw_only=True)
-class CheckResult:
-    """Findings and verdict."""
-
-    report: CheckReport
-    verdict: Verdict
-    exit_code: int
-
-
-def check(request: CheckRequest) -> CheckResult:
-    """Check the recording, reading it once.
+def check(request: CheckRequest) -> tuple[CheckReport, Verdict]:
+    """Check the recording, reading it once, and judge the findings.
 
     Raises UsageError for contradictory options, InputError for an unreadable recording.
     """
     if request.num_images is not None and request.num_images < 1:
         raise UsageError(f"--quick {request.num_images}: expected 1 or more")
-    model = posed_robot(request.paths, request.urdf, request)
+    model = pose_robot(request.paths, request.urdf, request)
     other = "" if request.urdf is None or model is None else differs(model.urdf, request.paths)
     report = _report(request, model)
     report = replace(
         report,
         findings=[*report.findings, *([warning("robot-model", str(request.urdf), other, TAKE)] if other else [])],
     )
-    verdict = _verdict(report, request.fail_on)
-    return CheckResult(
-        report=report, verdict=verdict, exit_code=0 if request.fail_on == "never" else verdict.exit_code
-    )
+    return report, _verdict(report, request.fail_on)
 
 
 def refuse_errors(path: Path, options: SourceOptions, allowed: Collection[str] = ()) -> None:
@@ -89,7 +77,7 @@ def _report(request: CheckRequest, model: RobotModel | None, *, only_errors: boo
     return replace(report, findings=[*report.findings, *_agreement(report)])
 
 
-def posed_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) -> RobotModel | None:
+def pose_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) -> RobotModel | None:
     """Robot of a URDF, with spheres alone the recording's own; None without either.
 
     Raises UsageError for robot options without one.

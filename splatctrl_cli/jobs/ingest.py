@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import DAMAGED, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import check_same_run, told_how_to_go_on
+from splatctrl_cli.jobs.running.resume import advise_resumption, check_same_run
 from splatctrl_cli.recording.calibrated import LOGGED
-from splatctrl_cli.recording.capture.capture_writer import JOURNAL, CaptureSummary, read_identity, write_capture
+from splatctrl_cli.recording.capture.capture_writer import JOURNAL, read_identity, write_capture
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.recording.source import logged_descriptions, open_session
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -33,28 +33,10 @@ class IngestRequest:
     resume: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class IngestResult:
-    """The capture folder, and its content."""
+def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, dict[str, Any]]:
+    """Write the capture, or continue an interrupted one to the same bytes; also return its metrics.
 
-    capture: Path
-    summary: CaptureSummary
-
-    @property
-    def metrics(self) -> dict[str, Any]:
-        written = self.summary
-        return {"frames": written.num_frames, "joint_states": written.num_joint_states, "loss": asdict(written.loss)}
-
-    @property
-    def exit_code(self) -> int:
-        """3 if part of the input was damaged, else 0."""
-        return DAMAGED if self.summary.loss.damaged else 0
-
-
-def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
-    """Write the capture, or continue an interrupted one to the same bytes.
-
-    Raises UsageError without a training camera or for another interrupted run, InputError for an unusable recording.
+    Raises UsageError without a camera or for another interrupted run, InputError for an unusable recording.
     """
     stopwatch, options = Stopwatch(), request.options
     out = request.out or Path(request.paths[0].stem + ".capture")
@@ -74,7 +56,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
     identity = _identity(options, source.digests())
     journal = partial_path(out) / JOURNAL
     with (
-        told_how_to_go_on(journal, journal.parent),
+        advise_resumption(journal, journal.parent),
         output_path(out, force=request.force, is_folder=True, checkpoint=JOURNAL, resume=request.resume) as partial,
     ):
         if (before := read_identity(partial)) is not None:
@@ -90,16 +72,20 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
             )
         if summary.num_resumed:
             progress.log(f"{summary.num_resumed} frames were there already")
-        result = IngestResult(capture=out, summary=summary)
+        metrics = {
+            "frames": summary.num_frames,
+            "joint_states": summary.num_joint_states,
+            "loss": asdict(summary.loss),
+        }
         write_run(
             partial,
             command="ingest",
             config=asdict(options),
             inputs=source.digests(),
-            metrics=result.metrics,
+            metrics=metrics,
             stopwatch=stopwatch,
         )
-    return result
+    return out, metrics
 
 
 def _identity(options: SourceOptions, inputs: Mapping[str, str]) -> dict[str, Any]:

@@ -129,7 +129,7 @@ class _Search:
             np.repeat(first.q[:1], second.size, axis=0), second.q[: second.size], only_whole=True
         )
         if np.any(direct >= 1.0):
-            return PlanOutcome.SOLVED, *self._joined(0, int(np.argmax(direct)))
+            return PlanOutcome.SOLVED, *self._join(0, int(np.argmax(direct)))
         while self.num_iterations < self.config.max_iterations:
             if time.perf_counter() - self.start_time > self.config.max_time:
                 return PlanOutcome.OUT_OF_TIME, np.empty((0, first.q.shape[1])), -1
@@ -140,10 +140,10 @@ class _Search:
             )
             meeting = self.met(tree, other, new) if len(new) else None
             if meeting is not None:
-                return PlanOutcome.SOLVED, *self._joined(*(meeting if tree is first else meeting[::-1]))
+                return PlanOutcome.SOLVED, *self._join(*(meeting if tree is first else meeting[::-1]))
         return PlanOutcome.OUT_OF_ITERATIONS, np.empty((0, first.q.shape[1])), -1
 
-    def _joined(self, in_first: int, in_second: int) -> tuple[Float64, int]:
+    def _join(self, in_first: int, in_second: int) -> tuple[Float64, int]:
         out, back = self.trees[0].branch(in_first)[0], self.trees[1].branch(in_second)
         return np.concatenate([out, back[0][::-1]]), back[1]
 
@@ -155,13 +155,13 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
     InputError for a start or goal outside the limits, NotEvaluableError for one in collision.
     """
     began = time.perf_counter()
-    roots = checked_postures(clearance, start, goals, config)
+    roots = check_postures(clearance, start, goals, config)
     search = _Search(clearance, config, (_Tree(roots[:1]), _Tree(roots[1:])), np.random.default_rng(seed), began)
     outcome, found, goal = search.run()
     searched = time.perf_counter()
     waypoints = found
     if outcome is PlanOutcome.SOLVED:
-        waypoints, num_edges, num_checks = shortened(clearance, found, config, search.random)
+        waypoints, num_edges, num_checks = shorten_path(clearance, found, config, search.random)
         search.num_edges += num_edges
         search.num_checks += num_checks
     return Plan(
@@ -177,7 +177,7 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
     )
 
 
-def checked_postures(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig) -> Float64:
+def check_postures(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig) -> Float64:
     """Start and goals (1 + G, J) within limits and free. Raises as `plan`."""
     model = clearance.model
     rows = [checked_posture(model, start, what="start")]
@@ -202,14 +202,14 @@ def checked_postures(clearance: Clearance, start: Float64, goals: Float64, confi
     return np.array(rows)
 
 
-def shortened(
+def shorten_path(
     clearance: Clearance, waypoints: Float64, config: PlannerConfig, random: np.random.Generator
 ) -> tuple[Float64, int, int]:
     """A path (W', J) of proved edges, not longer, and the checks made.
 
     After the shortest way over waypoints, each round takes the free one of random shortcuts that saves most.
     """
-    path, num_edges, num_checks = _over_waypoints(clearance, waypoints, config)
+    path, num_edges, num_checks = _skip_waypoints(clearance, waypoints, config)
     for _ in range(config.shortcut_rounds):
         if len(path) <= 2:
             break
@@ -224,7 +224,7 @@ def shortened(
     return path, num_edges, num_checks
 
 
-def _over_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) -> tuple[Float64, int, int]:
+def _skip_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) -> tuple[Float64, int, int]:
     W = len(path)
     a, b = np.triu_indices(W, k=2)
     length = np.linalg.norm(path[:, None] - path[None], axis=2)

@@ -47,7 +47,7 @@ def effector_rates(
     return rates
 
 
-def timed(
+def time_path(
     waypoints: Float64, velocity_limit: Float64, max_acceleration: float, *, max_rate: Float64 | None = None
 ) -> TimedPath:
     """Fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
@@ -125,9 +125,9 @@ def planned_path(
     path, num_proved, num_edges = None, 0, 0
     if min(margin, own) > 0:
         room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
-        outcome, way = _found(room, task, goals, approach, planner, control)
+        outcome, way = _find(room, task, goals, approach, planner, control)
         if outcome is PlanOutcome.SOLVED:
-            path = timed(
+            path = time_path(
                 way,
                 model.velocity_limit,
                 planner.max_acceleration,
@@ -149,7 +149,7 @@ def planned_path(
     )
 
 
-def _found(
+def _find(
     room: Clearance, task: ReplayTask, goals: Float64, approach: float, planner: PlannerConfig, control: ControlConfig
 ) -> tuple[PlanOutcome, Float64]:
     last = [approach_to(room, task.frame, goal, approach, planner, control) for goal in goals]
@@ -181,7 +181,7 @@ def approach_to(
     for back in np.arange(fixed.APPROACH_STEP, length + 1e-9, fixed.APPROACH_STEP):
         T = T_world_goal.copy()
         T[:3, 3] -= back * T[:3, 2]
-        q = _solved(model, frame, T, way[0], control)
+        q = _solve(model, frame, T, way[0], control)
         if q is None or np.max(np.abs(q - way[0])) > fixed.APPROACH_TURN:
             break
         is_free = check_edges(room, q[None], way[0][None], contact=planner.contact).is_free[0]
@@ -192,7 +192,7 @@ def approach_to(
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:
-    """Margins that start and goals (G, J) keep, and the free goals that keep them."""
+    """Margins that start and goals (G, J) keep, and these goals."""
     rows = room.rows(np.vstack([start, goals])) - fixed.START_ROOM
     num = len(room.moving)
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)
@@ -229,11 +229,11 @@ def goal_postures(
 ) -> Float64:
     """Distinct postures (G, J) within limits that bring `frame` to a pose.
 
-    They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, 0 if no guess (K, J) succeeds.
+    They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, perhaps 0.
     """
     found: list[Float64] = []
     for guess in guesses:
-        q = _solved(model, frame, T_world_goal, guess, config)
+        q = _solve(model, frame, T_world_goal, guess, config)
         if q is not None and all(np.max(np.abs(q - other)) > fixed.GOAL_DISTINCT for other in found):
             found.append(q)
         if len(found) == at_most:
@@ -241,7 +241,7 @@ def goal_postures(
     return np.array(found).reshape(-1, len(model.lower))
 
 
-def _solved(
+def _solve(
     model: RobotModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
 ) -> Float64 | None:
     """Levenberg's method with steps clipped at the limits; None without convergence."""

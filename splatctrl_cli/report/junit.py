@@ -3,6 +3,7 @@
 Recordings are suites; criteria and gates are cases.
 """
 
+import itertools
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -64,14 +65,13 @@ class Suite:
     seconds: float = 0.0
 
     def count(self, *kinds: Kind) -> int:
-        """The number of cases of these kinds."""
         return sum(case.kind in kinds for case in self.cases)
 
 
 def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed") -> list[Case]:
     """A case per criterion of a verdict (`Verdict.as_dict`, or a command's JSON).
 
-    expected: the right outcome; if it occurs and is not "passed", every case passes.
+    expected: outcome other than "passed" with which every case passes.
     """
     by_criterion: dict[str, list[Mapping[str, Any]]] = {}
     for reason in verdict["reasons"]:
@@ -131,11 +131,11 @@ def _case(name: str, group: str, reasons: Sequence[Mapping[str, Any]]) -> Case:
         group=group,
         kind=Kind(worst["outcome"]),
         sentence=f"{sentence}; and {more} more" if more else sentence,
-        text="\n\n".join(map(_told, ordered)),
+        text="\n\n".join(map(_explain, ordered)),
     )
 
 
-def _told(reason: Mapping[str, Any]) -> str:
+def _explain(reason: Mapping[str, Any]) -> str:
     unit = f" {reason['unit']}" if reason["unit"] else ""
     place = reason["place"]
     facts = {
@@ -160,7 +160,7 @@ _NOT_XML = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 def write_junit(path: Path, suites: Sequence[Suite]) -> None:
     """Write the suites atomically to `path`, replacing a report.
 
-    Raises UsageError for another file or an unwritable path, WriteError on a full disk.
+    Raises UsageError for another file or path, WriteError on a full disk.
     """
     check_replaceable(path)
     with output_path(path, force=True, is_folder=False) as partial:
@@ -184,7 +184,7 @@ def junit_text(suites: Sequence[Suite]) -> str:
     """The suites as reproducible XML 1.0; characters that XML cannot hold are escaped."""
     root = ElementTree.Element(
         "testsuites",
-        {"name": "splatctrl", **_counts(suites), "time": _seconds(sum(suite.seconds for suite in suites))},
+        {"name": "splatctrl", **_counts(suites), "time": f"{sum(suite.seconds for suite in suites):.3f}"},
     )
     for suite in suites:
         _add_suite(root, suite)
@@ -197,7 +197,7 @@ def _add_suite(root: ElementTree.Element, suite: Suite) -> None:
         "name": _clean(suite.name),
         **_counts([suite]),
         "skipped": str(suite.count(Kind.SKIPPED)),
-        "time": _seconds(suite.seconds),
+        "time": f"{suite.seconds:.3f}",
         **({"timestamp": suite.started} if suite.started else {}),
     }
     element = ElementTree.SubElement(root, "testsuite", attributes)
@@ -215,7 +215,7 @@ def _add_case(suite: ElementTree.Element, case: Case) -> None:
     element = ElementTree.SubElement(
         suite,
         "testcase",
-        {"classname": _clean(case.group), "name": _clean(case.name), "time": _seconds(case.seconds)},
+        {"classname": _clean(case.group), "name": _clean(case.name), "time": f"{case.seconds:.3f}"},
     )
     if case.kind is Kind.PASSED:
         if case.text:
@@ -234,12 +234,7 @@ def _counts(suites: Sequence[Suite]) -> dict[str, str]:
     }
 
 
-def _seconds(value: float) -> str:
-    return f"{value:.3f}"
-
-
 def _clean(text: str) -> str:
-    """The text, escaped where XML cannot hold it."""
     return _NOT_XML.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
@@ -251,7 +246,7 @@ MORE = "\n... and {} more that do not fit here\n"
 def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> None:
     """Print annotations, and append a table to the step's summary, in GitHub Actions only.
 
-    is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError if the summary cannot be written.
+    is_fatal: else annotations are warnings. Raises OSError if the summary cannot be written.
     """
     if os.environ.get("GITHUB_ACTIONS") != "true":
         return
@@ -269,12 +264,12 @@ def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping
     lines = []
     # GitHub shows ten of a level for a step
     for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:10]:
-        file = _in_repository(suite.path, environment)
+        file = _repository_path(suite.path, environment)
         properties = {**({"file": file} if file else {}), "title": f"{case.group}: {case.name} ({case.kind})"}
         given = ",".join(
-            f"{name}={_escaped(value).replace(':', '%3A').replace(',', '%2C')}" for name, value in properties.items()
+            f"{name}={_escape(value).replace(':', '%3A').replace(',', '%2C')}" for name, value in properties.items()
         )
-        lines.append(f"::{level} {given}::{_escaped(case.text)}")
+        lines.append(f"::{level} {given}::{_escape(case.text)}")
     return lines
 
 
@@ -298,12 +293,8 @@ def summary(suites: Sequence[Suite], room: int) -> str:
     left -= len(MORE.encode()) + len(str(len(rows)))
     if left < 0:
         return ""
-    kept: list[str] = []
-    for row in rows:
-        left -= len(row.encode())
-        if left < 0:
-            break
-        kept.append(row)
+    ends = itertools.accumulate(len(row.encode()) for row in rows)
+    kept = [row for row, end in zip(rows, ends, strict=True) if end <= left]
     return head + "".join(kept) + MORE.format(len(rows) - len(kept))
 
 
@@ -313,8 +304,7 @@ def _cell(text: str) -> str:
     return " ".join(escaped.split()).encode("utf-8", "backslashreplace").decode()
 
 
-def _in_repository(path: str, environment: Mapping[str, str]) -> str:
-    """The file's path in the repository, or ""."""
+def _repository_path(path: str, environment: Mapping[str, str]) -> str:
     workspace = environment.get("GITHUB_WORKSPACE", "")
     if not (path and workspace and Path(path).is_file()):
         return ""
@@ -322,6 +312,6 @@ def _in_repository(path: str, environment: Mapping[str, str]) -> str:
     return real.relative_to(root).as_posix() if real.is_relative_to(root) else ""
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     """Text escaped as in actions/toolkit."""
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")

@@ -1,8 +1,7 @@
 """One self-contained HTML file: verdict, timelines, pictures, tables, and 3-D scenes.
 
-A scene holds splats by time, a moving arm, and the deciding event; trimesh brings the viewer's three.js. Packed, it
-is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64, and each array's type, first byte and count. Points
-are 16-bit integers within their box.
+trimesh brings the viewer's three.js. A packed scene is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64,
+and each array's type, first byte and count. Points are 16-bit integers within their box.
 """
 
 import base64
@@ -54,31 +53,19 @@ class Motion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deciding:
-    """The deciding event: sentence, time [s], place (3,) [m], world.
-
-    sphere: the arm's there, centre (3,) and radius [m], or None.
-    """
-
-    sentence: str
-    time_s: float
-    place: Float64
-    sphere: tuple[Float64, float] | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class Space:
     """Content of a 3-D page, world [m].
 
     splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) and edge
-    of never-seen cubes. surface: where a baked distance is 0.
+    of never-seen cubes. surface: where a baked distance is 0. deciding: the event's sentence, time [s] and place,
+    with center and radius of the arm's sphere there [m].
     """
 
     splats: Mapping[float, SplatSet] = field(default_factory=dict)
     unknown: tuple[Float32, float] | None = None
     surface: Surface | None = None
     motion: Motion | None = None
-    deciding: Deciding | None = None
+    deciding: Mapping[str, Any] | None = None
 
     def box(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of 90 % of splats, path and surface."""
@@ -125,10 +112,10 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
     return trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=SIDES)
 
 
-def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
+def coarsen(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
     """Centres (K, 3) and edge [m] of at most `most` cubes on unknown space's border.
 
-    Cubes of 2, 3, ... voxels a side are unknown by half or more.
+    Larger cubes are unknown by half or more.
     """
     factor = 1
     while True:
@@ -154,11 +141,10 @@ def three_js() -> str:
         script = page[page.index("<script>") + len("<script>") : page.index("var camera,controls")]
     except (OSError, KeyError, ValueError) as error:
         raise UsageError(f"three.js: not found in trimesh: {error}", remedy="pip install 'trimesh>=4.4,<6'") from None
-    return _deflated(script.encode("utf-8"))
+    return _deflate(script.encode("utf-8"))
 
 
-def packed(space: Space) -> str:
-    """A scene as JSON for the viewer."""
+def pack(space: Space) -> str:
     block = bytearray()
     lower, upper = space.box()
     header: dict[str, Any] = {
@@ -172,26 +158,16 @@ def packed(space: Space) -> str:
     if space.unknown is not None and len(space.unknown[0]):
         header["unknown"] = {"points": _points(block, space.unknown[0]), "edge": space.unknown[1]}
     if space.surface is not None:
-        header["surface"] = _mesh(block, space.surface.vertices, space.surface.faces)
+        header["surface"] = _mesh(block, space.surface)
     if space.motion is not None:
         header["motion"] = _motion(block, space.motion)
-    if (deciding := space.deciding) is not None:
-        header["deciding"] = {
-            "sentence": deciding.sentence,
-            "time": deciding.time_s,
-            "place": np.asarray(deciding.place).tolist(),
-        }
-        if deciding.sphere is not None:
-            center, radius = deciding.sphere
-            header["deciding"] |= {"center": np.asarray(center).tolist(), "radius": radius}
-    return json.dumps({"header": header, "bytes": _deflated(block)}, allow_nan=False)
+    if space.deciding is not None:
+        header["deciding"] = space.deciding
+    return json.dumps({"header": header, "bytes": _deflate(block)}, allow_nan=False)
 
 
 def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
-    """Append values by column, padded to 4 bytes; return [type, first byte, count].
-
-    Columns deflate better than rows.
-    """
+    """Append values by column, which deflates best, padded to 4 bytes; return [type, first byte, count]."""
     array, start = np.asarray(values, kind), len(block)
     block += np.ascontiguousarray(array.T).tobytes()
     block += bytes(-len(block) % 4)
@@ -227,18 +203,18 @@ def _motion(block: bytearray, motion: Motion) -> dict[str, Any]:
         "seconds": _add(block, motion.seconds, np.float32),
         "clearance": [float(value) if np.isfinite(value) else None for value in motion.clearance.round(6)],
         "margin": motion.margin,
-        "links": [_mesh(block, body.vertices, body.faces) for body in motion.bodies.values()],
+        "links": [_mesh(block, body) for body in motion.bodies.values()],
         "quats": _add(block, np.rint(32767 * quats), np.int16),
         "places": _points(block, motion.poses[:, :, :3, 3]),
         "path": _points(block, motion.path),
     }
 
 
-def _mesh(block: bytearray, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> dict[str, Any]:
-    return {"vertices": _points(block, vertices), "faces": _add(block, faces, np.uint32)}
+def _mesh(block: bytearray, surface: Surface) -> dict[str, Any]:
+    return {"vertices": _points(block, surface.vertices), "faces": _add(block, surface.faces, np.uint32)}
 
 
-def _deflated(data: bytes | bytearray) -> str:
+def _deflate(data: bytes | bytearray) -> str:
     return base64.b64encode(zlib.compress(data)).decode("ascii")
 
 
@@ -312,13 +288,13 @@ class Page:
     opens: bool = False
 
 
-def rendered(page: Page) -> str:
+def render_page(page: Page) -> str:
     """The page as HTML, all text escaped."""
     environment = Environment(loader=FileSystemLoader(PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {
         "classed": lambda state: str(state).replace(" ", "-"),
         "scripted": lambda text: Markup(text.replace("<", "\\u003c")),
-        "shown": _shown,
+        "shown": _format_cell,
     }
     environment.tests["a_cell"] = lambda value: isinstance(value, Cell)
     parts = {
@@ -344,7 +320,7 @@ def picture(path: Path, title: str, most: int) -> Picture:
     return Picture(title=title, data=f"data:image/jpeg;base64,{text}", width=width, height=height)
 
 
-def _shown(cell: object) -> str:
+def _format_cell(cell: object) -> str:
     if cell is None or cell == "":
         return "-"
     return f"{cell:.4g}" if isinstance(cell, float) else str(cell)

@@ -144,7 +144,7 @@ def _draw_comparison(figure: "mpl.figure.Figure", axes: Sequence[Any], row: Comp
 
 
 def _draw_depth_error(panel: Any, row: ComparisonRow) -> tuple[Any, str]:
-    """Image of |render - recorded depth| [cm], and its median in words."""
+    """Draw |render - recorded depth| [cm]; return its median in words."""
     both = (row.photo_depth > 0) & (row.render_depth > 0)
     error = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
     panel.set_facecolor("#d9d9d9")  # not recorded

@@ -1,7 +1,6 @@
 """Pictures of a replay: clearance, events, commands, divergence; long curves as ranges."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -166,7 +165,7 @@ def open_loop_picture(
     shaped: intervals [s] in which a row shaped the command, shaded.
     """
     room, largest = np.asarray(margin), 0.0
-    low = envelope(seconds, room)
+    times, lowest, _ = envelope(seconds, room)
     with drawn_figure(path, 7.2) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
         for color, style, (j, joint) in zip(
@@ -181,9 +180,7 @@ def open_loop_picture(
         above.set(ylabel="difference [rad/s]", ylim=(-most, most))
         above.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
         _curve(below, seconds, room, color=CURVE_COLORS[0], width=1.8)
-        below.fill_between(
-            low.seconds, low.lowest, 0.0, where=low.lowest < 0, color=CURVE_COLORS[1], alpha=0.35, linewidth=0
-        )
+        below.fill_between(times, lowest, 0.0, where=lowest < 0, color=CURVE_COLORS[1], alpha=0.35, linewidth=0)
         below.axhline(0.0, color=INK, linewidth=1.2, linestyle=(0, (6, 3)))
         below.set_title(
             "Room that the logged velocity left in the tightest barrier row; below 0 it breaks it", pad=10
@@ -219,17 +216,17 @@ def divergence_picture(
 def _curve(
     axes: Any, seconds: Float64, values: Float64, *, color: str, width: float, style: Any = "-", label: str = ""
 ) -> float:
-    """Draw a curve, or a long one's band; return its largest magnitude."""
-    of = envelope(seconds, values)
-    there = np.isfinite(of.lowest)
-    height = float(np.max(of.highest[there]) - np.min(of.lowest[there])) if there.any() else 0.0
-    is_thin = not there.any() or float(np.median((of.highest - of.lowest)[there])) <= 0.05 * height
+    """Draw a curve, or a long one's band; return its largest size."""
+    times, lowest, highest = envelope(seconds, values)
+    there = np.isfinite(lowest)
+    height = float(np.max(highest[there]) - np.min(lowest[there])) if there.any() else 0.0
+    is_thin = not there.any() or float(np.median((highest - lowest)[there])) <= 0.05 * height
     if is_thin:
-        axes.plot(of.seconds, of.lowest, linestyle=style, color=color, linewidth=width, label=label or "_")
-    if not of.is_exact:
+        axes.plot(times, lowest, linestyle=style, color=color, linewidth=width, label=label or "_")
+    if lowest is not highest:
         name = "_" if is_thin else label or "_"
-        axes.fill_between(of.seconds, of.lowest, of.highest, color=color, alpha=0.45, linewidth=0.7, label=name)
-    return float(np.nanmax(np.abs([of.lowest, of.highest]), initial=0.0))
+        axes.fill_between(times, lowest, highest, color=color, alpha=0.45, linewidth=0.7, label=name)
+    return float(np.nanmax(np.abs([lowest, highest]), initial=0.0))
 
 
 def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) -> float:
@@ -291,35 +288,22 @@ def _tidy(axes: Any, seconds: Float64) -> None:
     set_grid(axes)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Envelope:
-    """K columns: middle time (K,) [s], lowest and highest value (K,), NaN if empty."""
-
-    seconds: Float64
-    lowest: Float64
-    highest: Float64
-
-    @property
-    def is_exact(self) -> bool:
-        """True if every column is one state."""
-        return self.lowest is self.highest
-
-
-def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> Envelope:
+def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> tuple[Float64, Float64, Float64]:
     """Ranges of values (T,) in `columns` equal parts of time (T,).
 
-    Up to two states per column, the values themselves.
+    Returns middle times (K,) [s], lowest and highest values (K,), NaN if empty. Up to two states per column, both are
+    the values, one array.
     """
     values = np.asarray(values, dtype=np.float64)
     if len(values) <= 2 * columns:
-        return Envelope(seconds=seconds, lowest=values, highest=values)
+        return seconds, values, values
     edges = np.linspace(seconds[0], seconds[-1], columns + 1)
     first = np.searchsorted(seconds, edges[:-1], side="left")
     is_filled = np.append(first[1:], len(values)) > first
     starts = first[is_filled]
     lowest, highest = np.full(columns, np.nan), np.full(columns, np.nan)
     lowest[is_filled], highest[is_filled] = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
-    return Envelope(seconds=0.5 * (edges[:-1] + edges[1:]), lowest=lowest, highest=highest)
+    return 0.5 * (edges[:-1] + edges[1:]), lowest, highest
 
 
 def column(rows: FloatRows, number: int) -> Float64:
@@ -331,7 +315,7 @@ def column(rows: FloatRows, number: int) -> Float64:
 def spans(intervals: Sequence[tuple[float, float]], span_s: tuple[float, float]) -> list[tuple[float, float]]:
     """Start and length [s] of intervals on the axis `span_s`.
 
-    None is shorter than `SHORTEST`; touching ones are joined.
+    At least `SHORTEST`; touching ones are joined.
     """
     least = SHORTEST * (span_s[1] - span_s[0])
     drawn: list[tuple[float, float]] = []

@@ -122,13 +122,13 @@ def _curves(axis: _Axis, seconds: Float64, curves: Mapping[str, Float64]) -> Ite
     for name, metres in curves.items():
         color, _, width = FIELD_STYLES.get(name, (CURVE_COLORS[3], "-", 1.5))
         dash = f' stroke-dasharray="{DASHES[name]}"' if name in DASHES else ""
-        of = envelope(seconds, 100 * metres, COLUMNS)
-        x = axis.x(of.seconds)
+        times, lowest, highest = envelope(seconds, 100 * metres, COLUMNS)
+        x = axis.x(times)
         title = escape(FIELD_NAMES.get(name, name))
-        for part in _pieces(of.lowest):
-            low = _points(x[part], axis.y(of.lowest[part]))
-            if not of.is_exact:
-                back = _points(x[part][::-1], axis.y(of.highest[part])[::-1])
+        for part in _pieces(lowest):
+            low = _points(x[part], axis.y(lowest[part]))
+            if lowest is not highest:
+                back = _points(x[part][::-1], axis.y(highest[part])[::-1])
                 yield f'<polygon points="{low} {back}" fill="{color}" opacity="0.3"/>'
             yield (
                 f'<polyline points="{low}" data-name="{title}" stroke="{color}" stroke-width="{width}"{dash}>'
@@ -168,7 +168,6 @@ def _strips(axis: _Axis, strips: Mapping[str, Sequence[tuple[float, float, str, 
 
 
 def legend(curves: Mapping[str, Float64]) -> list[tuple[str, str, str]]:
-    """Colour, name and least value, per measure."""
     rows = []
     for name, metres in curves.items():
         known = metres[np.isfinite(metres)]

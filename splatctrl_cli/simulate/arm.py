@@ -192,8 +192,8 @@ def hand_pose(q: Float64) -> Float64:
     """T_base_hand (4, 4) at joint positions q (7,) [rad]."""
     T = np.eye(4)
     for (_, xyz, roll, *_), angle in zip(JOINTS, q, strict=True):
-        T = T @ _turned(0, roll, xyz) @ _turned(2, angle)
-    return T @ _turned(2, HAND_YAW, (0.0, 0.0, FLANGE))
+        T = T @ _turn(0, roll, xyz) @ _turn(2, angle)
+    return T @ _turn(2, HAND_YAW, (0.0, 0.0, FLANGE))
 
 
 def arm_spheres_yaml() -> str:
@@ -270,7 +270,7 @@ def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]
                 yield f'<sphere radius="{shape.radius}"/>', f'<origin xyz="{_words(point)}" rpy="0 0 0"/>'
 
 
-def _turned(axis: int, angle: float, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float64:
+def _turn(axis: int, angle: float, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float64:
     """The pose (4, 4) at xyz [m], rotated about x (0) or z (2)."""
     T, c, s = np.eye(4), np.cos(angle), np.sin(angle)
     i, j = ((1, 2), (2, 0), (0, 1))[axis]

@@ -49,10 +49,10 @@ class StereoDepth:
         scale = focal / imager if focal > 0 else 1.0  # pixels of the image in one of the imagers
         exact = np.where(depth > 0, imager * BASELINE / np.where(depth > 0, depth, 1.0), 0.0)
         sigma = 0.5 * scale * self.window  # blurred noise correlates by exp(-(r / 2 sigma)^2)
-        error, wide, offset, lost = (_blurred(rng, depth.shape, sigma * blob) for blob in (1, 2, 2, 2))
+        error, wide, offset, lost = (_blur(rng, depth.shape, sigma * blob) for blob in (1, 2, 2, 2))
         low, high = self.fattening
         reach = np.floor(scale * (low + (high - low) * ndtr(wide)) + ndtr(offset)).astype(np.int64)
-        seen = _fattened(exact, reach)
+        seen = _fatten(exact, reach)
         is_lost = _is_hidden(depth, scale * imager * BASELINE) & (seen == exact)
         is_lost |= lost > np.quantile(lost, 1 - self.dropout)
         disparity = np.rint((seen + self.spread * error) * STEPS) / STEPS
@@ -61,7 +61,7 @@ class StereoDepth:
         return np.where(is_lost, 0, measured).astype(np.float32)
 
 
-def _blurred(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Float64:
+def _blur(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Float64:
     """Gaussian-blurred noise (H, W) of unit variance."""
     impulse = np.zeros(min(shape))
     impulse[0] = 1.0
@@ -70,14 +70,14 @@ def _blurred(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> 
 
 
 def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
-    """True where a pixel is occluded from the second imager, right of the first."""
+    """True where occluded from the second imager, right of the first."""
     columns = np.arange(depth.shape[1])
     shifted = np.where(depth > 0, columns - focal_baseline / np.where(depth > 0, depth, 1.0), np.inf)
     least = np.minimum.accumulate(shifted[:, ::-1], axis=1)[:, ::-1]
     return np.asarray(shifted > least + 0.5)  # [px]
 
 
-def _fattened(disparity: Float64, reach: np.ndarray) -> Float64:
+def _fatten(disparity: Float64, reach: np.ndarray) -> Float64:
     """Disparities (H, W), each the largest within `reach` (H, W) [px] if beyond an edge."""
     out = disparity
     for radius in range(1, int(reach.max()) + 1):
@@ -110,8 +110,8 @@ class DepthNoise:
         focal [px]: needed for a baseline.
         """
         coarse = (depth.shape[0] // self.patch + 3, depth.shape[1] // self.patch + 3)
-        error = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
-        lost = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
+        error = _enlarge(rng.standard_normal(coarse), self.patch, depth.shape)
+        lost = _enlarge(rng.standard_normal(coarse), self.patch, depth.shape)
         exact = np.where(depth > 0, depth.astype(np.float64), 1.0)
         noisy = 1 / (self.step * np.rint((1 / exact + self.spread * error) / self.step))
         threshold = np.quantile(lost, 1 - self.dropout) if self.dropout > 0 else np.inf
@@ -121,7 +121,7 @@ class DepthNoise:
         return np.where(is_lost, 0, noisy).astype(np.float32)
 
 
-def _enlarged(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.ndarray:
+def _enlarge(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.ndarray:
     """Unit-variance noise (H, W), blended bilinearly from coarse noise."""
     v, u = np.arange(shape[0]) / factor, np.arange(shape[1]) / factor
     i, j = v.astype(int), u.astype(int)

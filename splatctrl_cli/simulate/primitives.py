@@ -253,7 +253,7 @@ def _cylinder_span(origin: Float64, directions: Float64, radius: float, half: fl
 
 
 def _capsule_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
-    """Interval of t inside a capsule: of its cylinder and balls, as it is convex."""
+    """Interval of t inside a capsule: of its cylinder and balls."""
     end = np.array([0.0, 0.0, half])
     spans = [
         _cylinder_span(origin, directions, radius, half),

@@ -127,7 +127,7 @@ class Recording:
         """scene: instead of the options'; unmodelled: `UNMODELLED` parts on the arm."""
         self.options, self.robot, self.unmodelled = options, robot, unmodelled
         parts = [(UNMODELLED[name][0], capsule) for name in unmodelled for capsule in UNMODELLED[name][1]]
-        self._body = robot if not parts else _with_parts(robot, parts)
+        self._body = robot if not parts else _add_parts(robot, parts)
         scene = Scene.of(options) if scene is None else scene
         self.start_ns, self.end_ns = START_NS, START_NS + round(options.duration_s * 1e9)
         self.cameras = scene.cameras or tabletop.cameras(options.width, options.height)
@@ -163,7 +163,7 @@ class Recording:
             if cameras is not None and renderer.camera.name not in cameras:
                 continue
             color, depth = renderer.image([*arm, *passing], meshes)
-            human = _shown(depth, renderer.depth(arm, meshes)) if self._has_people else None
+            human = _mark_shown(depth, renderer.depth(arm, meshes)) if self._has_people else None
             if noise is not None:
                 rng, focal = np.random.default_rng([self.options.seed, number, index]), renderer.camera.intrinsics.fx
                 depth = noise.applied(depth, rng, focal=focal)
@@ -226,7 +226,7 @@ class Recording:
         return [Renderer(camera, static, color_rays=rays) for camera in self.cameras]
 
 
-def _with_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> RobotModel:
+def _add_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> RobotModel:
     """The robot with balls along the capsules on its links."""
     balls = [(link, c.radius, x) for link, c in parts for x in np.linspace(c.start, c.end, NUM_BALLS)]
     links, radii, centers = zip(*balls, strict=True)
@@ -239,6 +239,6 @@ def _with_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> Robo
     return RobotModel.from_urdf(robot.urdf.path, spheres, T_world_base=robot.T_world_base)
 
 
-def _shown(depth: Float32, without: Float32) -> UInt8:
-    """(H, W) 1 where `depth` [m] shows an object that `without` does not, else 0."""
+def _mark_shown(depth: Float32, without: Float32) -> UInt8:
+    """(H, W) 1 where `depth` [m] shows what `without` does not, else 0."""
     return np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)

@@ -42,7 +42,6 @@ MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
 
 
 def furniture() -> list[Primitive]:
-    """Table, floor and walls, obstacles like any other."""
     return [
         box("table", (1.70, 1.80, 0.05), (0.30, 0.0, -0.025), texture("noise", 0.10, "wood", 1)),
         box("floor", (4.0, 4.0, 0.05), (0.4, 0.0, -0.725), texture("noise", 0.15, "slate", 2)),
@@ -53,7 +52,6 @@ def furniture() -> list[Primitive]:
 
 
 def things() -> list[Primitive]:
-    """Objects on the table throughout."""
     return [
         box(
             "crate", (0.14, 0.18, 0.20), (0.655, 0.315, 0.10), texture("stripes", 0.06, "ocean", 0), np.deg2rad(20.0)
@@ -111,7 +109,6 @@ def cameras(width: int, height: int) -> tuple[Camera, ...]:
 
 
 def arm_motion(duration_s: float) -> Motion:
-    """Motion across the table, at rest at both ends."""
     waypoints = np.array(WAYPOINTS)
     return Motion(times=np.linspace(0.06, 0.94, len(waypoints)) * duration_s, waypoints=waypoints)
 
@@ -142,7 +139,6 @@ def arm_meshes(surface: RobotSurface) -> Meshes:
 
 
 def texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
-    """A texture in two colours of `PALETTE`."""
     dark, bright = PALETTE[palette]
     return Texture(pattern=pattern, feature=feature, dark=dark, bright=bright, seed=seed)
 

@@ -124,14 +124,14 @@ def load_truth(path: Path) -> Truth:
             remedy="give the truth.json that simulate wrote",
         )
     try:
-        return _parsed(path, document)
+        return _parse(path, document)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: damaged: {type(error).__name__}: {error}", remedy="write it anew with simulate"
         ) from None
 
 
-def _parsed(path: Path, document: dict[str, Any]) -> Truth:
+def _parse(path: Path, document: dict[str, Any]) -> Truth:
     robot, clearance = document["robot"], document["clearance"]
     cameras = tuple(
         Camera(

@@ -15,7 +15,7 @@ from splatctrl_cli import __version__
 from splatctrl_cli.cli import check, demo
 from splatctrl_cli.cli.commands import COMMANDS
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
-from splatctrl_cli.jobs.demo import DemoRequest, DemoResult, Told
+from splatctrl_cli.jobs.demo import DemoRequest, Perform
 from tests.cli.here import splatctrl
 from tests.recording.log.make_log import LogRecipe, make_log
 
@@ -146,16 +146,16 @@ def test_on_github_a_command_annotates_and_sums_up_and_its_json_is_whole(
     assert splatctrl("info", log, "--quik").stderr.count("\n") == 1, "it judges nothing"
 
 
-def test_a_demo_tells_of_itself_and_not_of_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    step = Reason(criterion="clearance", outcome=Outcome.FAILED, sentence="too near")
+def test_a_demo_tells_of_itself_and_not_of_its_steps(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = Reason(criterion="replay", outcome=Outcome.PASSED, sentence="expected 'failed', got 'failed'")
 
-    def one_step(request: DemoRequest, progress: object, told: Told) -> DemoResult:
-        told(verdict_of("replay", [step]), request.out)  # type: ignore[arg-type]
-        return DemoResult(out=request.out, verdict=verdict_of("demo", [whole]), seconds=1.0, pictures={})
+    def one_step(request: DemoRequest, perform: Perform, progress: object) -> Verdict:
+        assert perform(["check", str(log), "--fail-on", "warning"], request.out) == "failed"
+        return verdict_of("demo", [whole])
 
     monkeypatch.setattr(demo, "demo", one_step)
-    monkeypatch.setitem(demo.SHOWN, Verdict, lambda console, verdict: console.concluded(verdict, {}, ()))
     monkeypatch.setenv("GITHUB_ACTIONS", "true")
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary.md"))
     told = splatctrl("demo", "-o", tmp_path / "out", "--junit", tmp_path / "j.xml")

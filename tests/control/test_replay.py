@@ -17,7 +17,7 @@ from splatctrl_cli.control.replay import Outcome, ReplayTask, Waypoint, _Course,
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.planner.planned import timed
+from splatctrl_cli.planner.planned import time_path
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm, far_away, num_on_rung, sample_arm
 
@@ -106,7 +106,7 @@ TASK = ReplayTask(start=BEFORE_WALL, T_world_goal=ARM.frame_pose(BEHIND_WALL, "t
 def folded_way(q: Float64, wait_distance: float = 0.05) -> Detour:
     """Fold, turn past the goal, unfold, turn back."""
     waypoints = np.array([q, [q[0], FOLDED], [BEYOND, FOLDED], [BEYOND, BEHIND_WALL[1]], BEHIND_WALL])
-    return Detour(path=timed(waypoints, 0.5 * ARM.velocity_limit, 5.0), wait_distance=wait_distance)
+    return Detour(path=time_path(waypoints, 0.5 * ARM.velocity_limit, 5.0), wait_distance=wait_distance)
 
 
 def test_an_arm_that_stalls_goes_on_by_the_planned_way() -> None:
@@ -146,7 +146,7 @@ def test_no_more_ways_are_planned_than_allowed(ways: int) -> None:
 
     def blocked(stamp_ns: int, q: Float64, T_world_goal: Float64) -> Detour:
         asked.append(stamp_ns)
-        return Detour(path=timed(np.array([q, BEHIND_WALL]), ARM.velocity_limit, 5.0), wait_distance=0.05)
+        return Detour(path=time_path(np.array([q, BEHIND_WALL]), ARM.velocity_limit, 5.0), wait_distance=0.05)
 
     config = replace(WITH_DETOURS, max_detours=ways)
     trace = closed_loop(ARM, config, TASK, lambda _: BEAM, plan_detour=blocked)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
+from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, space_out, thin
 from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.records import Float64
 
@@ -70,14 +70,14 @@ def test_points_that_do_not_count_enter_no_accuracy_but_complete_the_surface() -
 
 def test_spaced_points_are_what_taking_them_in_turn_leaves() -> None:
     points, spacing, kept = np.random.default_rng(3).uniform(0, 0.01, (800, 3)), 0.002, np.empty((0, 3))
-    some = thinned(points, spacing / 2)
+    some = thin(points, spacing / 2)
     for point in some[np.random.default_rng(0).permutation(len(some))]:
         if np.all(np.linalg.norm(kept - point, axis=1) > spacing):
             kept = np.vstack([kept, point])
     assert 50 < len(kept) < 0.6 * len(some)
-    assert np.array_equal(spaced(points, spacing), kept)
-    assert sorted(spaced(kept, spacing).tolist()) == sorted(kept.tolist()), "what is spaced stays as it is"
-    assert len(spaced(np.empty((0, 3)), spacing)) == 0
+    assert np.array_equal(space_out(points, spacing), kept)
+    assert sorted(space_out(kept, spacing).tolist()) == sorted(kept.tolist()), "what is spaced stays as it is"
+    assert len(space_out(np.empty((0, 3)), spacing)) == 0
 
 
 def test_rigid_motion_changes_no_figure() -> None:
@@ -92,11 +92,11 @@ def test_rigid_motion_changes_no_figure() -> None:
 def test_thinning_leaves_one_point_to_a_cube() -> None:
     """Thinning in two parts gives the same points as thinning at once."""
     points = np.array([[0.0, 0.0, 0.0], [0.0004, 0.0, 0.0], [0.0011, 0.0, 0.0], [0.0, 0.0, 0.0012]])
-    np.testing.assert_array_equal(thinned(points, 0.001), points[[0, 2, 3]])
-    assert len(thinned(np.empty((0, 3)), 0.001)) == 0
+    np.testing.assert_array_equal(thin(points, 0.001), points[[0, 2, 3]])
+    assert len(thin(np.empty((0, 3)), 0.001)) == 0
     many = np.random.default_rng(2).uniform(-0.01, 0.01, (2000, 3))
-    parts = np.vstack([thinned(many[:900], 0.003), thinned(many[900:], 0.003)])
-    assert np.array_equal(thinned(parts, 0.003), thinned(many, 0.003))
+    parts = np.vstack([thin(many[:900], 0.003), thin(many[900:], 0.003)])
+    assert np.array_equal(thin(parts, 0.003), thin(many, 0.003))
 
 
 def test_points_on_a_mesh_lie_on_it_evenly() -> None:

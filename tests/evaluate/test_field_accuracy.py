@@ -14,15 +14,14 @@ import trimesh
 from splatctrl_cli.config.fixed import ROBOT_MARGIN
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import (
-    TrueCells,
-    TruthComparison,
     compare_with_mesh,
     compare_with_truth,
+    distance_at,
     field_accuracy,
     grid_distances,
     median_radius,
 )
-from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
+from splatctrl_cli.evaluate.held_out_depth import compare_with_held_out_depth, counted_pixels
 from splatctrl_cli.evaluate.views import surface_points
 from splatctrl_cli.geometry import back_project, look_at
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, Intrinsics, RgbdFrame
@@ -80,11 +79,13 @@ def small_grid(header: dict[str, object], **channels: float) -> DistanceGrid:
 
 def test_hard_comes_back_from_the_bound_of_a_grid() -> None:
     grid = small_grid({"bound_margin": 0.0175, "health": {"radius": 0.01}}, sdf=0.0, bound=0.083)
-    np.testing.assert_allclose(grid_distances(grid)["hard"].at(np.array([0, 5])), [0.1005, 0.1005], atol=1e-7)
+    np.testing.assert_allclose(
+        distance_at(grid_distances(grid)["hard"], np.array([0, 5])), [0.1005, 0.1005], atol=1e-7
+    )
     assert median_radius(grid) == 0.01
     distances = grid_distances(small_grid({}, sdf=0.0, hard=0.083, se=0.0))
     assert list(distances) == ["sdf", "hard", "se"]
-    np.testing.assert_array_equal(distances["hard"].at(np.arange(8)), np.float32(0.083))
+    np.testing.assert_array_equal(distance_at(distances["hard"], np.arange(8)), np.float32(0.083))
 
 
 @pytest.mark.parametrize("header", [{}, {"bound_margin": "wide"}])
@@ -96,50 +97,51 @@ def test_a_grid_without_its_bounds_margin_is_refused(header: dict[str, object]) 
 HIDDEN, SEEN = -0.3, 0.3  # x of cells: a plate at 1 m hides the wall's left half
 
 
-def cells(error: float = 0.004) -> TrueCells:
+def cells(error: float = 0.004) -> dict[str, Any]:
     """At each x, cells at 1, 3, 7 and 15 cm before the wall, behind it, and far away; sdf reads `error` too much."""
     distance = np.tile([0.01, 0.03, 0.07, 0.15, -0.01, 0.5], 2)
     x, nothing = np.repeat([HIDDEN, SEEN], 6), np.zeros(12)
-    return TrueCells(
-        points=np.stack([x, nothing, 2.0 - distance], axis=1),
-        fields={"sdf": distance + error, "hard": distance.copy()},
-        distance=distance,
-        surface=np.stack([x, nothing, nothing + 2.0], axis=1),
-    )
+    return {
+        "points": np.stack([x, nothing, 2.0 - distance], axis=1),
+        "fields": {"sdf": distance + error, "hard": distance.copy()},
+        "distance": distance,
+        "surface": np.stack([x, nothing, nothing + 2.0], axis=1),
+    }
 
 
-def compared(given: TrueCells, workspace: Box | None = None) -> TruthComparison:
-    return compare_with_truth(
-        given,
-        [wall_frame()],
+def compared(given: dict[str, Any], workspace: Box | None = None) -> dict[str, Any]:
+    document, _ = compare_with_truth(
+        **given,
+        frames=[wall_frame()],
         name="truth.json",
         workspace=workspace,
         median_radius=0.01,
         probabilities={"by sign": lambda points, sdf: (sdf < 0).astype(np.float64)},
     )
+    return document
 
 
 def test_cells_count_where_a_camera_saw_their_surface() -> None:
     """And inside the workspace alone."""
     found = compared(cells())
-    assert (found.num_drawn, found.num_blank, found.num_near, found.num_seen) == (12, 0, 8, 4)
-    assert [band.count for band in found.accuracy.seen["sdf"]] == [1, 1, 1, 1]
-    assert [band.count for band in found.accuracy.everywhere["sdf"]] == [2, 2, 2, 2]
-    assert [band.mean for band in found.accuracy.seen["sdf"]] == pytest.approx([0.004] * 4)
-    assert (found.error_mean, found.error_sigma) == (pytest.approx(0.004), pytest.approx(0.0, abs=1e-12))
-    curve = found.reliability["by sign"]
-    assert (curve.count.sum(), curve.calibration_error) == (5, 0.0), "a cell behind the surface counts here"
+    assert [found[f"num_{name}"] for name in ("drawn", "blank", "near", "seen")] == [12, 0, 8, 4]
+    assert [band["count"] for band in found["seen"]["sdf"]] == [1, 1, 1, 1]
+    assert [band["count"] for band in found["everywhere"]["sdf"]] == [2, 2, 2, 2]
+    assert [band["mean"] for band in found["seen"]["sdf"]] == pytest.approx([0.004] * 4)
+    assert (found["error_mean"], found["error_sigma"]) == (pytest.approx(0.004), pytest.approx(0.0, abs=1e-12))
+    curve = found["reliability"]["by sign"]
+    assert (curve["count"].sum(), curve["calibration_error"]) == (5, 0.0), "a cell behind the surface counts here"
     none = compared(cells(), Box(lower=np.array([-1.0, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.9])))
-    assert (none.num_seen, none.num_outside_workspace, none.reliability) == (0, 4, {})
-    assert (none.error_mean, none.error_sigma) == (None, None)
+    assert (none["num_seen"], none["num_outside_workspace"], none["reliability"]) == (0, 4, {})
+    assert (none["error_mean"], none["error_sigma"]) == (None, None)
 
 
 def test_cells_without_a_distance_are_blank_and_a_field_of_them_cannot_be_compared() -> None:
     given = cells()
-    given.fields["sdf"][6] = np.nan
+    given["fields"]["sdf"][6] = np.nan
     blank = compared(given)
-    assert (blank.num_blank, blank.num_near, blank.num_seen) == (1, 7, 3)
-    given.fields["sdf"][:] = np.nan
+    assert (blank["num_blank"], blank["num_near"], blank["num_seen"]) == (1, 7, 3)
+    given["fields"]["sdf"][:] = np.nan
     with pytest.raises(NotEvaluableError, match=r"truth\.json: no cell of the grid lies within 0\.2 m"):
         compared(given)
 
@@ -166,28 +168,28 @@ def write_box(path: Path, size: tuple[float, float, float] = SIZE, at: Float64 |
 
 def test_errors_are_those_of_the_grid_and_hard_comes_back_from_the_bound(tmp_path: Path) -> None:
     found = compare_with_mesh(box_grid(0.003, hard_error=0.005), write_box(tmp_path / "box.stl"), seed=0)
-    assert (found.is_closed, found.num_faces, found.num_inside) == (True, 12, 11**3)
+    assert (found["is_closed"], found["num_faces"], found["num_inside"]) == (True, 12, 11**3)
     for name, error in (("sdf", 0.003), ("hard", 0.005)):
-        for band in found.accuracy.everywhere[name]:
-            assert band.count > 100 and (band.mean, band.rmse) == pytest.approx((error, error), abs=1e-6)
-    over = found.accuracy.over_estimate
-    assert (over.count, over.allowance) == (found.num_near, pytest.approx(0.014))
-    assert found.accuracy.seen == {} and found.as_dict()["holds"]
+        for band in found["everywhere"][name]:
+            assert band["count"] > 100 and (band["mean"], band["rmse"]) == pytest.approx((error, error), abs=1e-6)
+    over = found["over_estimate"]
+    assert (over["count"], over["allowance"]) == (found["num_near"], pytest.approx(0.014))
+    assert found["seen"] == {} and found["holds"]
     beyond = compare_with_mesh(box_grid(hard_error=0.015), tmp_path / "box.stl", seed=0)
-    assert beyond.accuracy.over_estimate.count_beyond == beyond.num_near
+    assert beyond["over_estimate"]["count_beyond"] == beyond["num_near"]
 
 
 def test_points_are_drawn_with_the_seed_and_cells_without_a_distance_are_left_out(tmp_path: Path) -> None:
     path, grid = write_box(tmp_path / "box.stl"), box_grid()
     grid.channels["sdf"] += np.random.default_rng(0).normal(0, 0.001, grid.channels["sdf"].shape).astype(np.float32)
     one, same, other = (compare_with_mesh(grid, path, seed=seed, max_points=3000) for seed in (5, 5, 6))
-    assert (one.num_drawn, one.num_in_reach) == (3000, 31**3)  # 0.305 m on either side
-    assert one == same and one.accuracy != other.accuracy
+    assert (one["num_drawn"], one["num_in_reach"]) == (3000, 31**3)  # 0.305 m on either side
+    assert one == same and one["everywhere"] != other["everywhere"]
     grid = box_grid(0.001)
     grid.channels["sdf"][:20] = np.nan
     found = compare_with_mesh(grid, path, seed=0)
-    assert 0.4 < found.num_unknown / found.num_drawn < 0.55
-    assert found.accuracy.everywhere["sdf"][1].rmse == pytest.approx(0.001, abs=1e-6)
+    assert 0.4 < found["num_unknown"] / found["num_drawn"] < 0.55
+    assert found["everywhere"]["sdf"][1]["rmse"] == pytest.approx(0.001, abs=1e-6)
 
 
 def test_an_open_mesh_is_compared_on_both_sides(tmp_path: Path) -> None:
@@ -196,8 +198,8 @@ def test_an_open_mesh_is_compared_on_both_sides(tmp_path: Path) -> None:
     grid, heights = box_grid(), np.abs(-0.4 + 0.02 * np.arange(41))
     grid.channels["sdf"][:], grid.channels["bound"][:] = heights, heights - 0.017
     found = compare_with_mesh(grid, tmp_path / "sheet.stl", seed=0)
-    assert (found.is_closed, found.num_inside) == (False, 0) and found.num_near >= 19 * 41 * 41
-    assert [band.rmse for band in found.accuracy.everywhere["hard"]] == pytest.approx([0.0] * 4, abs=1e-6)
+    assert (found["is_closed"], found["num_inside"]) == (False, 0) and found["num_near"] >= 19 * 41 * 41
+    assert [band["rmse"] for band in found["everywhere"]["hard"]] == pytest.approx([0.0] * 4, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -244,20 +246,20 @@ def frames() -> list[RgbdFrame]:
 
 def held_out(
     grid: DistanceGrid, views: Sequence[RgbdFrame] = (), max_points: int = 4000, **how: Any
-) -> HeldOutComparison:
+) -> dict[str, Any]:
     return compare_with_held_out_depth(grid, [*views] or frames(), max_points=max_points, **{"seed": 0} | how)
 
 
 def test_a_floor_reads_zero_on_it_and_its_height_before_it() -> None:
     found = held_out(height_grid(0.003))
-    assert found.reference == "nearest measured depth point"
-    assert (found.num_frames, found.num_unknown, found.num_edges) == (3, 0, 0)
+    assert found["reference"] == "nearest measured depth point"
+    assert (found["num_frames"], found["num_unknown"], found["num_edges"]) == (3, 0, 0)
     for name, error in (("sdf", 0.003), ("hard", 0.0)):
-        on = found.on_surface[name]
-        assert on.count > 1000 and on.mean == pytest.approx(error, abs=1e-6)
-        for band in found.before.seen[name]:  # pixels on the floor are up to 6 mm apart
-            assert band.count > 50 and band.mean == pytest.approx(error, abs=6e-4)
-    assert found.before.over_estimate.count_beyond == 0
+        on = found["on_surface"][name]
+        assert on["count"] > 1000 and on["mean"] == pytest.approx(error, abs=1e-6)
+        for band in found["before"]["seen"][name]:  # pixels on the floor are up to 6 mm apart
+            assert band["count"] > 50 and band["mean"] == pytest.approx(error, abs=6e-4)
+    assert found["before"]["over_estimate"]["count_beyond"] == 0
 
 
 def test_a_hidden_surface_is_an_under_estimate_only_where_the_ball_was_seen() -> None:
@@ -265,14 +267,14 @@ def test_a_hidden_surface_is_an_under_estimate_only_where_the_ball_was_seen() ->
     grid, x = height_grid(), -0.3 + 0.02 * np.arange(31)
     post = np.hypot(x[:, None, None] - 0.05, x[None, :, None]) - 0.02
     grid.channels["sdf"] = np.minimum(grid.channels["sdf"], post).astype(np.float32)
-    shown = held_out(grid).before
-    everywhere, seen = shown.everywhere["sdf"][3], shown.seen["sdf"][3]
-    assert seen.count > 0.8 * everywhere.count and seen.mean is not None and seen.mean < -0.01
+    shown = held_out(grid)["before"]
+    everywhere, seen = shown["everywhere"]["sdf"][3], shown["seen"]["sdf"][3]
+    assert seen["count"] > 0.8 * everywhere["count"] and seen["mean"] < -0.01
     blind = [replace(view, depth=np.where(hides_post(view), 0, view.depth)) for view in frames()]
-    unsure = held_out(grid, blind).before
-    everywhere, seen = unsure.everywhere["sdf"][3], unsure.seen["sdf"][3]
-    assert 100 < seen.count < everywhere.count
-    assert seen.rmse is not None and everywhere.rmse is not None and seen.rmse < 0.005 and everywhere.rmse > 0.02
+    unsure = held_out(grid, blind)["before"]
+    everywhere, seen = unsure["everywhere"]["sdf"][3], unsure["seen"]["sdf"][3]
+    assert 100 < seen["count"] < everywhere["count"]
+    assert seen["rmse"] < 0.005 and everywhere["rmse"] > 0.02
 
 
 def hides_post(frame: RgbdFrame) -> Bool:
@@ -288,20 +290,20 @@ def test_masked_pixels_and_edges_measure_nothing() -> None:
     view, robot = frames()[0], np.broadcast_to(np.arange(200) < 100, (160, 200))
     view.depth[robot] *= 0.5
     without, with_arm = (held_out(height_grid(), [view], 1000, counted=counted) for counted in ([~robot], None))
-    assert (without.num_edges, with_arm.num_edges) == (160, 320)  # the column beside the mask
-    assert without.on_surface["sdf"].over_max == pytest.approx(0.0, abs=1e-6)
-    assert with_arm.num_measured > without.num_measured or with_arm.num_outside > 0
+    assert (without["num_edges"], with_arm["num_edges"]) == (160, 320)  # the column beside the mask
+    assert without["on_surface"]["sdf"]["over_max"] == pytest.approx(0.0, abs=1e-6)
+    assert with_arm["num_measured"] > without["num_measured"] or with_arm["num_outside"] > 0
 
 
 def test_points_without_a_distance_and_over_estimates_count_wherever_they_are() -> None:
     grid, over = height_grid(), height_grid()
     grid.channels["sdf"][:15] = np.nan
     found = held_out(grid, max_points=2000)
-    assert 0 < found.num_unknown < 2000 - found.num_outside
-    assert sum(band.count for band in found.before.everywhere["sdf"]) <= 2000 - found.num_unknown
+    assert 0 < found["num_unknown"] < 2000 - found["num_outside"]
+    assert sum(band["count"] for band in found["before"]["everywhere"]["sdf"]) <= 2000 - found["num_unknown"]
     over.channels["hard"] += np.float32(0.03)
-    beyond = held_out(over, frames()[:1], 2000).before.over_estimate
-    assert beyond.count_beyond == beyond.count > 500
+    beyond = held_out(over, frames()[:1], 2000)["before"]["over_estimate"]
+    assert beyond["count_beyond"] == beyond["count"] > 500
     one, same, other = (held_out(height_grid(), max_points=500, seed=seed) for seed in (1, 1, 2))
     assert one == same and one != other
 

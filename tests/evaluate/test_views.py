@@ -185,11 +185,10 @@ def test_ssim_map_equals_the_reference_window_by_window_and_at_the_border() -> N
 def test_depth_errors_count_only_pixels_where_both_have_depth() -> None:
     reference = np.array([[1.0, 1.0, 1.0, 0.0, 1.0]], dtype=np.float32)
     errors = depth_errors(np.array([[1.005, 1.015, 1.1, 1.0, 0.0]], dtype=np.float32), reference)
-    assert errors.num_pixels == 3
-    assert (errors.median, errors.mean, errors.p90) == pytest.approx((0.015, 0.04, 0.015 + 0.8 * 0.085), abs=1e-6)
-    assert (errors.within_1cm, errors.within_2cm) == pytest.approx((1 / 3, 2 / 3))
+    assert list(errors.values()) == pytest.approx([3, 0.015, 0.04, 0.015 + 0.8 * 0.085, 1 / 3, 2 / 3], abs=1e-6)
+    assert list(errors)[1:4] == ["depth_median", "depth_mean", "depth_p90"]
     none = depth_errors(np.zeros((3, 3), np.float32), np.ones((3, 3), np.float32))
-    assert none.num_pixels == 0 and math.isnan(none.median) and math.isnan(none.within_1cm)
+    assert none["depth_pixels"] == 0 and math.isnan(none["depth_median"]) and math.isnan(none["depth_within_1cm"])
 
 
 def test_zeros_beyond_the_border_make_it_look_alike() -> None:

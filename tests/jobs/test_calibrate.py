@@ -15,7 +15,7 @@ from splatctrl_cli.checks import check_log
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
-from splatctrl_cli.jobs.check import posed_robot
+from splatctrl_cli.jobs.check import pose_robot
 from splatctrl_cli.jobs.ingest import IngestRequest, ingest
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.recording.container.log_formats import open_raw_log
@@ -300,5 +300,5 @@ def test_directions_that_a_table_does_not_show_are_named(tmp_path: Path) -> None
 
 
 def test_a_robot_that_meshes_draw_needs_no_spheres(sample_data: Path) -> None:
-    model = posed_robot((), sample_data / "tabletop" / "robot.urdf", RobotOptions())
+    model = pose_robot((), sample_data / "tabletop" / "robot.urdf", RobotOptions())
     assert model is not None and model.surface.trees and not len(model.sphere_set.radii)

@@ -9,7 +9,7 @@ from experiments.paths import joint_length
 from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner import birrt
-from splatctrl_cli.planner.birrt import PlanOutcome, plan, shortened
+from splatctrl_cli.planner.birrt import PlanOutcome, plan, shorten_path
 from splatctrl_cli.planner.configuration_clearance import Clearance, EdgeCheck, OnlyDistance, Solids, check_edges
 from splatctrl_cli.planner.planned import resampled
 from splatctrl_cli.records import Float64
@@ -106,7 +106,7 @@ def test_a_start_or_goal_that_cannot_be_is_named(
 def test_shortcuts_are_proved_and_never_longer(seed: int) -> None:
     room = clearance(one_wall())
     found = plan(room, START, GOAL, replace(CONFIG, shortcut_rounds=0), seed=seed).found
-    short, _, _ = shortened(room, found, CONFIG, np.random.default_rng(seed))
+    short, _, _ = shorten_path(room, found, CONFIG, np.random.default_rng(seed))
     np.testing.assert_array_equal(short[[0, -1]], found[[0, -1]])
     assert joint_length(short) <= joint_length(found) + 1e-12 and densest(room, short) > 0
 

@@ -27,7 +27,7 @@ from splatctrl_cli.planner.planned import (
     planned_detours,
     planned_path,
     resampled,
-    timed,
+    time_path,
 )
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
@@ -169,7 +169,7 @@ def test_resampling_keeps_waypoints_length_and_spacing() -> None:
 
 def test_a_timed_path_keeps_its_limits_and_its_edges() -> None:
     """And uses them."""
-    path = timed(PATH, ARM.velocity_limit, 3.0)
+    path = time_path(PATH, ARM.velocity_limit, 3.0)
     clock = np.linspace(0, path.duration, 20_001)
     position, velocity = path.at(clock)
     assert np.all(np.abs(velocity) <= ARM.velocity_limit + 1e-12)
@@ -184,16 +184,16 @@ def test_a_timed_path_keeps_its_limits_and_its_edges() -> None:
 
 def test_a_path_of_one_place_or_without_limits_is_refused() -> None:
     with pytest.raises(InputError, match="expected at least 2 waypoints, got 1"):
-        timed(PATH[:1], ARM.velocity_limit, 3.0)
+        time_path(PATH[:1], ARM.velocity_limit, 3.0)
     with pytest.raises(InputError, match="limits above 0"):
-        timed(PATH, np.zeros(2), 3.0)
+        time_path(PATH, np.zeros(2), 3.0)
 
 
 def test_a_path_keeps_the_speed_of_a_frame_too() -> None:
     """An edge that leaves a frame where it is has no rate."""
     rates = effector_rates(ARM, PATH, "tip", max_linear=0.2, max_angular=0.5)
-    path = timed(PATH, ARM.velocity_limit, 7.5, max_rate=rates)
-    assert path.duration > timed(PATH, ARM.velocity_limit, 7.5).duration
+    path = time_path(PATH, ARM.velocity_limit, 7.5, max_rate=rates)
+    assert path.duration > time_path(PATH, ARM.velocity_limit, 7.5).duration
     motion = zip(*path.at(np.arange(0, path.duration, 0.01)), strict=True)
     twists = np.array([ARM.frame_jacobian(q, "tip") @ v for q, v in motion])
     linear, angular = (np.linalg.norm(part, axis=1).max() for part in (twists[:, :3], twists[:, 3:]))

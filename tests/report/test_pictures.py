@@ -225,9 +225,9 @@ def test_each_kind_of_event_that_came_up_has_a_row() -> None:
 
 
 def test_a_short_series_is_drawn_as_it_is() -> None:
-    of = envelope(np.linspace(0, 1, 20), np.arange(20.0), columns=10)
-    assert of.is_exact
-    np.testing.assert_array_equal(of.lowest, np.arange(20.0))
+    _, lowest, highest = envelope(np.linspace(0, 1, 20), np.arange(20.0), columns=10)
+    assert lowest is highest
+    np.testing.assert_array_equal(lowest, np.arange(20.0))
 
 
 @pytest.mark.parametrize("block", [1, 3, 7, 50])
@@ -242,25 +242,25 @@ def test_a_long_series_keeps_its_extremes_where_they_are() -> None:
     seconds = np.sort(rng.uniform(0, 100, 5000))
     values = rng.normal(size=5000)
     values[1234], values[4321] = -50.0, 70.0
-    of = envelope(seconds, values, columns=100)
-    assert not of.is_exact and len(of.seconds) == 100
-    low, high = int(np.nanargmin(of.lowest)), int(np.nanargmax(of.highest))
-    assert (of.lowest[low], of.highest[high]) == (-50.0, 70.0)
-    np.testing.assert_allclose([of.seconds[low], of.seconds[high]], seconds[[1234, 4321]], atol=0.51)
+    times, lowest, highest = envelope(seconds, values, columns=100)
+    assert lowest is not highest and len(times) == 100
+    low, high = int(np.nanargmin(lowest)), int(np.nanargmax(highest))
+    assert (lowest[low], highest[high]) == (-50.0, 70.0)
+    np.testing.assert_allclose([times[low], times[high]], seconds[[1234, 4321]], atol=0.51)
     column = np.minimum((100 * (seconds - seconds[0]) / np.ptp(seconds)).astype(int), 99)
     for k in (0, 50, 99):
-        assert of.lowest[k] == values[column == k].min() and of.highest[k] == values[column == k].max()
+        assert lowest[k] == values[column == k].min() and highest[k] == values[column == k].max()
 
 
 def test_gaps_and_missing_values_stay_gaps() -> None:
     seconds = np.concatenate([np.linspace(0, 4, 500), np.linspace(6, 10, 500)])
     values = np.ones(1000)
     values[:100] = np.nan
-    of = envelope(seconds, values, columns=50)
-    is_gap = np.isnan(of.lowest)
-    np.testing.assert_array_equal(is_gap, np.isnan(of.highest))
-    assert is_gap[(of.seconds > 4.2) & (of.seconds < 5.8)].all() and is_gap[of.seconds < 0.7].all()
-    assert not is_gap[(of.seconds > 1) & (of.seconds < 3.8)].any()
+    times, lowest, highest = envelope(seconds, values, columns=50)
+    is_gap = np.isnan(lowest)
+    np.testing.assert_array_equal(is_gap, np.isnan(highest))
+    assert is_gap[(times > 4.2) & (times < 5.8)].all() and is_gap[times < 0.7].all()
+    assert not is_gap[(times > 1) & (times < 3.8)].any()
 
 
 def test_short_intervals_can_be_seen_and_those_that_touch_are_one() -> None:

@@ -13,7 +13,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Label
-from splatctrl_cli.report.page import Space, bodies_of, coarsened, packed, three_js
+from splatctrl_cli.report.page import Space, bodies_of, coarsen, pack, three_js
 from splatctrl_cli.report.timeline import HEIGHT, LEFT, RIGHT, TOP, WIDTH, legend, runs_of, timeline
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
@@ -93,12 +93,12 @@ def test_a_primitive_is_drawn_in_its_place_and_size(
 def test_unknown_space_is_its_border_and_in_larger_cubes_where_that_is_too_much() -> None:
     is_unknown = np.zeros((40, 40, 40), bool)
     is_unknown[10:30, 10:30, 10:30] = True
-    fine, edge = coarsened(is_unknown, np.zeros(3), 0.1, 10_000)
+    fine, edge = coarsen(is_unknown, np.zeros(3), 0.1, 10_000)
     assert (len(fine), edge) == (20**3 - 18**3, 0.1)
-    coarse, edge = coarsened(is_unknown, np.zeros(3), 0.1, 500)
+    coarse, edge = coarsen(is_unknown, np.zeros(3), 0.1, 500)
     assert (len(coarse), edge) == (10**3 - 8**3, pytest.approx(0.2))
     np.testing.assert_allclose(coarse.min(axis=0) - edge / 2, 10 * 0.1 - 0.05, atol=1e-6)  # the same lower corner
-    assert len(coarsened(np.ones((5, 5, 5), bool), np.zeros(3), 0.1, 100)[0]) == 0  # there is none around the grid
+    assert len(coarsen(np.ones((5, 5, 5), bool), np.zeros(3), 0.1, 100)[0]) == 0  # there is none around the grid
 
 
 def test_splats_are_packed_to_a_hundredth_of_a_per_cent_of_their_box() -> None:
@@ -106,7 +106,7 @@ def test_splats_are_packed_to_a_hundredth_of_a_per_cent_of_their_box() -> None:
     centers = generator.uniform(-1.5, 1.5, (200, 3))
     labels = np.where(np.arange(200) < 50, Label.ROBOT, Label.OBJECT)
     splats = plain_splats(centers, generator.uniform(0.002, 0.05, 200), labels=labels)
-    scene = json.loads(packed(Space(splats={0.0: splats})))
+    scene = json.loads(pack(Space(splats={0.0: splats})))
     block, (coded,) = zlib.decompress(base64.b64decode(scene["bytes"])), scene["header"]["splats"]
     kind, start, count = coded["centers"]["array"]
     whole = np.frombuffer(block, kind, count, start).reshape(3, -1).T
@@ -114,7 +114,7 @@ def test_splats_are_packed_to_a_hundredth_of_a_per_cent_of_their_box() -> None:
     kind, start, count = coded["radii"]
     radii = np.frombuffer(block, kind, count, start) * coded["largest"] / 65535
     np.testing.assert_allclose(radii, splats.radii, atol=1e-6)
-    assert len(packed(Space(splats={0.0: splats}))) < 6000
+    assert len(pack(Space(splats={0.0: splats}))) < 6000
 
 
 def test_without_the_three_js_of_trimesh_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from experiments.shared_workspace import scene_of
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.jobs.simulate.simulate import adapted_motion
+from splatctrl_cli.jobs.simulate.simulate import adapt_motion
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
@@ -88,7 +88,7 @@ def test_an_arm_of_six_joints_goes_where_ours_goes(
 ) -> None:
     monkeypatch.setattr(fixed, "SIMULATED_TURNS", turns)
     model = ur10e(tmp_path)
-    motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
+    motion = adapt_motion(scene, model, SelfSurfaces(model, {}))
     np.testing.assert_array_equal(motion.times, scene.motion.times)
     for ours, theirs in zip(scene.motion.waypoints, motion.waypoints, strict=True):
         hand, tip = hand_pose(ours), model.frame_pose(theirs, "tool0")
@@ -108,7 +108,7 @@ def test_a_small_arm_goes_as_far_as_it_reaches_and_a_tiny_one_is_refused(tmp_pat
 
     scene = Scene.of(RecordingOptions(is_free=True))
     small = ur10e(tmp_path, scaled(0.45))
-    motion = adapted_motion(scene, small, SelfSurfaces(small, {}))
+    motion = adapt_motion(scene, small, SelfSurfaces(small, {}))
     for ours, theirs in zip(scene.motion.waypoints, motion.waypoints, strict=True):
         hand, tip = hand_pose(ours)[:3, 3], small.frame_pose(theirs, "tool0")[:3, 3]
         assert tip[2] == pytest.approx(hand[2], abs=2e-3)
@@ -116,12 +116,12 @@ def test_a_small_arm_goes_as_far_as_it_reaches_and_a_tiny_one_is_refused(tmp_pat
         assert tip[0] * hand[1] - tip[1] * hand[0] == pytest.approx(0.0, abs=2e-3)
     with pytest.raises(InputError, match=r"expected tool0 to reach .* pointing down, got no posture; give the URDF"):
         tiny = ur10e(tmp_path, scaled(0.05))
-        adapted_motion(scene, tiny, SelfSurfaces(tiny, {}))
+        adapt_motion(scene, tiny, SelfSurfaces(tiny, {}))
 
 
 def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path) -> None:
     model, scene = ur10e(tmp_path), Scene.of(RecordingOptions(is_free=True))
-    motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
+    motion = adapt_motion(scene, model, SelfSurfaces(model, {}))
     seconds = np.linspace(0, 7, 300)
     passed = motion.at(3.5)[0]
 
@@ -134,19 +134,19 @@ def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path) -> None:
             return np.asarray(np.linalg.norm(q - passed, axis=1, keepdims=True) - self.radius)
 
     meeting = Meeting(model, {})
-    other = adapted_motion(scene, model, meeting)
+    other = adapt_motion(scene, model, meeting)
     gaps = meeting.gaps(np.array([other.at(second)[0] for second in seconds]), np.zeros(0), 0.0)
     assert gaps.min() > -0.05 and not np.allclose(other.waypoints, motion.waypoints)
     Meeting.radius = 100.0
     with pytest.raises(InputError, match="expected a way between the waypoints, got none"):
-        adapted_motion(scene, model, meeting)
+        adapt_motion(scene, model, meeting)
 
 
 @pytest.mark.parametrize("duration", DURATIONS[::2])
 def test_another_arm_keeps_its_velocity_limits_in_any_time(tmp_path: Path, duration: float) -> None:
     model, options = ur10e(tmp_path), RecordingOptions(duration_s=duration, fps=10.0)
     scene = Scene.of(options)
-    motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
+    motion = adapt_motion(scene, model, SelfSurfaces(model, {}))
     recording = Recording(options, model, replace(scene, motion=motion))
     assert_keeps_limits(recording)
     assert recording.clearances()[1].min() > 0
@@ -156,7 +156,7 @@ def test_an_arm_that_is_too_slow_for_its_task_beside_a_person_is_refused(tmp_pat
     slow = ur10e(tmp_path, re.sub(r'velocity="[^"]+"', 'velocity="0.2"', ur10e_urdf()))
     scene = scene_of("near-goal", 0)
     with pytest.raises(InputError, match="expected a way between the waypoints, got none"):
-        adapted_motion(scene, slow, SelfSurfaces(slow, {}))
+        adapt_motion(scene, slow, SelfSurfaces(slow, {}))
 
 
 def test_free_space_has_floor_and_walls_alone() -> None:

@@ -1,7 +1,6 @@
 """Report and verdict of a baked field, and its errors against references."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,12 @@ from numpy.typing import NDArray
 from splatctrl_cli.config.fixed import COMPARED_CELLS, FAR_GRID
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.field_accuracy import (
-    MeshComparison,
-    TrueCells,
-    TruthComparison,
     compare_with_mesh,
     compare_with_truth,
+    figures_of,
     median_radius,
 )
-from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
+from splatctrl_cli.evaluate.held_out_depth import compare_with_held_out_depth, counted_pixels
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, verdict_of
 from splatctrl_cli.field.clusters import Spheres
@@ -30,6 +27,7 @@ from splatctrl_cli.field.report import GridStatistics
 from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.report.field_pictures import Reliability
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 
@@ -41,26 +39,21 @@ SUMMARY_METRICS = {
 }  # comparison scales of the summary's figures
 
 
-@dataclass(frozen=True, kw_only=True)
-class Accuracy:
-    """Errors of a field against its references; None for those not requested."""
+def accuracy_of(
+    grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest
+) -> tuple[dict[str, dict[str, Any]], dict[str, Reliability]]:
+    """Errors of a field by reference requested, as in ``field.json``, and reliability against the truth.
 
-    truth: TruthComparison | None = None
-    reference_mesh: MeshComparison | None = None
-    held_out_depth: HeldOutComparison | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        return {name: compared.as_dict() for name, compared in vars(self).items() if compared is not None}
-
-
-def accuracy_of(grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest) -> Accuracy:
-    """Compare the field with its references. Raises NotEvaluableError without overlap."""
-    mesh, held_out = request.reference_mesh, request.held_out
-    return Accuracy(
-        truth=None if request.truth is None else _beside_truth(grid, spheres, source, request),
-        reference_mesh=None if mesh is None else compare_with_mesh(grid, mesh, seed=request.seed),
-        held_out_depth=None if held_out is None else _beside_held_out(grid, source, held_out, request),
-    )
+    Raises NotEvaluableError without overlap.
+    """
+    compared, curves = dict[str, dict[str, Any]](), dict[str, Reliability]()
+    if request.truth is not None:
+        compared["truth"], curves = _compare_with_truth(grid, spheres, source, request)
+    if request.reference_mesh is not None:
+        compared["reference_mesh"] = compare_with_mesh(grid, request.reference_mesh, seed=request.seed)
+    if request.held_out is not None:
+        compared["held_out_depth"] = _compare_with_held_out(grid, source, request.held_out, request)
+    return compared, curves
 
 
 def check_references(request: BakeRequest, source: BakeSource) -> None:
@@ -72,8 +65,9 @@ def check_references(request: BakeRequest, source: BakeSource) -> None:
         _held_out_cameras(open_source(request.held_out), request, source.cameras)
 
 
-def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest) -> TruthComparison:
-    """Compare drawn cells with the truth; neither contains the robot."""
+def _compare_with_truth(
+    grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest
+) -> tuple[dict[str, Any], dict[str, Reliability]]:
     assert request.truth is not None and request.seen_by is not None
     truth = load_truth(request.truth)
     stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
@@ -87,12 +81,10 @@ def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, requ
     distances, surfaces = zip(*(truth.closest(chunk, stamp_ns) for chunk in chunks), strict=True)
     forms = probabilities(spheres, request.config.field, threads=request.threads)
     return compare_with_truth(
-        TrueCells(
-            points=points,
-            fields=_fields(grid, drawn),
-            distance=np.concatenate(distances),
-            surface=np.concatenate(surfaces),
-        ),
+        points,
+        _fields(grid, drawn),
+        np.concatenate(distances),
+        np.concatenate(surfaces),
         _frames(request.seen_by, source.cameras, stamp_ns),
         name=str(request.truth),
         workspace=source.workspace,
@@ -102,7 +94,7 @@ def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, requ
 
 
 def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
-    """Values of hard and sdf at drawn cells; whole channels may not fit the memory."""
+    """Values of hard and sdf at drawn cells; a whole channel may not fit in memory."""
     channels: dict[str, NDArray[np.generic]] = {
         name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
         for name in ("sdf", "hard", "bound")
@@ -113,7 +105,7 @@ def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
 
 
 def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:
-    """Frames of training cameras (of all if unknown) up to a stamp."""
+    """Frames of training cameras, or all, up to a stamp."""
     for record in open_source(log).records():
         if record.stamp_ns > until_ns:
             return
@@ -121,10 +113,9 @@ def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator
             yield record
 
 
-def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> HeldOutComparison:
-    """Compare with the newest held-out depth not later than the scene's stamp.
-
-    Pixels outside the scene's box or on the robot do not count: the field has neither.
+def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> dict[str, Any]:
+    """Compare with the newest held-out depth up to the scene's stamp. Pixels outside the scene's box or on the robot
+    do not count: the field has neither.
     """
     recording = open_source(log)
     cameras = _held_out_cameras(recording, request, source.cameras)
@@ -155,10 +146,7 @@ def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request:
 def _held_out_cameras(
     recording: RecordSource, request: BakeRequest, trained: Sequence[str] | None
 ) -> tuple[str, ...]:
-    """Return the named cameras, or all not known to have trained.
-
-    Raises UsageError for another camera, or if none is left.
-    """
+    """Return the named cameras, or all not known to have trained."""
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
     if wrong := [name for name in names if name not in known]:
         raise UsageError(f"--held-out: {log} has no camera {wrong[0]}", remedy=f"it has: {', '.join(known)}")
@@ -170,69 +158,55 @@ def _held_out_cameras(
     return chosen
 
 
-@dataclass(frozen=True, kw_only=True)
-class FieldReport:
-    """A baked grid, its statistics, and an update's changes."""
-
-    grid: DistanceGrid
-    statistics: GridStatistics
-    changes: Changes | None = None
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings about splat health, and a box far from all splats."""
-        health, lowest = self.grid.header["health"], self.statistics.lowest
-        assert isinstance(health, dict)
-        if lowest is None or lowest <= FAR_GRID:
-            return tuple(health["warnings"])
+def field_document(grid: DistanceGrid, statistics: GridStatistics, changes: Changes | None) -> dict[str, Any]:
+    """Content of ``field.json`` without accuracy: header and place first, an update's changes last."""
+    header: Mapping[str, Any] = grid.header
+    warnings, lowest, update = tuple(header["health"]["warnings"]), statistics.lowest, {}
+    if lowest is not None and lowest > FAR_GRID:
         far = f"the box holds no splat: the nearest is {lowest:.3g} m from every cell; check --box"
-        return (*health["warnings"], far)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values for ``field.json``, header and place first."""
-        grid, changes, update = self.grid, self.changes, {}
-        if changes is not None:
-            why = {"why_all": changes.reason} if changes.reason else {}
-            update = {"update": {"blocks_baked": changes.num_baked, "blocks": changes.num_blocks, **why}}
-        return {
-            **grid.header,
-            "shape": grid.channels["sdf"].shape,
-            "first_cell": grid.origin,
-            "voxel": grid.voxel,
-            "channels": list(grid.channels),
-            "statistics": self.statistics.as_dict(),
-            "warnings": self.warnings,
-            **update,
-        }
-
-    def summary(self) -> dict[str, Any]:
-        """Printed figures, without accuracy."""
-        header: Mapping[str, Any] = self.grid.header
-        num_used, health = sum(header["splats_used"].values()), header["health"]
-        # cells where the kernel field of sdf, alone, exceeds the exact distance
-        over = header["kernel_counts"].get(f"{KERNEL_OF[header['distance']]}_over_estimates")
-        summary = {
-            "num_splats": num_used,
-            "num_splats_left_out": sum(header["splats_given"].values()) - num_used,
-            "shape": list(self.grid.channels["sdf"].shape),
-            "num_cells": self.statistics.num_cells,
-            "voxel": self.grid.voxel,
-            "distance": header["distance"],
-            "length_scale": header["length_scale"],
-            "median_radius": health["radius"],
-            "median_spacing": health["spacing"],
-            "never_seen_share": self.statistics.never_seen_share,
-            "over_estimating_share": None if over is None else over / self.statistics.num_cells,
-            "num_warnings": len(self.warnings),
-        }
-        if self.changes is not None:
-            summary["blocks_baked"] = f"{self.changes.num_baked} of {self.changes.num_blocks}"
-        return summary
+        warnings = (*warnings, far)
+    if changes is not None:
+        why = {"why_all": changes.reason} if changes.reason else {}
+        update = {"update": {"blocks_baked": changes.num_baked, "blocks": changes.num_blocks, **why}}
+    return {
+        **header,
+        "shape": grid.channels["sdf"].shape,
+        "first_cell": grid.origin,
+        "voxel": grid.voxel,
+        "channels": list(grid.channels),
+        "statistics": statistics.as_dict(),
+        "warnings": warnings,
+        **update,
+    }
 
 
-def metrics_of(summary: Mapping[str, Any], accuracy: Accuracy) -> dict[str, float | None]:
+def summary_of(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Printed figures of ``field.json``, without accuracy."""
+    num_used, statistics = sum(document["splats_used"].values()), document["statistics"]
+    # cells where the kernel field of sdf, alone, exceeds the exact distance
+    over = document["kernel_counts"].get(f"{KERNEL_OF[document['distance']]}_over_estimates")
+    summary = {
+        "num_splats": num_used,
+        "num_splats_left_out": sum(document["splats_given"].values()) - num_used,
+        "shape": list(document["shape"]),
+        "num_cells": statistics["num_cells"],
+        "voxel": document["voxel"],
+        "distance": document["distance"],
+        "length_scale": document["length_scale"],
+        "median_radius": document["health"]["radius"],
+        "median_spacing": document["health"]["spacing"],
+        "never_seen_share": statistics["never_seen_share"],
+        "over_estimating_share": None if over is None else over / statistics["num_cells"],
+        "num_warnings": len(document["warnings"]),
+    }
+    if "update" in document:
+        summary["blocks_baked"] = "{blocks_baked} of {blocks}".format(**document["update"])
+    return summary
+
+
+def metrics_of(summary: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
     """Figures a gate can name: of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``."""
-    of_truth = {} if accuracy.truth is None else accuracy.truth.accuracy.figures()
+    of_truth = figures_of(accuracy["truth"]) if "truth" in accuracy else {}
     return {name: summary[name] for name in SUMMARY_METRICS} | of_truth
 
 
@@ -243,11 +217,11 @@ def counts_of(metrics: Mapping[str, float | None]) -> dict[str, int]:
 
 
 def bake_verdict(
-    request: BakeRequest, report: FieldReport, metrics: Mapping[str, float | None], *, has_occupancy: bool
+    request: BakeRequest, document: Mapping[str, Any], metrics: Mapping[str, float | None], *, has_occupancy: bool
 ) -> Verdict:
     """Judge the channels' loss of distance [m], unobserved boxes, and each ``--require``."""
-    statistics, voxel = report.statistics, report.grid.voxel
-    num_cells, loss = statistics.num_cells, LOSS * voxel
+    statistics, voxel = document["statistics"], document["voxel"]
+    num_cells, loss = statistics["num_cells"], LOSS * voxel
     reasons = [
         Reason(
             criterion="loss",
@@ -259,7 +233,7 @@ def bake_verdict(
             count=num_cells,
         )
     ]
-    if has_occupancy and statistics.never_seen_share == 1:
+    if has_occupancy and statistics["never_seen_share"] == 1:
         reasons.append(
             Reason(
                 criterion="known space",
@@ -271,11 +245,11 @@ def bake_verdict(
                 count=num_cells,
             )
         )
-    reasons += [note(criterion="field", sentence=text) for text in report.warnings]
-    shape, counts = report.grid.channels["sdf"].shape, counts_of(metrics)
+    reasons += [note(criterion="field", sentence=text) for text in document["warnings"]]
+    counts = counts_of(metrics)
     return verdict_of(
         "sdf-bake",
         [*reasons, *gate_reasons(request.require, metrics, counts)],
-        scope=f"{' x '.join(map(str, shape))} cells of {voxel:g} m, {metrics['num_splats']} splats",
+        scope=f"{' x '.join(map(str, document['shape']))} cells of {voxel:g} m, {metrics['num_splats']} splats",
         counts=counts,
     )

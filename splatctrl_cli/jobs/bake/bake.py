@@ -16,7 +16,7 @@ from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
 from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.report import grid_statistics
+from splatctrl_cli.field.report import GradientLengths, grid_statistics
 from splatctrl_cli.field.slabs import (
     Kept,
     UnknownSpace,
@@ -32,29 +32,30 @@ from splatctrl_cli.formats.grid.grid_format import CHANNELS, GridSlabs, SlabPlan
 from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
 from splatctrl_cli.jobs.bake.accuracy import (
     SUMMARY_METRICS,
-    Accuracy,
-    FieldReport,
     accuracy_of,
     bake_verdict,
     check_references,
+    field_document,
     metrics_of,
+    summary_of,
 )
 from splatctrl_cli.jobs.bake.request import (
     BakeRequest,
     BakeSource,
     Previous,
     check_same,
-    covered,
+    choose_box,
     device_for,
     read_bake_source,
     read_previous,
 )
-from splatctrl_cli.jobs.running.device import Device, named
+from splatctrl_cli.jobs.running.device import Device, explain_fault
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
-from splatctrl_cli.jobs.running.resume import check_resumption, deciding_versions, told_how_to_go_on
+from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, deciding_versions
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import (
+    Reliability,
     gradient_picture,
     probability_picture,
     reliability_picture,
@@ -71,7 +72,7 @@ def bake_to_disk(
     """Bake the channels into ``partial/channels``; the baker's counts then cover all slabs.
 
     kept: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last
-    slab. Raises UsageError if that bake had other settings, or if disk or memory lacks room.
+    slab. Raises UsageError for other settings than that bake's, or too little room on disk or in memory.
     """
     baker, request, folder = job.baker, job.request, partial / FOLDER
     layout, config = baker.layout, request.config
@@ -142,13 +143,16 @@ def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection
 
 @dataclass(frozen=True, kw_only=True)
 class BakeResult:
-    """A baked field in `out`; metrics can be gated on, seconds are by stage."""
+    """A baked field in `out`; metrics can be gated on, seconds are by stage.
+
+    accuracy: by reference (truth, reference_mesh, held_out_depth), as in ``field.json``.
+    """
 
     __repr__ = brief
 
     out: Path
     summary: Mapping[str, Any]
-    accuracy: Accuracy
+    accuracy: Mapping[str, Mapping[str, Any]]
     metrics: Mapping[str, float | None]
     verdict: Verdict
     seconds: Mapping[str, float]
@@ -161,7 +165,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
     checkpoint = partial_path(out) / CHECKPOINT
     check_resumption(checkpoint, "bake", progress, resume=request.resume)
     with (
-        told_how_to_go_on(checkpoint),
+        advise_resumption(checkpoint),
         output_path(
             out, force=request.force, is_folder=True, checkpoint=CHECKPOINT, resume=request.resume
         ) as partial,
@@ -172,25 +176,25 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
                 remove(path)
         with stopwatch.stage("bake"):
             try:
-                grid, changes = _baked(job, partial, progress)
+                grid, changes = _bake_grid(job, partial, progress)
             except DeviceError as error:
-                raise named(error, job.device, checkpoint) from error
+                raise explain_fault(error, job.device, checkpoint) from error
             finally:
                 job.baker.close()
         with stopwatch.stage("report"):
-            report = FieldReport(grid=grid, statistics=grid_statistics(grid), changes=changes)
+            statistics = grid_statistics(grid)
+            document = field_document(grid, statistics, changes)
         with stopwatch.stage("write"):
             write_grid(partial, grid, request.formats)
         with stopwatch.stage("accuracy"):
-            accuracy = accuracy_of(grid, job.baker.spheres, job.source, request)
+            accuracy, curves = accuracy_of(grid, job.baker.spheres, job.source, request)
         with stopwatch.stage("report"):
-            compared = accuracy.as_dict()
-            write_json(partial / "field.json", report.as_dict() | ({"accuracy": compared} if compared else {}))
+            write_json(partial / "field.json", document | ({"accuracy": accuracy} if accuracy else {}))
             if not request.no_report:
-                _draw(partial / "report", report, accuracy, _middle(job))
-        summary = report.summary()
+                _draw(partial / "report", grid, statistics.gradient, curves, _middle(job))
+        summary = summary_of(document)
         metrics = metrics_of(summary, accuracy)
-        verdict = bake_verdict(request, report, metrics, has_occupancy=job.source.occupancy is not None)
+        verdict = bake_verdict(request, document, metrics, has_occupancy=job.source.occupancy is not None)
         shutil.rmtree(partial / FOLDER)
         write_run(
             partial,
@@ -229,7 +233,6 @@ class _Job:
 
     @property
     def digests(self) -> dict[str, str]:
-        """sha256 of all input files."""
         return self.source.digests | ({} if self.previous is None else self.previous.digests)
 
 
@@ -243,7 +246,7 @@ def _read(request: BakeRequest, stopwatch: Stopwatch, progress: Progress) -> _Jo
     channels = _channels(request, previous)
     check_references(request, source)
     check_formats(request.formats, channels, unknown=config.field.unknown)
-    layout = GridLayout.over(covered(request, source, previous), config.field.voxel)
+    layout = GridLayout.over(choose_box(request, source, previous), config.field.voxel)
     if previous is not None:
         check_same(previous, layout, config.field, channels, request.label_names)
     with stopwatch.stage("bake"):
@@ -262,7 +265,6 @@ def _read(request: BakeRequest, stopwatch: Stopwatch, progress: Progress) -> _Jo
 
 
 def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...]:
-    """Channels to bake, in order. Raises UsageError if a request needs another."""
     usual = DEFAULT_CHANNELS if previous is None else tuple(previous.grid.channels)
     wanted = usual if request.channels is None else request.channels
     names = {"sdf", *wanted, *(("probability",) if request.with_probability else ())}
@@ -282,7 +284,7 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
     return chosen
 
 
-def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, Changes | None]:
+def _bake_grid(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, Changes | None]:
     baker, previous, source, config = job.baker, job.previous, job.source, job.request.config
     changes = kept = old = None
     if previous is not None:
@@ -320,20 +322,25 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
     return store.grid({**header, **made}), changes
 
 
-def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence[float]) -> None:
+def _draw(
+    folder: Path,
+    grid: DistanceGrid,
+    lengths: GradientLengths | None,
+    curves: Mapping[str, Reliability],
+    point: Sequence[float],
+) -> None:
     folder.mkdir()
-    grid, lengths = report.grid, report.statistics.gradient
     slices_picture(folder / "slices.png", grid, point)
     if lengths is not None:
         gradient_picture(folder / "gradient.png", grid, lengths.histogram, lengths.bin_width, point)
     if "probability" in grid.channels:
         probability_picture(folder / "probability.png", grid, point)
-    if accuracy.truth is not None and accuracy.truth.reliability:
-        reliability_picture(folder / "reliability.png", accuracy.truth.reliability, "Probability against the truth")
+    if curves:
+        reliability_picture(folder / "reliability.png", curves, "Probability against the truth")
 
 
 def _middle(job: _Job) -> list[float]:
-    """Point [m] where slices are drawn: the middle of the grid's splats without outliers."""
+    """Point [m] of the slices: the middle of the grid's splats without outliers."""
     box, centers = job.baker.layout.box, job.obstacles.splats.centers
     inside = centers[box.contains(centers)]
     lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)

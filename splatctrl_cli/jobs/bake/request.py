@@ -18,7 +18,7 @@ from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene
 from splatctrl_cli.formats.splat.splats import read_spheres
-from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, choose_device
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.jobs.runs.run_folder import read_object
 from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
@@ -32,8 +32,8 @@ class BakeRequest(RunOptions):
 
     at: time after the scene's start [s], None for its end. labels: of the splats in the field. The grid covers `box`,
     or the robot's reach, or the splats. channels: besides sdf, None for the usual ones. References: `truth`, where
-    cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out` (`held_out_cameras`, by default all
-    that did not train). update: a field baked from `previous_scene` (None: `scene`), to bake only changes.
+    cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out` (`held_out_cameras`; none: all that did
+    not train). update: a field of `previous_scene` (None: `scene`); only changes are baked.
     """
 
     scene: Path
@@ -140,7 +140,7 @@ class Previous:
 def read_previous(path: Path, scene: Path) -> Previous:
     """Read the field in folder `path` and the splats of `scene` it was baked from.
 
-    Raises InputError for a missing, damaged or foreign field, UsageError for another scene or version.
+    Raises InputError for a missing or damaged field, UsageError for another scene or version.
     """
     if not path.is_dir():
         raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
@@ -215,7 +215,7 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
     return source
 
 
-def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
+def choose_box(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
     """Box of the grid: given, else of the reach, the previous field, or the splats."""
     if request.box is not None:
         return request.box
@@ -233,6 +233,6 @@ def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progre
             raise UsageError(f"--device {request.device}: --update bakes on the processor", remedy=TO_CPU)
         return Device()
     is_matern = KERNEL_OF[request.config.field.distance] == "gpdf"
-    return chosen(
+    return choose_device(
         request.device, layout.num_cells * (num_splats if is_matern else CARD_SPLATS) >= CARD_LEAST_BAKE, progress
     )

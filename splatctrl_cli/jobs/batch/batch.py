@@ -1,19 +1,17 @@
 """A batch: read the suite, run its graph, write batch.json."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import DAMAGED, InputError, UsageError
+from splatctrl_cli.errors import DAMAGED, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, verdict_of
-from splatctrl_cli.files.output import MARKERS, write_durably, write_json
-from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
+from splatctrl_cli.files.output import write_durably, write_json
+from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, select_shard
 from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Ledger, Run, keys_of
 from splatctrl_cli.jobs.batch.run import (
     DONE,
@@ -22,9 +20,9 @@ from splatctrl_cli.jobs.batch.run import (
     SKIPPED,
     TO_DO,
     Scheduler,
+    describe_run,
     local_executor,
     not_run,
-    told,
     verdict_in,
 )
 from splatctrl_cli.jobs.batch.suite import Suite as Asked
@@ -42,7 +40,7 @@ class BatchRequest:
     """Run a suite's file into `out` (default: the suite's).
 
     workers: processes at once. shard: (i, n) runs every n-th recording from the i-th on. dask: address of a Dask
-    scheduler that runs the nodes instead. again: rerun finished nodes.
+    scheduler to use instead. again: rerun finished nodes.
     """
 
     suite: Path
@@ -68,7 +66,7 @@ class BatchResult:
 def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:
     """Run unfinished nodes. Raises UsageError for an invalid suite, InputError for missing files."""
     suite, every, out = planned(request, command_line)
-    nodes = of_shard(every, request.shard)
+    nodes = select_shard(every, request.shard)
     with (
         Ledger(out) as ledger,
         scheduling(
@@ -101,7 +99,7 @@ def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, li
     suite = read_suite(request.suite, COMMANDS)
     out = (request.out or suite.out).absolute()
     nodes = nodes_of(suite, out, command_line)
-    if not of_shard(nodes, request.shard):
+    if not select_shard(nodes, request.shard):
         index, count = request.shard
         raise UsageError(
             f"--shard {index}/{count}: has none of the {len(suite.recordings)} recordings", remedy="give fewer shards"
@@ -112,17 +110,11 @@ def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, li
 def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node, str]]:
     """Every node with "done" or "to do"; writes nothing but a ledger's digests."""
     _, every, out = planned(request, command_line)
-    nodes = of_shard(every, request.shard)
+    nodes = select_shard(every, request.shard)
     with Ledger(out) as ledger:
         keys, latest = keys_of(nodes, ledger, command_line.entry), ledger.latest()
-    is_kept = {
-        node.name: not request.again
-        and (run := latest.get(node.name)) is not None
-        and run.key == keys[node.name]
-        and run.state in {DONE, "failed"}
-        for node in nodes
-    }
-    return [(node, "done" if is_kept[node.name] else "to do") for node in nodes]
+    stand = {name for name, run in latest.items() if run.state in {DONE, FAILED} and run.key == keys.get(name)}
+    return [(node, "done" if node.name in stand and not request.again else "to do") for node in nodes]
 
 
 def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
@@ -148,7 +140,7 @@ def _reason(run: Run) -> Reason:
     return Reason(
         criterion=run.node,
         outcome=Outcome.PASSED if run.state == DONE else Outcome.NOT_EVALUABLE if lacks else Outcome.FAILED,
-        sentence=told(run) + (f": {run.sentence}" if run.sentence and run.state != DONE else ""),
+        sentence=describe_run(run) + (f": {run.sentence}" if run.sentence and run.state != DONE else ""),
         label="error" if run.state == ERROR else "not as expected",
         remedy="" if run.state in (DONE, SKIPPED) else f"see {run.log}",
         count=1,
@@ -156,7 +148,6 @@ def _reason(run: Run) -> Reason:
 
 
 def suites_of(result: BatchResult) -> list[Suite]:
-    """JUnit suites, one for each recording."""
     suites = list[Suite]()
     for recording in dict.fromkeys(run.recording for run in result.runs):
         runs = [run for run in result.runs if run.recording == recording]
@@ -192,11 +183,13 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
         ]
     verdict = verdict_in(out / run.result)
     if run.state == FAILED:
-        wrong = Case(name="expected", group=run.node, kind=Kind.FAILED, sentence=told(run), text=str(_reason(run)))
+        wrong = Case(
+            name="expected", group=run.node, kind=Kind.FAILED, sentence=describe_run(run), text=str(_reason(run))
+        )
         return [wrong, *(cases_of(verdict, run.node) if verdict and run.outcome != Outcome.PASSED else [])]
     if verdict:
         return cases_of({**verdict, "is_damaged": _is_damaged(run)}, run.node, expected=run.outcome)
-    passed = Case(name=run.command, group=run.node, kind=Kind.PASSED, text="" if run.outcome else told(run))
+    passed = Case(name=run.command, group=run.node, kind=Kind.PASSED, text="" if run.outcome else describe_run(run))
     return [passed, *([damage_case(run.node)] if _is_damaged(run) else [])]
 
 
@@ -223,27 +216,6 @@ def write_batch(
         "nodes": [run.document() for run in found],
     }
     write_durably(out / FILE, lambda path: write_json(path, document))
-
-
-def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: str) -> None:
-    """Raise UsageError if `out` is of another command, or of other settings (`what`).
-
-    Its file `name` has the settings. Raises InputError if that is unreadable.
-    """
-    file = out / name
-    if not file.is_file():
-        if any((out / other).exists() for other in (*MARKERS, FILE)):
-            raise UsageError(f"{out}: is no {what}, but something else", remedy="give another --out")
-        return
-    try:
-        before = json.loads(file.read_text(encoding="utf-8"))["asked"]
-        differs = [key for key in asked if before.get(key) != asked[key]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{file}: is not what a {what} writes", remedy="give another --out") from None
-    if differs:
-        raise UsageError(
-            f"{out}: was begun with other settings: {', '.join(differs)}", remedy="give them again, or another --out"
-        )
 
 
 @contextmanager

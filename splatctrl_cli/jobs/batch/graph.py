@@ -1,9 +1,10 @@
 """The graph of a suite: nodes of recording, job and variant."""
 
 import itertools
+import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -79,13 +80,12 @@ def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
     nodes: list[Node] = []
     for recording in sorted(suite.recordings, key=lambda each: each.name):
         jobs = jobs_for(recording, suite.jobs, COMMANDS)
-        kept = {job.name: _with_roles(job, jobs, recording) for job in jobs}
-        nodes += _nodes_of(recording, _in_order(kept, recording), suite.folder, out, command_line)
+        kept = {job.name: _add_roles(job, jobs, recording) for job in jobs}
+        nodes += _nodes_of(recording, _sort_jobs(kept, recording), suite.folder, out, command_line)
     return nodes
 
 
-def of_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
-    """Nodes of every n-th recording from the i-th on."""
+def select_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
     index, count = shard
     chosen = set(list(dict.fromkeys(node.recording for node in nodes))[index - 1 :: count])
     return [node for node in nodes if node.recording in chosen]
@@ -97,13 +97,13 @@ def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[
     return sorted(job_of, key=lambda name: jobs.index(job_of[name]) if job_of[name] in jobs else len(jobs))
 
 
-def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
+def _add_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
     given = {*job.options, *job.matrix}
     given |= {"field", "lockstep"} & given and {"scene"}  # either stands for its scene
     roles = {option: role for option, role in ROLES[job.command].items() if option not in given}
     if job.command in {"reconstruct", "score"} and "dtu" in given:
         roles = {option: role for option, role in roles.items() if option == "scene"}
-    filled = {option: _filled(job, role, jobs, recording) for option, role in roles.items()}
+    filled = {option: _fill(job, role, jobs, recording) for option, role in roles.items()}
     return replace(job, options={**filled, **job.options})
 
 
@@ -111,7 +111,7 @@ def _where(job: Job, recording: Recording) -> str:
     return f"[jobs.{job.name}] of {recording.name}"
 
 
-def _filled(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
+def _fill(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
     where = _where(job, recording)
     makers = [other.name for other in jobs if other.command == role and other.name != job.name]
     if len(makers) > 1:
@@ -122,7 +122,7 @@ def _filled(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> s
     return f"{{{makers[0] if makers else RECORDING}}}"
 
 
-def _in_order(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
+def _sort_jobs(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
     needs = {name: _needs(job, jobs, recording) for name, job in jobs.items()}
     try:
         TopologicalSorter(needs).prepare()
@@ -141,23 +141,13 @@ def _in_order(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, 
 
 
 def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str, ...]:
-    found = dict.fromkeys(place for text in _texts((job.options, job.matrix)) for place in _PLACE.findall(text))
+    texts = json.dumps([job.options, job.matrix], ensure_ascii=False, default=str)
+    found = dict.fromkeys(_PLACE.findall(texts))
     for place in found:
         if place not in {RECORDING, NAME, *jobs}:
             known = ", ".join((RECORDING, NAME, *jobs))
             raise UsageError(f"{_where(job, recording)}: {{{place}}} is no job", remedy=f"known here: {known}")
     return tuple(place for place in found if place in jobs)
-
-
-def _texts(value: Any) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, Mapping):
-        for each in value.values():
-            yield from _texts(each)
-    elif isinstance(value, list | tuple):
-        for each in value:
-            yield from _texts(each)
 
 
 def _nodes_of(
@@ -171,27 +161,44 @@ def _nodes_of(
     for job, needs in jobs:
         made[job.name] = []
         for before in itertools.product(*(made[name] for name in needs)):
-            inherited = _joined([node.variant for node in before])
+            inherited = _join([node.variant for node in before])
             if inherited is None:
                 continue
             for picked in itertools.product(*job.matrix.values()):
                 chosen = dict(zip(job.matrix, picked, strict=True))
                 variant = {**inherited, **{f"{job.name}.{option}": value for option, value in chosen.items()}}
-                node = _node(recording, job, variant, _suffix(variant, (each for each, _ in jobs)), before, out)
+                suffix = _suffix(variant, (each for each, _ in jobs))
+                place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:120]
+                only_prints = job.command in ("check", "info")
+                its = None if only_prints else out / recording.name / (place + ENDINGS.get(job.command, ""))
                 values: dict[str, Any] = {
                     **{each.job: str(each.out) for each in before},
                     RECORDING: [str(path) for path in recording.paths],
                     NAME: recording.name,
                 }
-                options = _placed(_merged(job.options, chosen), values.__getitem__)
-                options |= {} if node.out is None else {"out": str(node.out), "force": True, "resume": True}
+                options = _fill_places(_merge(job.options, chosen), values.__getitem__)
+                options |= {} if its is None else {"out": str(its), "force": True, "resume": True}
                 try:
                     words, read = command_line.parsed(job.command, options, folder)
                 except UsageError as error:
                     raise UsageError(f"{_where(job, recording)}: {error.message}", remedy=error.remedy) from None
                 outs = [each.out for each in before if each.out is not None]
                 inputs = (path for path in read if not any(out in (path, *path.parents) for out in outs))
-                made[job.name].append(replace(node, words=words, inputs=tuple(inputs)))
+                made[job.name].append(
+                    Node(
+                        name=f"{recording.name}/{place}",
+                        recording=recording.name,
+                        job=job.name,
+                        command=job.command,
+                        words=words,
+                        variant=variant,
+                        inputs=tuple(inputs),
+                        needs=tuple(each.name for each in before),
+                        out=its,
+                        expect=job.expect,
+                        limits=job.limits,
+                    )
+                )
     nodes = [node for each in made.values() for node in each]
     by_name: dict[str, Node] = {}
     for node in nodes:
@@ -219,7 +226,6 @@ def text_of(value: Any) -> str:
 
 
 def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
-    """Write matrix choices for a node's name, with the job's name if ambiguous."""
     chosen = {
         f"{job.name}.{option}": (option.removeprefix("set."), values)
         for job in jobs
@@ -235,25 +241,7 @@ def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
     return found
 
 
-def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before: Sequence[Node], out: Path) -> Node:
-    place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:120]
-    return Node(
-        name=f"{recording.name}/{place}",
-        recording=recording.name,
-        job=job.name,
-        command=job.command,
-        words=(),
-        variant=variant,
-        needs=tuple(node.name for node in before),
-        out=None
-        if job.command in ("check", "info")
-        else out / recording.name / (place + ENDINGS.get(job.command, "")),
-        expect=job.expect,
-        limits=job.limits,
-    )
-
-
-def _joined(variants: Sequence[Variant]) -> Variant | None:
+def _join(variants: Sequence[Variant]) -> Variant | None:
     """Union of variants; None if two choose differently."""
     joined: dict[str, Any] = {}
     for variant in variants:
@@ -262,8 +250,8 @@ def _joined(variants: Sequence[Variant]) -> Variant | None:
     return joined
 
 
-def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
-    """Add matrix choices to options; ``set.SECTION.KEY`` and ``perturb.NAME`` add an entry to their table."""
+def _merge(options: Table, chosen: Variant) -> dict[str, Any]:
+    """Add matrix choices; ``set.SECTION.KEY`` and ``perturb.NAME`` add to a table."""
     merged = dict(options)
     for key, value in chosen.items():
         table, dot, entry = key.partition(".")
@@ -275,14 +263,14 @@ def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
     return merged
 
 
-def _placed(value: Any, filled: Callable[[str], Any]) -> Any:
-    """Fill each {place}; a text that is one place becomes its value, even a list."""
+def _fill_places(value: Any, filled: Callable[[str], Any]) -> Any:
+    """Fill each {place}; a text that is one place may become a list."""
     if isinstance(value, str):
         alone = _PLACE.fullmatch(value)
         return filled(alone[1]) if alone else _PLACE.sub(lambda match: _one(filled(match[1])), value)
     if isinstance(value, Mapping):
-        return {key: _placed(each, filled) for key, each in value.items()}
-    return [_placed(each, filled) for each in value] if isinstance(value, list) else value
+        return {key: _fill_places(each, filled) for key, each in value.items()}
+    return [_fill_places(each, filled) for each in value] if isinstance(value, list) else value
 
 
 def _one(value: Any) -> str:

@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from uuid import uuid4
 
 import splatctrl_cli
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults
 from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PACKAGES, sha256, write_durably, write_table
 from splatctrl_cli.jobs.batch.graph import Node
@@ -74,7 +74,6 @@ class Run:
         return self.node.removeprefix(f"{self.recording}/")
 
     def document(self) -> dict[str, Any]:
-        """The run for batch.json; `run_of_document` reads it."""
         plain = asdict(self) | {name: json.loads(getattr(self, name)) for name in _OF_JSON}
         return {"id": plain.pop("node"), **plain, "outcome": self.outcome or None}
 
@@ -101,12 +100,10 @@ class Ledger(AbstractContextManager["Ledger"]):
         self.folder, self.path = folder, folder / NAME
         self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
         self._lock: TextIO | None = None
-        try:
-            self._base = self._opened()
-        except sqlite3.DatabaseError as error:
-            raise InputError(f"{self.path}: is no ledger: {error}", remedy="move it away; outputs stay") from None
+        with refuse_faults(f"{self.path}: is no ledger", sqlite3.DatabaseError, remedy="move it away; outputs stay"):
+            self._base = self._open()
 
-    def _opened(self) -> sqlite3.Connection:
+    def _open(self) -> sqlite3.Connection:
         base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
         base.row_factory = sqlite3.Row
         version = int(base.execute("PRAGMA user_version").fetchone()[0])
@@ -161,28 +158,28 @@ class Ledger(AbstractContextManager["Ledger"]):
     def release(self, node: str) -> None:
         self._base.execute("DELETE FROM claims WHERE node = ? AND owner = ?", (node, self._owner))
 
-    def last(self, node: str) -> Run | None:
-        return next(self.runs([f"node={node}"]), None)
-
     def latest(self) -> dict[str, Run]:
         return {run.node: run for run in self.runs()}
 
     def mean_seconds(self) -> dict[str, float]:
-        """Mean time of runs that ended by themselves, by job."""
         rows = self._base.execute("SELECT job, avg(seconds) AS mean FROM runs WHERE cause = '' GROUP BY job")
         return {row["job"]: float(row["mean"]) for row in rows}
 
     def runs(self, conditions: Sequence[str] = (), *, only_last: bool = True) -> Iterator[Run]:
         """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10". Raises UsageError for others."""
-        clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
+        clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], list[Any]()
         for condition in conditions:
             match = re.fullmatch(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)", condition.strip())
             if match is None or match[1] not in COLUMNS:
                 raise UsageError(
                     f"--where {condition}: expected COLUMN=VALUE", remedy=f"columns: {', '.join(COLUMNS)}"
                 )
-            clauses.append(f"{match[1]} {_PATTERN.get(match[2], match[2]) if '*' in match[3] else match[2]} ?")
-            values.append(_value_of(match[1], match[3], condition))
+            column, comparison, text = match.groups()
+            clauses.append(f"{column} {_PATTERN.get(comparison, comparison) if '*' in text else comparison} ?")
+            try:
+                values.append(float(text) if column in _NUMBERS else text)
+            except ValueError:
+                raise UsageError(f"--where {condition}: {column} is a number, got {text!r}") from None
         where = f" WHERE {' AND '.join(clauses)}" if clauses else ""
         for row in self._base.execute(f"SELECT * FROM runs{where} ORDER BY id", values):
             plain = {name: row[name] for name in COLUMNS}
@@ -190,12 +187,16 @@ class Ledger(AbstractContextManager["Ledger"]):
 
     def digest(self, path: Path) -> str:
         """sha256 of a file, or a folder's names and files; cached by sizes and times."""
-        stamp = _stamp_of(path)
-        key = str(path.resolve())
+        key, found = str(path.resolve()), path.stat()
+        stamp = f"{found.st_size} {found.st_mtime_ns} {found.st_ino}"
+        files = {place: place.stat() for place in sorted(path.rglob("*")) if place.is_file()}
+        if path.is_dir():
+            lines = [f"{place.relative_to(path)} {s.st_size} {s.st_mtime_ns}" for place, s in files.items()]
+            stamp = hashlib.sha256("\n".join(lines).encode()).hexdigest()
         row = self._base.execute("SELECT stamp, digest FROM digests WHERE path = ?", (key,)).fetchone()
         if row is not None and row["stamp"] == stamp:
             return str(row["digest"])
-        listing = "\n".join(f"{place.relative_to(path)} {sha256(place)}" for place in _files(path))
+        listing = "\n".join(f"{place.relative_to(path)} {sha256(place)}" for place in files)
         digest = hashlib.sha256(listing.encode()).hexdigest() if path.is_dir() else sha256(path)
         self._base.execute("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", (key, stamp, digest))
         return digest
@@ -224,7 +225,6 @@ class Ledger(AbstractContextManager["Ledger"]):
 
 
 def write_csv(path: Path, runs: Iterable[Run]) -> None:
-    """Write runs with every column."""
     write_durably(path, lambda place: write_table(place, COLUMNS, map(asdict, runs)))
 
 
@@ -232,27 +232,6 @@ def run_of_document(plain: Mapping[str, Any]) -> Run:
     """Run of an entry of batch.json. Raises TypeError, KeyError or AttributeError."""
     known = {name: value for name, value in plain.items() if name in COLUMNS and value is not None}
     return Run(node=plain["id"], **known | {name: json.dumps(known[name]) for name in _OF_JSON if name in known})
-
-
-def _value_of(column: str, text: str, condition: str) -> Any:
-    if column not in _NUMBERS:
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise UsageError(f"--where {condition}: {column} is a number, got {text!r}") from None
-
-
-def _stamp_of(path: Path) -> str:
-    found = path.stat()
-    if not path.is_dir():
-        return f"{found.st_size} {found.st_mtime_ns} {found.st_ino}"
-    lines = [f"{place.relative_to(path)} {(s := place.stat()).st_size} {s.st_mtime_ns}" for place in _files(path)]
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
-
-
-def _files(folder: Path) -> list[Path]:
-    return sorted(place for place in folder.rglob("*") if place.is_file())
 
 
 def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]:
@@ -282,25 +261,18 @@ def code_version() -> str:
     return found.hexdigest()
 
 
-def _said(words: Sequence[str], named: Mapping[str, str]) -> Iterator[str]:
+def _said(words: Sequence[str], named: Mapping[str, str]) -> list[str]:
     """Words that change results, with paths replaced by digests."""
-    longest_first = sorted(named, key=len, reverse=True)
-    skip = False
-    for word in words:
-        if skip or word in ("--force", "--resume", "--quiet", "-q", "--json"):
-            skip = False
-            continue
-        if word.startswith(THREADS):
-            skip = word == THREADS
-            continue
-        said = word
-        for path in longest_first:
-            said = said.replace(path, f"<{named[path]}>")
-        yield said
+    left_out = ("--force", "--resume", "--quiet", "-q", "--json")
+    pairs = zip(words, ("", *words), strict=False)
+    said = [w for w, before in pairs if w not in left_out and before != THREADS and not w.startswith(THREADS)]
+    for path in sorted(named, key=len, reverse=True):
+        said = [word.replace(path, f"<{named[path]}>") for word in said]
+    return said
 
 
 def _digest(path: Path, ledger: Ledger) -> str:
-    """Digest of an input and what it names: an image folder, a URDF's meshes."""
+    """Digest of an input and what it names: images, a URDF's meshes."""
     try:
         digest = ledger.digest(path.parent if path.suffix == ".toml" and path.parent != Path() else path)
         if path.suffix != ".urdf":
@@ -312,7 +284,6 @@ def _digest(path: Path, ledger: Ledger) -> str:
 
 
 def _meshes(urdf: Path) -> Iterator[Path]:
-    """Possible places of a URDF's meshes: next to it, or below a parent."""
     for name in dict.fromkeys(_MESH.findall(urdf.read_text(encoding="utf-8", errors="replace"))):
         if "://" not in name:
             yield urdf.parent / name

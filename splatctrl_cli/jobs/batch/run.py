@@ -56,18 +56,31 @@ class Scheduler:
                     break
                 if any(need not in self.runs for need in node.needs):
                     continue
-                run = self._without_running(node, self.keys[node.name], latest.get(node.name))
+                run = self._reuse_run(node, self.keys[node.name], latest.get(node.name))
                 if run is not None:
                     self._settle(waiting.pop(node.name), run, clock)
                 elif self.ledger.claim(node.name):
-                    run = self._without_running(node, self.keys[node.name], self.ledger.last(node.name))
+                    run = self._reuse_run(
+                        node, self.keys[node.name], next(self.ledger.runs([f"node={node.name}"]), None)
+                    )
                     if run is not None:
                         self.ledger.release(node.name)
                         self._settle(waiting.pop(node.name), run, clock)
                         continue
                     del waiting[node.name]
                     Path(self._place(node, ".end")).unlink(missing_ok=True)
-                    futures[self.executor.submit(run_task, self._task(node, self.keys[node.name]))] = node
+                    task = Task(
+                        entry=self.entry,
+                        words=[*node.words],
+                        key=self.keys[node.name],
+                        out="" if node.out is None else str(node.out.absolute()),
+                        result=self._place(node, ".json"),
+                        log=self._place(node, ".log"),
+                        end=self._place(node, ".end"),
+                        timeout=node.limits.timeout,
+                        memory=node.limits.memory,
+                    )
+                    futures[self.executor.submit(run_task, task)] = node
                 else:
                     is_busy = True
             ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
@@ -94,8 +107,7 @@ class Scheduler:
                 self._settle(node, run, clock)
         return {node.name: self.runs[node.name] for node in nodes}
 
-    def _without_running(self, node: Node, key: str, before: Run | None) -> Run | None:
-        """The run that stands: earlier, unrecorded, or skipped for a missing need."""
+    def _reuse_run(self, node: Node, key: str, before: Run | None) -> Run | None:
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:
             cause = f"needs {lacking[0]}, which left nothing"
@@ -109,7 +121,7 @@ class Scheduler:
         # both stamps are empty after an expected error
         if before is not None and is_same and (node.out is None or before.stamp == stamp_of(node.out)):
             self.num_kept += 1
-            judged = _judged_again(before, node)
+            judged = _judge_again(before, node)
             if judged != before:
                 self.ledger.record(judged)
             return judged
@@ -126,20 +138,7 @@ class Scheduler:
         self.runs[node.name] = run
         line = clock.passed(run)
         if run.started >= clock.started or run.state == SKIPPED:
-            self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
-
-    def _task(self, node: Node, key: str) -> Task:
-        return Task(
-            entry=self.entry,
-            words=[*node.words],
-            key=key,
-            out="" if node.out is None else str(node.out.absolute()),
-            result=self._place(node, ".json"),
-            log=self._place(node, ".log"),
-            end=self._place(node, ".end"),
-            timeout=node.limits.timeout,
-            memory=node.limits.memory,
-        )
+            self.progress.log(f"{line} {node.name}: {describe_run(run)}{clock.left()}")
 
     def _place(self, node: Node, ending: str) -> str:
         return str((self.ledger.folder / node.name).absolute()) + ending
@@ -178,10 +177,10 @@ def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
         version=__version__,
         host=socket.gethostname(),
     )
-    return _judged_again(run, node)
+    return _judge_again(run, node)
 
 
-def _judged_again(run: Run, node: Node) -> Run:
+def _judge_again(run: Run, node: Node) -> Run:
     if run.cause:
         return replace(run, state=ERROR)
     is_expected = node.expect in {run.label, run.outcome, f"exit {run.exit_code}"}
@@ -189,7 +188,7 @@ def _judged_again(run: Run, node: Node) -> Run:
     return replace(run, state=state, expect=node.expect)
 
 
-def told(run: Run) -> str:
+def describe_run(run: Run) -> str:
     if run.state == SKIPPED:
         return f"skipped: {run.cause}"
     what = run.cause or (run.label.upper() if run.outcome else run.label)
@@ -248,11 +247,10 @@ def _end_of(future: "Future[End]") -> End:
     try:
         return future.result()
     except Exception as error:  # of the executor: a worker that died, a machine that is gone
-        return End.without_one("", f"lost: {type(error).__name__}: {error}"[:200])
+        return End(key="", cause=f"lost: {type(error).__name__}: {error}"[:200])
 
 
 def verdict_in(result: Path) -> dict[str, Any]:
-    """Verdict in a command's JSON, else empty."""
     with suppress(OSError, ValueError):
         document = json.loads(result.read_bytes())
         verdict = document.get("verdict") if isinstance(document, dict) else None
@@ -261,4 +259,4 @@ def verdict_in(result: Path) -> dict[str, Any]:
 
 
 def not_run(node: Node, key: str, folder: Path, *, state: str, cause: str) -> Run:
-    return replace(run_of(node, key, End.without_one(key, cause), folder), state=state)
+    return replace(run_of(node, key, End(key=key, cause=cause), folder), state=state)

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.config.ranges import shown
+from splatctrl_cli.config.ranges import format_value
 from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 
 Table = Mapping[str, Any]
 
+_ODD = re.compile(r"[^\w.+-]")  # in no name of a folder
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 SECONDS = {"s": 1, "m": 60, "min": 60, "h": 3600}
 EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
@@ -83,10 +84,10 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
         raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the path") from None
     _check_keys(path.name, document, ("name", "out", "recordings", "jobs"))
     folder = path.absolute().parent
-    name = _text(path.name, document, "name", path.stem)
+    name = _worded(path.name, "name", document.get("name", path.stem))
     jobs = tuple(_job(key, table, commands) for key, table in _tables(path.name, document, "jobs").items())
     tables = _list(path.name, document, "recordings")
-    recordings = _named([one for table in tables for one in _recordings(folder, table)])
+    recordings = _check_names([one for table in tables for one in _recordings(folder, table)])
     if not jobs or not recordings:
         lacking = "the first" if jobs else "the second"
         raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {lacking}")
@@ -94,7 +95,7 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     return Suite(
         name=name,
         folder=folder,
-        out=folder / _text(path.name, document, "out", f"{path.stem}.out"),
+        out=folder / _worded(path.name, "out", document.get("out", f"{path.stem}.out")),
         recordings=tuple(recordings),
         jobs=jobs,
     )
@@ -113,23 +114,23 @@ def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str])
 def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = None) -> Job:
     where = f"[jobs.{name}]"
     if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {shown(table)}")
-    _checked_name(where, name)
-    command = _text(where, table, "command", base.command if base else name)
+        raise UsageError(f"{where}: expected a table, got {format_value(table)}")
+    _check_name(where, name)
+    command = _worded(where, "command", table.get("command", base.command if base else name))
     if command not in commands:
         raise UsageError(
-            f"{where}: no job is called {command!r}", remedy=_near(command, commands, "give command = one of")
+            f"{where}: no job is called {command!r}", remedy=_suggest(command, commands, "give command = one of")
         )
     own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
     if own is not None:
         raise UsageError(f"{where}: a batch gives {own} itself", remedy="leave it out")
     matrix = table.get("matrix", {})
     if not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()):
-        raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {shown(matrix)}")
-    expect = _text(where, table, "expect", base.expect if base else "passed")
+        raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {format_value(matrix)}")
+    expect = _worded(where, "expect", table.get("expect", base.expect if base else "passed"))
     if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
         raise UsageError(
-            f"{where} expect: no verdict is called {expect!r}", remedy=_near(expect, (*EXPECTED, "exit N"))
+            f"{where} expect: no verdict is called {expect!r}", remedy=_suggest(expect, (*EXPECTED, "exit N"))
         )
     limits = base.limits if base else Limits()
     return Job(
@@ -149,14 +150,16 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
 def _recordings(folder: Path, table: Table) -> list[Recording]:
     where = "[[recordings]]"
     if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {shown(table)}", remedy="give it paths = [...]")
+        raise UsageError(f"{where}: expected a table, got {format_value(table)}", remedy="give it paths = [...]")
     _check_keys(where, table, ("name", "paths", "session", "only", "jobs"))
     only = tuple(_worded(where, "only", name) for name in _list(where, table, "only"))
     if ("paths" in table) == ("session" in table):
         raise UsageError(f"{where}: expected paths or session, and not both")
     key = "paths" if "paths" in table else "session"
-    paths = list(dict.fromkeys(path for each in _list(where, table, key) for path in _found(folder, where, each)))
-    name = _text(where, table, "name", "")
+    paths = list(
+        dict.fromkeys(path for each in _list(where, table, key) for path in _find_files(folder, where, each))
+    )
+    name = _worded(where, "name", table.get("name", ""))
     if name and key == "paths" and len(paths) > 1:
         raise UsageError(f"{where} name = {name!r}: {len(paths)} recordings match", remedy="leave the name out")
     each = [tuple(paths)] if key == "session" else [(path,) for path in paths]
@@ -164,23 +167,23 @@ def _recordings(folder: Path, table: Table) -> list[Recording]:
     return [Recording(name=name, paths=files, only=only, overrides=jobs) for files in each]
 
 
-def _found(folder: Path, where: str, pattern: object) -> list[Path]:
+def _find_files(folder: Path, where: str, pattern: object) -> list[Path]:
     places = sorted(glob.glob(_worded(where, "paths", pattern), root_dir=folder, recursive=True))  # noqa: PTH207
     if not places:
         raise InputError(f"{where}: nothing matches {pattern!r} in {folder}", remedy="check the pattern")
     return [folder / place for place in places]
 
 
-def _named(recordings: Sequence[Recording]) -> list[Recording]:
-    """Name the recordings by file, with as many folders, or the ending, as distinguish them."""
+def _check_names(recordings: Sequence[Recording]) -> list[Recording]:
+    """Name the recordings by file, with the folders or ending that distinguish them."""
     files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
-    beside = Counter(map(_without_ending, set(files)))
-    places = [path if beside[_without_ending(path)] > 1 else _without_ending(path) for path in files]
+    beside = Counter(map(_strip_ending, set(files)))
+    places = [path if beside[_strip_ending(path)] > 1 else _strip_ending(path) for path in files]
     # a common name gets the folder's in front
     own = [
         f"{p.parent.name}-{p.name}" if p.name in ("log", "capture", "recording", "data") else p.name for p in places
     ]
-    names = [each.name or _plain(name) for each, name in zip(recordings, own, strict=True)]
+    names = [each.name or _ODD.sub("_", name) for each, name in zip(recordings, own, strict=True)]
     for above in range(max((len(place.parts) - 1 for place in places), default=0)):
         alike: dict[str, list[int]] = {}
         for k, name in enumerate(names):
@@ -188,22 +191,18 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
         for group in alike.values():
             folders = {k: "".join(parent.name for parent in [*places[k].parents][above : above + 1]) for k in group}
             for k in group if len(set(folders.values())) > 1 else ():
-                names[k] = names[k] if recordings[k].name else _plain(f"{folders[k]}-{names[k]}".lstrip("-"))
+                names[k] = names[k] if recordings[k].name else _ODD.sub("_", f"{folders[k]}-{names[k]}".lstrip("-"))
     return [replace(each, name=name) for each, name in zip(recordings, names, strict=True)]
 
 
-def _without_ending(path: Path) -> Path:
+def _strip_ending(path: Path) -> Path:
     return path.with_suffix("") if path.suffix in (".mcap", ".bag", ".db3", ".toml", ".capture") else path
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[^\w.+-]", "_", name)
 
 
 def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> None:
     by_name: dict[str, Recording] = {}
     for recording in recordings:
-        _checked_name("[[recordings]] name", recording.name)
+        _check_name("[[recordings]] name", recording.name)
         other = by_name.setdefault(recording.name, recording)
         if other is not recording:
             both = f"{other.paths[0]} and {recording.paths[0]}"
@@ -213,53 +212,49 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> N
             )
         for job in recording.only:
             if job not in jobs:
-                raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_near(job, jobs))
+                raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_suggest(job, jobs))
         for job in recording.overrides:
             if job not in (recording.only or jobs):
-                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_near(job, jobs))
+                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_suggest(job, jobs))
 
 
 def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:
     for key in table:
         if key not in known:
-            raise UsageError(f"{where}: unknown key {key!r}", remedy=_near(key, known))
+            raise UsageError(f"{where}: unknown key {key!r}", remedy=_suggest(key, known))
 
 
-def _near(word: str, known: Sequence[str], otherwise: str = "known here") -> str:
+def _suggest(word: str, known: Sequence[str], otherwise: str = "known here") -> str:
     return did_you_mean(word, known, f"{otherwise}: {', '.join(known)}")
 
 
-def _checked_name(where: str, name: str) -> None:
+def _check_name(where: str, name: str) -> None:
     if not re.fullmatch(r"\w[\w.+-]*", name):
         raise UsageError(f"{where}: {name!r} is no name of a folder", remedy="use letters, digits, . _ + -")
 
 
-def _text(where: str, table: Table, key: str, default: str) -> str:
-    return _worded(where, key, table.get(key, default))
-
-
 def _worded(where: str, key: str, value: object) -> str:
     if not isinstance(value, str):
-        raise UsageError(f"{where} {key}: expected text, got {shown(value)}")
+        raise UsageError(f"{where} {key}: expected text, got {format_value(value)}")
     return value
 
 
 def _list(where: str, table: Table, key: str) -> list[Any]:
     value = table.get(key, [])
     if not isinstance(value, list) or (key in table and not value):
-        raise UsageError(f"{where} {key}: expected a list, got {shown(value)}")
+        raise UsageError(f"{where} {key}: expected a list, got {format_value(value)}")
     return value
 
 
 def _tables(where: str, table: Table, key: str) -> dict[str, Table]:
     value = table.get(key, {})
     if not isinstance(value, dict) or not all(isinstance(each, dict) for each in value.values()):
-        raise UsageError(f"{where} {key}: expected [{key}.NAME], got {shown(value)}")
+        raise UsageError(f"{where} {key}: expected [{key}.NAME], got {format_value(value)}")
     return value
 
 
 def _amount(where: str, table: Table, key: str, units: Mapping[str, int], default: float) -> float:
-    """Parse a number, or text such as "10 min" or "4GiB"."""
+    """Parse a number, "10 min" or "4GiB"."""
     value = table.get(key, default)
     match = re.fullmatch(r"\s*([\d.]+)\s*(\w+)\s*", value) if isinstance(value, str) else None
     try:
@@ -268,5 +263,5 @@ def _amount(where: str, table: Table, key: str, units: Mapping[str, int], defaul
         amount = -1.0
     if isinstance(value, bool) or not 0 <= amount < 1e15:
         example = f" or with one of {', '.join(units)}" if units else ""
-        raise UsageError(f"{where} {key}: expected a number, 0 or more{example}, got {shown(value)}")
+        raise UsageError(f"{where} {key}: expected a number, 0 or more{example}, got {format_value(value)}")
     return amount

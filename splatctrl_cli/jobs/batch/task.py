@@ -1,7 +1,7 @@
 """One node's run in a forked child under limits, with log, result and end.
 
-A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time, each a
-line of JSON from stdin, and ends with stdin.
+A runner has imported the commands, so a node costs a fork. It runs one node at a time, a line of JSON from stdin, and
+ends with stdin.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
@@ -40,7 +40,7 @@ BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # reported by the batc
 class Task:
     """Work of a runner: call `entry` with `words`, write `result` (stdout), `log` (stderr), `end`.
 
-    key: the node's, kept in `end`. timeout [s], memory [bytes]: 0 for no limit. Plain values, for other machines.
+    key: the node's, kept in `end`. timeout [s], memory [bytes]: 0 for no limit.
     """
 
     entry: str
@@ -56,23 +56,18 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """The end of a run; exit_code is None if it was killed, for `cause`.
+    """The end of a run; exit_code is None if it was killed, or never completed, for `cause`.
 
     started [s since 1970]. stamp: of the output, changes when rewritten.
     """
 
     key: str
-    exit_code: int | None
+    exit_code: int | None = None
     cause: str
-    started: float
-    seconds: float
-    peak_mb: float
-    stamp: str
-
-    @classmethod
-    def without_one(cls, key: str, cause: str) -> "End":
-        """End of a task that never completed."""
-        return cls(key=key, exit_code=None, cause=cause, started=time.time(), seconds=0.0, peak_mb=0.0, stamp="")
+    started: float = field(default_factory=time.time)
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    stamp: str = ""
 
 
 def run_task(task: Task) -> End:
@@ -86,7 +81,7 @@ def run_task(task: Task) -> End:
     for _ in range(2):
         runner = getattr(_local, "runner", None)
         if runner is None or runner.poll() is not None:
-            runner = _local.runner = _started(task.entry)
+            runner = _local.runner = _start(task.entry)
         assert runner.stdin is not None and runner.stdout is not None
         try:
             runner.stdin.write(json.dumps(asdict(task)) + "\n")
@@ -97,10 +92,10 @@ def run_task(task: Task) -> End:
         if line:
             return End(**json.loads(line))
         if runner not in _runners:  # ended by stop_runners: another would only delay the end of the batch
-            return End.without_one(task.key, "ended with its batch")
+            return End(key=task.key, cause="ended with its batch")
         runner.kill()
         runner.wait()
-    return End.without_one(task.key, "its runner was killed twice")
+    return End(key=task.key, cause="its runner was killed twice")
 
 
 def stop_runners() -> None:
@@ -148,7 +143,7 @@ def last_lines(log: Path, number: int = 5) -> list[str]:
     return [line for line in lines if line.strip()][-number:]
 
 
-def _started(entry: str) -> "subprocess.Popen[str]":
+def _start(entry: str) -> "subprocess.Popen[str]":
     words = [sys.executable, "-m", __name__, entry]
     told = {name: value for name, value in os.environ.items() if name not in BY_THE_BATCH}
     environment = {**told, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -208,7 +203,7 @@ def _run(function: Entry, task: Task) -> End:
 
 
 def _clear(task: Task) -> None:
-    """Remove outputs of another key, lest they be taken for this run's."""
+    """Remove outputs of another key."""
     begun = Path(task.end).with_suffix(".begun")
     if begun.is_file() and begun.read_text() != task.key and task.out:
         remove(Path(task.out))
@@ -217,7 +212,6 @@ def _clear(task: Task) -> None:
 
 
 def _be_child(function: Entry, task: Task) -> NoReturn:
-    """Run the words in a session of their own, and exit."""
     code = 70
     try:
         os.setsid()
@@ -267,7 +261,7 @@ def _wait(pid: int, task: Task) -> str:
 
 
 def _signal(pid: int, number: signal.Signals) -> None:
-    """Signal a child's group, or the child alone before it has one."""
+    """Signal a child's group, or the child before it has one."""
     try:
         os.killpg(pid, number)
     except ProcessLookupError:
@@ -275,7 +269,7 @@ def _signal(pid: int, number: signal.Signals) -> None:
 
 
 def _memory_of(pid: int) -> int:
-    """Resident memory of a process [bytes], 0 if gone."""
+    """Resident memory [bytes], 0 if gone."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError):

@@ -52,8 +52,7 @@ class CompareRequest:
 class FigureChange:
     """One figure of one run; `after` is None if it lost its value.
 
-    allowed: tolerance, in `unit`. share: by how many tolerances it is worse, infinite without one. where: worst state
-    of a replay.
+    allowed: tolerance, in `unit`. share: tolerances by which it is worse. where: worst state of a replay.
     """
 
     run: str
@@ -80,17 +79,6 @@ class FigureChange:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerdictChange:
-    """Verdict labels of a run before and after."""
-
-    run: str
-    recording: str
-    before: str
-    after: str
-    change: Change
-
-
-@dataclass(frozen=True, kw_only=True)
 class JobChange:
     """One figure of a job over the recordings: mean harm, and the worst recording."""
 
@@ -105,14 +93,14 @@ class JobChange:
 class CompareResult:
     """Changes of figures, verdicts and jobs, regressions first.
 
-    jobs: over enough recordings; they then decide in place of the figures. differences: settings, versions and
-    inputs, before and after. only_before: not compared.
+    verdicts: run, recording, change, and labels before and after. jobs: over enough recordings, which decide in place
+    of figures. differences: settings, versions and inputs, before and after. only_before: not compared.
     """
 
     __repr__ = brief
 
     verdict: Verdict
-    verdicts: tuple[VerdictChange, ...]
+    verdicts: tuple[Mapping[str, str], ...]
     figures: tuple[FigureChange, ...]
     jobs: tuple[JobChange, ...]
     differences: Mapping[str, tuple[str, str]]
@@ -124,7 +112,7 @@ class CompareResult:
     def as_dict(self) -> dict[str, Any]:
         return {
             "metrics": dict(self.metrics),
-            "verdicts": [asdict(one) for one in self.verdicts],
+            "verdicts": list(self.verdicts),
             "figures": [
                 asdict(one) | {"share": one.share if math.isfinite(one.share) else None} for one in self.figures
             ],
@@ -148,7 +136,7 @@ class CompareResult:
 def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResult:
     """Compare, and write a requested baseline.
 
-    Raises UsageError for another form of request, InputError for unreadable or unlike runs.
+    Raises UsageError for another request, InputError for unreadable or unlike runs.
     """
     num_needed = 1 if request.against is not None else 2
     if len(request.runs) != num_needed and not (len(request.runs) == 1 and request.update_baseline is not None):
@@ -156,7 +144,7 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
     after = read_judged(request.runs[-1])
     before = read_baseline(request.against) if request.against is not None else read_judged(request.runs[0])
     _check_alike(before, after)
-    result = _compared(before, after)
+    result = _compare(before, after)
     if request.update_baseline is not None:
         write_baseline(request.update_baseline, after)
         progress.log(f"wrote {request.update_baseline}")
@@ -164,7 +152,6 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
 
 
 def _check_alike(before: Judged, after: Judged) -> None:
-    """Raise InputError for runs of another kind or command, or without a common recording."""
     if before.kind != after.kind:
         raise InputError(f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}")
     if before.kind == "run" and before.runs.keys() != after.runs.keys():
@@ -172,7 +159,7 @@ def _check_alike(before: Judged, after: Judged) -> None:
         raise InputError(f"{after.path}: expected a run of {expected}, as {before.path} is, got one of {got}")
     common = [name for name in before.runs if name in after.runs]
     if not common:
-        expected, got = (_named([*judged.runs]) or "none" for judged in (before, after))
+        expected, got = (_list_names([*judged.runs]) or "none" for judged in (before, after))
         raise InputError(
             f"{after.path}: expected some of the runs of {before.path} ({expected}), got {got}",
             remedy="compare runs of the same recordings",
@@ -184,12 +171,12 @@ def _check_alike(before: Judged, after: Judged) -> None:
         lost = sorted(old.metrics.keys() - new.metrics.keys())
         if before.is_baseline and new.outcome and lost:
             raise InputError(
-                f"{before.path}: {name}: has figures that this run has not: {_named(lost)}",
+                f"{before.path}: {name}: has figures that this run has not: {_list_names(lost)}",
                 remedy="run it with the options of then, or write the baseline anew with --update-baseline",
             )
 
 
-def _compared(before: Judged, after: Judged) -> CompareResult:
+def _compare(before: Judged, after: Judged) -> CompareResult:
     pairs = [(old, after.runs[name]) for name, old in before.runs.items() if name in after.runs]
     only_before = tuple(sorted(before.runs.keys() - after.runs.keys()))
     verdicts = [change for old, new in pairs if (change := _verdict_change(old, new)) is not None]
@@ -203,28 +190,43 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
         "num_runs": len(pairs),
         "num_verdicts": sum(bool(old.outcome and new.outcome) for old, new in pairs),
         "num_figures": sum(one.better is not Better.NEITHER for one in found),
-        "num_verdicts_worse": sum(one.change is Change.WORSE for one in verdicts),
-        "num_verdicts_better": sum(one.change is Change.BETTER for one in verdicts),
+        "num_verdicts_worse": sum(one["change"] is Change.WORSE for one in verdicts),
+        "num_verdicts_better": sum(one["change"] is Change.BETTER for one in verdicts),
         "num_worse": len(alone) + sum(one.change is Change.WORSE for one in jobs),
         "num_better": sum(one.change is Change.BETTER for one in found),
     }
     weighed = [
-        *((-one.share, one.metric, _of_figure(one, after.kind)) for one in alone),
-        *((-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE),
+        *((-one.share, one.metric, _figure_reason(one, after.kind)) for one in alone),
+        *((-one.worst.share, one.metric, _job_reason(one)) for one in jobs if one.change is Change.WORSE),
     ]
     ordered = sorted(weighed, key=lambda one: one[:2])
-    reasons = [*_of_verdicts(verdicts, after), *(reason for *_, reason in ordered), *_of_single(jobs)]
-    lone = ((before, only_before), (after, only_after))
-    reasons += [
-        note(criterion="runs", sentence=f"only in {side.path}: {_named(names)}") for side, names in lone if names
+    single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
+    more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
+    notes = {
+        "single recordings": [f"{one.metric} of {one.worst.run}: {one.worst.sentence}{more}" for one in single[:1]],
+        "runs": [
+            f"only in {side.path}: {_list_names(names)}"
+            for side, names in ((before, only_before), (after, only_after))
+            if names
+        ],
+    }
+    num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
+    counted = f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
+    reasons = [
+        note(criterion="comparison", sentence=counted)
+        if num_figures or num_verdicts
+        else lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides"),
+        *_verdict_reasons(verdicts, after),
+        *(reason for *_, reason in ordered),
+        *(note(criterion=name, sentence=sentence) for name, sentences in notes.items() for sentence in sentences),
     ]
     return CompareResult(
         verdict=verdict_of(
             "compare",
-            [_overall(metrics), *reasons],
+            reasons,
             scope=f"{before.path} -> {after.path}",
             passed="no regression",
-            notes=[f"not compared, only in {before.path}: {_named(only_before)}"] if only_before else [],
+            notes=[f"not compared, only in {before.path}: {_list_names(only_before)}"] if only_before else [],
             counts=metrics,
         ),
         verdicts=tuple(verdicts),
@@ -242,23 +244,18 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
     )
 
 
-def _overall(metrics: Mapping[str, int]) -> Reason:
-    num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
-    if not num_figures and not num_verdicts:
-        return lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides")
-    return note(
-        criterion="comparison",
-        sentence=f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}",
-    )
-
-
-def _verdict_change(old: JudgedRun, new: JudgedRun) -> VerdictChange | None:
-    if old.is_green == new.is_green and (old.outcome, old.label) == (new.outcome, new.label):
+def _verdict_change(old: JudgedRun, new: JudgedRun) -> dict[str, str] | None:
+    is_other = old.is_green != new.is_green
+    if not is_other and (old.outcome, old.label) == (new.outcome, new.label):
         return None
-    change = Change.OTHER
-    if old.is_green != new.is_green:
-        change = Change.WORSE if old.is_green else Change.BETTER
-    return VerdictChange(run=new.name, recording=new.recording, before=old.label, after=new.label, change=change)
+    change = Change.OTHER if not is_other else Change.WORSE if old.is_green else Change.BETTER
+    return {
+        "run": new.name,
+        "recording": new.recording,
+        "before": old.label,
+        "after": new.label,
+        "change": change,
+    }
 
 
 def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
@@ -266,7 +263,7 @@ def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
         if before is None or metric not in new.metrics or not new.outcome:
             continue
         scale, after = scales()[new.command][metric], new.metrics[metric]
-        change, share = _judged(scale, before, after)
+        change, share = _judge(scale, before, after)
         yield FigureChange(
             run=new.name,
             recording=new.recording,
@@ -283,8 +280,7 @@ def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
         )
 
 
-def _judged(scale: Scale, before: float, after: float | None) -> tuple[Change, float]:
-    """Change of a figure, and by how many tolerances it is worse."""
+def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, float]:
     if after is None:
         return (Change.OTHER, 0.0) if scale.better is Better.NEITHER else (Change.WORSE, math.inf)
     harm, allowed = scale.harm(before, after), scale.tolerance(before)
@@ -296,9 +292,8 @@ def _judged(scale: Scale, before: float, after: float | None) -> tuple[Change, f
 
 
 def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
-    """Changes of figures with enough recordings.
-
-    Worse or better if the whole interval is, and the mean exceeds the mean tolerance.
+    """Changes of figures with enough recordings: the whole interval is on one side, and the mean exceeds the mean
+    tolerance.
     """
     by_job: dict[tuple[str, str], list[FigureChange]] = {}
     for one in found:
@@ -310,37 +305,35 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
         if harm is None:
             continue
         allowed = sum(one.allowed for one in changes) / len(changes)
-        change = Change.SAME
-        if harm.low > 0 and harm.mean > allowed:
-            change = Change.WORSE
-        elif harm.high < 0 and -harm.mean > allowed:
-            change = Change.BETTER
+        is_worse, is_better = harm.low > 0 and harm.mean > allowed, harm.high < 0 and -harm.mean > allowed
+        change = Change.WORSE if is_worse else Change.BETTER if is_better else Change.SAME
         yield JobChange(
             job=job, metric=metric, harm=harm, change=change, worst=max(changes, key=lambda one: one.share)
         )
 
 
-def _of_verdicts(verdicts: Sequence[VerdictChange], after: Judged) -> Iterator[Reason]:
+def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: Judged) -> Iterator[Reason]:
     for one in verdicts:
-        words = f"{one.run}: the verdict went from '{one.before}' to '{one.after}'"
-        if one.change is not Change.WORSE:
-            better = ", an improvement" if one.change is Change.BETTER else ""
-            yield note(criterion=f"verdict of {one.run}", sentence=words + better)
+        name = f"verdict of {one['run']}"
+        words = f"{one['run']}: the verdict went from '{one['before']}' to '{one['after']}'"
+        if one["change"] is not Change.WORSE:
+            better = ", an improvement" if one["change"] is Change.BETTER else ""
+            yield note(criterion=name, sentence=words + better)
             continue
-        why = next((reason for reason in after.runs[one.run].reasons if reason["outcome"] != "passed"), None)
+        why = next((reason for reason in after.runs[one["run"]].reasons if reason["outcome"] != "passed"), None)
         yield failed(
-            criterion=f"verdict of {one.run}",
+            criterion=name,
             sentence=words if why is None else f"{words}: {why['criterion']}: {why['sentence']}",
             time_s=None if why is None else why["time_s"],
             place=None if why is None or why["place"] is None else tuple(why["place"]),
-            who=one.recording,
+            who=one["recording"],
             cause="" if why is None else why["cause"],
             remedy="" if why is None else why["remedy"],
             label=REGRESSION,
         )
 
 
-def _of_figure(one: FigureChange, kind: str) -> Reason:
+def _figure_reason(one: FigureChange, kind: str) -> Reason:
     return failed(
         criterion=one.metric if kind == "run" else f"{one.metric} of {one.run}",
         sentence=one.sentence,
@@ -354,7 +347,7 @@ def _of_figure(one: FigureChange, kind: str) -> Reason:
     )
 
 
-def _of_job(one: JobChange) -> Reason:
+def _job_reason(one: JobChange) -> Reason:
     harm, worst, unit = one.harm, one.worst, f" {one.worst.unit}" if one.worst.unit else ""
     words = f"{one.job}: {one.metric} is worse by {harm.mean:.3g}{unit} in the mean of {harm.num_pairs} recordings"
     interval = f"{100 * CONFIDENCE:g} % interval {harm.low:.3g} to {harm.high:.3g}"
@@ -372,27 +365,17 @@ def _of_job(one: JobChange) -> Reason:
     )
 
 
-def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
-    if single := [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]:
-        first = single[0]
-        more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
-        yield note(
-            criterion="single recordings",
-            sentence=f"{first.metric} of {first.worst.run}: {first.worst.sentence}{more}",
-        )
-
-
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
-    """Differing settings, versions and inputs, before and after in the first such run."""
+    """Differing settings, versions and inputs, of the first such run."""
     found: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
-        for name in [name for name in old.settings if name in new.settings]:
-            values = str(old.settings[name]), str(new.settings[name])
+        for name, value in old.settings.items():
+            values = str(value), str(new.settings.get(name, value))
             if values[0] != values[1]:
                 found.setdefault(name, values)
     return found
 
 
-def _named(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     more = len(names) - MOST_NAMES
     return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")

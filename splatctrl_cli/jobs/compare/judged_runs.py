@@ -30,7 +30,6 @@ REPLAY_FIELDS = ("exact", "barrier", "certified")
 
 @cache
 def scales() -> Mapping[str, Mapping[str, Scale]]:
-    """Comparison scale of each figure, by command and name."""
     by_mode = [metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True) for mode in MODES]
     return {
         "reconstruct": reconstruct_verdict.GATED,
@@ -43,7 +42,6 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
 
 @cache
 def shown() -> Mapping[str, Shown]:
-    """Columns of a replay's ``steps.csv`` for its figures."""
     return {name: where for mode in MODES for name, where in shown_metrics(mode, REPLAY_FIELDS).items()}
 
 
@@ -103,14 +101,13 @@ def read_judged(path: Path) -> Judged:
     return Judged(
         path=path,
         kind="run",
-        runs={command: _judged_run(command, path.absolute().name, command, command, run.run, path)},
+        runs={command: _read_run(command, path.absolute().name, command, command, run.run, path)},
     )
 
 
-def _judged_run(
+def _read_run(
     name: str, recording: str, job: str, command: str, document: Mapping[str, Any], folder: Path | None
 ) -> JudgedRun:
-    """Run of ``run.json``, or of --json output (`folder` is None)."""
     verdict, known = document["verdict"], scales().get(command, {})
     metrics = document["metrics"] if isinstance(document.get("metrics"), dict) else {}
     return JudgedRun(
@@ -142,7 +139,7 @@ def _nodes_of(batch: BatchFolder) -> Iterator[JudgedRun]:
         document = open_run(folder).run if has_run else read_object(printed) if printed.is_file() else {}
         if ran.outcome and isinstance(document.get("verdict"), dict):
             yield replace(
-                _judged_run(ran.node, ran.recording, job, command, document, folder if has_run else None),
+                _read_run(ran.node, ran.recording, job, command, document, folder if has_run else None),
                 is_green=is_green,
             )
         else:
@@ -278,7 +275,7 @@ def worst_state(folder: Path | None, metric: str) -> WorstState | None:
 
 
 def _badness(where: Shown, text: str) -> float:
-    """Rank a cell: smaller is worse, infinite does not count."""
+    """Rank a cell: smaller is worse."""
     if where.pick not in ("least", "largest"):
         return 0.0 if text == where.pick else math.inf
     if not text:

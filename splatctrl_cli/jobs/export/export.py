@@ -6,11 +6,10 @@ Written splats are read back and rendered before they count.
 import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import methodcaller
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +37,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
-from splatctrl_cli.jobs.score.views import rendered
+from splatctrl_cli.jobs.score.views import render_splats
 from splatctrl_cli.recording.container.mcap_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
 
@@ -66,9 +65,8 @@ class ExportResult:
     """The written file and its differences from the source.
 
     origin: subtracted from every centre [m], in words. not_kept: attributes the format lacks. num_outside: Gaussians
-    with sigma or colour clamped to its range. allowed: the format's rounding. Over all views:
-    largest_pixel_difference in colour, opacity, or depth over scene size; psnr [dB], None if equal; covered_share,
-    where anything shows. isotropic_psnr [dB]: of the rounded splats.
+    clamped to the range. allowed: the format's rounding. Over all views: largest_pixel_difference in colour, opacity,
+    or depth over scene size; psnr [dB], None if equal; covered_share. isotropic_psnr [dB]: of the rounded splats.
     """
 
     file: Path
@@ -89,15 +87,12 @@ class ExportResult:
     isotropic_psnr: float | None
     was_rounded: bool
 
-    def as_dict(self) -> dict[str, Any]:
-        return {name: value for name, value in asdict(self).items() if name != "was_rounded"}
-
 
 def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     """Write the splats, read them back and compare.
 
     Raises UsageError, InputError or NotEvaluableError for unsuitable splats. Raises WriteError, leaving no file, for
-    errors above the format's rounding, or an exact format that looks different.
+    errors above the format's rounding.
     """
     source = _splat_file(request.scene)
     out = request.out or _beside(request.scene)
@@ -122,12 +117,12 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=request.force, is_folder=False) as partial:
         kept |= {"exported_from": f"{name} sha256 {sha256(source)}"}
-        back, said = _written(partial, kind, chosen, kept)
+        back, said = _write_scene(partial, kind, chosen, kept)
         before, after = _gaussians(chosen), _gaussians(back)
         held, bound = kind.held(before), kind.bound(before)
         bound = replace(bound, center=bound.center + float(np.abs(exact - before.centers).max()))
-        found = _checked_differences(out, held, after, bound, exact)
-        largest, psnr, covered = _checked_look(out, kind, chosen, back)
+        found = _check_differences(out, held, after, bound, exact)
+        largest, psnr, covered = _check_look(out, kind, chosen, back)
         return ExportResult(
             file=out,
             format=kind.name,
@@ -170,16 +165,15 @@ def _format(out: Path, layout: str | None) -> SplatFormat:
 
 
 def _check_colors(source: Path, splats: Splats) -> None:
-    """Raise InputError for a colour so large that float32 would lose the others."""
+    """Raise InputError for a colour so large that float32 loses others."""
     colors = splats.colors if isinstance(splats, SplatSet) else splats.harmonics.reshape(len(splats), -1)
     largest = np.abs(colors).max(axis=1, initial=0.0)
     refuse(str(source), "colour", largest, largest > EXPORT_MAX_COLOR, f"at most {EXPORT_MAX_COLOR:g}")
 
 
-def _written(
+def _write_scene(
     partial: Path, kind: SplatFormat, splats: Splats, comments: Mapping[str, str]
 ) -> tuple[Splats, Comments]:
-    """Write the splats and read them back; isotropic ones in a PLY keep their density."""
     if isinstance(splats, SplatSet) and kind is FORMATS[".ply"]:
         write_ply(partial, splats, comments)
         return read_ply(partial)
@@ -192,7 +186,7 @@ def _gaussians(splats: Splats) -> GaussianSet:
     return as_gaussians(splats) if isinstance(splats, SplatSet) else splats
 
 
-def _checked_differences(
+def _check_differences(
     out: Path, held: GaussianSet, back: GaussianSet, bound: Differences, exact: Float64
 ) -> Differences:
     if len(held) != len(back) or not np.array_equal(held.labels, back.labels):
@@ -203,7 +197,7 @@ def _checked_differences(
     return found
 
 
-def _checked_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> tuple[float, float | None, float]:
+def _check_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> tuple[float, float | None, float]:
     largest, psnr, covered = _look(source, back)
     looks_the_same = psnr is None or psnr >= EXPORT_MIN_PSNR
     if not kind.is_rounded and not (looks_the_same and largest <= EXPORT_DIFFERENCE):
@@ -215,14 +209,15 @@ def _checked_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) ->
 
 
 def _not_kept(source: Splats, back: Splats, held: GaussianSet) -> list[str]:
-    lost = []
-    if (source.labels != back.labels).any():
-        lost.append("labels")
-    if isinstance(source, SplatSet) and isinstance(back, SplatSet) and (source.density != back.density).any():
-        lost.append("density")
-    if isinstance(source, GaussianSet) and held.harmonics.shape[1] < source.harmonics.shape[1]:
-        lost.append("view-dependent colour")
-    return lost
+    lost = {
+        "labels": (source.labels != back.labels).any(),
+        "density": isinstance(source, SplatSet)
+        and isinstance(back, SplatSet)
+        and (source.density != back.density).any(),
+        "view-dependent colour": isinstance(source, GaussianSet)
+        and held.harmonics.shape[1] < source.harmonics.shape[1],
+    }
+    return [name for name, is_lost in lost.items() if is_lost]
 
 
 def _num_outside(source: GaussianSet, held: GaussianSet) -> int:
@@ -232,11 +227,11 @@ def _num_outside(source: GaussianSet, held: GaussianSet) -> int:
 
 
 def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
-    """Render both sets around `a`: largest difference, PSNR, covered share."""
+    """Largest difference, PSNR and covered share of renders around `a`."""
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:
-        one, two = (rendered(splats, intrinsics, T_world_camera) for splats in (a, b))
+        one, two = (render_splats(splats, intrinsics, T_world_camera) for splats in (a, b))
         pairs = ((one.color, two.color), (one.opacity, two.opacity), (one.depth / size, two.depth / size))
         largest = max(largest, *(float(np.abs(x.astype(np.float64) - y).max()) for x, y in pairs))
         covered += float(np.mean(one.opacity > 0)) / len(poses)
@@ -245,7 +240,7 @@ def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
 
 
 def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
-    """Cameras around and above the box of most splats, and its diagonal [m]."""
+    """Cameras around most splats, and their diagonal [m]."""
     lower, upper = np.percentile(centers.astype(np.float64), [2, 98], axis=0)
     middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
     width, height = 320, 240
@@ -293,7 +288,7 @@ def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:
     elif (run.path / "field.npz").is_file():
         yield 0, 0, partial(_field, 0, run.parts.checked(run.path / "field.npz"))
     elif (run.path / "splats.ply").is_file():
-        yield from _known_parts([(snapshot.stamp_ns, snapshot) for snapshot in open_scene(run.path).snapshots])
+        yield from _space_parts([(snapshot.stamp_ns, snapshot) for snapshot in open_scene(run.path).snapshots])
     else:
         raise InputError(f"{run.path}: {run.command} leaves nothing to log", remedy="give a replay, scene or field")
 
@@ -303,7 +298,7 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
     grid = run.option("--field")
     if grid is None:
         known = sets_known(run, states, scene_of(run, roots))
-        yield from _known_parts([(start + round(1e9 * time_s), snapshot) for time_s, snapshot in known])
+        yield from _space_parts([(start + round(1e9 * time_s), snapshot) for time_s, snapshot in known])
     elif (place := run.place_of(grid, roots)) is not None:
         yield start, 0, partial(_field, start, place / "field.npz" if place.is_dir() else place)
     robot = robot_of(run, states, roots)
@@ -324,7 +319,7 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
             yield int(event["first_ns"]), 4, methodcaller("add_line", EVENTS, int(event["first_ns"]), level, told)
 
 
-def _known_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:
+def _space_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:
     few = {known[i][0] for i in spread([1e-9 * (stamp - known[0][0]) for stamp, _ in known], math.inf)}
     for stamp, snapshot in known:
         yield stamp, 0, partial(_cloud, stamp, snapshot)

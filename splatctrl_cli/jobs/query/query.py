@@ -1,13 +1,12 @@
 """A query: answers of a field or scene at points of a table."""
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.ply import point_blocks
 from splatctrl_cli.formats.scene.scene_folder import run_value
 from splatctrl_cli.jobs.bake.request import BakeSource, read_bake_source, source_of_grid
-from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen, named
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, choose_device, explain_fault
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory
 from splatctrl_cli.records import Bool, Box, DistanceField, DistanceGrid, Float64, Label
@@ -210,9 +209,9 @@ OF_GRID = {  # field settings: name and type in a grid's header
 class QueryRequest(RunOptions):
     """One table of points for `source`: a field folder, ``field.npz``, scene folder or splat file.
 
-    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: source of the
-    field, for what the grid lacks. at: time after the scene's start [s], None for its end. labels: of the splats that
-    count. device: for a scene's distances.
+    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: the field's
+    source, for what the grid lacks. at: time after the scene's start [s], None for its end. labels: of splats that
+    count.
     """
 
     source: Path
@@ -228,7 +227,7 @@ class QueryResult:
     """A query's figures; kind: scene, field, or field and scene.
 
     metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision; num_never_seen;
-    min_distance, mean_distance and min_bound [m]. None if unknown.
+    min_distance, mean_distance, min_bound [m]; None if unknown.
     """
 
     out: Path | None
@@ -243,7 +242,7 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
 
     Raises SplatCtrlError, leaving no file, for an unreadable source or table.
     """
-    stopwatch, figures = Stopwatch(), _Figures()
+    stopwatch, figures = Stopwatch(), list[dict[str, Any]]()
     with ExitStack() as stack:
         out: TextIO | None = None
         if request.out is not None:
@@ -251,21 +250,22 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
             out = stack.enter_context(partial.open("w", encoding="utf-8", newline=""))
             out.write(",".join(TITLES) + "\n")
         with stopwatch.stage("read"):
-            asked = _asked(request, progress)
+            asked = _open_source(request, progress)
         with stopwatch.stage("answer"):
             for points in _blocks(request.points, progress):
                 try:
                     answers = asked.at(points)
                 except DeviceError as error:
-                    raise named(error, asked.device) from error
-                figures.add(answers)
+                    raise explain_fault(error, asked.device) from error
+                figures.append(_figures_of(answers))
                 if out is not None:
                     out.write(rows_of(points, answers))
+    metrics = _metrics_of(figures)
     return QueryResult(
         out=request.out,
         kind=asked.kind,
-        metrics=figures.metrics(),
-        notes=figures.notes(asked),
+        metrics=metrics,
+        notes=_notes_of(asked, metrics),
         seconds=stopwatch.seconds,
     )
 
@@ -281,7 +281,7 @@ class _Asked:
     device: Device | None = None
 
 
-def _asked(request: QueryRequest, progress: Progress) -> _Asked:
+def _open_source(request: QueryRequest, progress: Progress) -> _Asked:
     file = _grid_file(request.source)
     if file is None:
         if request.scene is not None:
@@ -289,7 +289,7 @@ def _asked(request: QueryRequest, progress: Progress) -> _Asked:
                 f"--scene: belongs to a field, and {request.source} is a scene", remedy="leave --scene out"
             )
         source = read_bake_source(request.source, request.at)
-        device = chosen(request.device, _is_enough(request.points), progress)
+        device = choose_device(request.device, _is_enough(request.points), progress)
         scene = _scene(source, request, request.labels, request.config, device)
         return _Asked(kind="scene", at=scene.at, box=source.workspace, device=device)
     if request.at is not None:
@@ -307,7 +307,7 @@ def _asked(request: QueryRequest, progress: Progress) -> _Asked:
     )
     baked = {name: run_value(grid.header, (key,), kind, where=where) for name, (key, kind) in OF_GRID.items()}
     config = replace(request.config, field=replace(request.config.field, unknown="free", **baked))
-    device = chosen(request.device, _is_enough(request.points), progress)
+    device = choose_device(request.device, _is_enough(request.points), progress)
     both = _scene(source_of_grid(where, grid, request.scene), request, labels, config, device)
 
     def at(points: Float64) -> Answers:
@@ -321,7 +321,7 @@ def _is_enough(points: Path | TextIO) -> bool:
 
 
 def _grid_file(source: Path) -> Path | None:
-    """``field.npz`` of a field, None for a scene. Raises InputError for a field without it."""
+    """``field.npz`` of a field, None for a scene."""
     if source.is_file() and source.suffix == ".npz":
         return source
     file = source / "field.npz"
@@ -362,52 +362,49 @@ def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
                 wait.at(raw.tell())
 
 
-class _Figures:
-    def __init__(self) -> None:
-        self._num = Counter[str]()
-        self._sum, self._least, self._least_bound = 0.0, np.inf, np.inf
-        self._knows_seen = True
+def _figures_of(answers: Answers) -> dict[str, Any]:
+    distance = answers.distance[~np.isnan(answers.distance)]
+    bounds = distance[:0] if answers.bound is None else answers.bound[~np.isnan(answers.bound)]
+    is_seen_known = answers.observed is not None
+    return {
+        "num_points": len(answers.distance),
+        "num_answered": len(distance),
+        "num_outside": 0 if answers.in_box is None else int(np.count_nonzero(~answers.in_box)),
+        "num_in_collision": int(np.count_nonzero(distance <= 0)),
+        "num_never_seen": int(np.count_nonzero(answers.observed == VoxelState.NEVER_SEEN)) if is_seen_known else None,
+        "sum": float(distance.sum()),
+        "min_distance": float(distance.min(initial=np.inf)),
+        "min_bound": float(bounds.min(initial=np.inf)),
+    }
 
-    def add(self, answers: Answers) -> None:
-        distance = answers.distance[~np.isnan(answers.distance)]
-        bounds = distance[:0] if answers.bound is None else answers.bound[~np.isnan(answers.bound)]
-        self._num.update(
-            points=len(answers.distance),
-            answered=len(distance),
-            in_collision=int(np.count_nonzero(distance <= 0)),
-            outside=0 if answers.in_box is None else int(np.count_nonzero(~answers.in_box)),
-            never_seen=int(np.count_nonzero(answers.observed == VoxelState.NEVER_SEEN)),
+
+def _metrics_of(figures: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+    counts = ("num_points", "num_answered", "num_outside", "num_in_collision")
+    num: dict[str, float | None] = {name: sum(each[name] for each in figures) for name in counts}
+    seen = [each["num_never_seen"] for each in figures]
+    least = {name: min((each[name] for each in figures), default=np.inf) for name in ("min_distance", "min_bound")}
+    num_answered = num["num_answered"]
+    return {
+        **num,
+        "num_never_seen": None if None in seen else sum(seen),
+        "min_distance": least["min_distance"] if num_answered else None,
+        "mean_distance": sum(each["sum"] for each in figures) / num_answered if num_answered else None,
+        "min_bound": least["min_bound"] if np.isfinite(least["min_bound"]) else None,
+    }
+
+
+def _notes_of(asked: _Asked, metrics: Mapping[str, float | None]) -> tuple[str, ...]:
+    num, notes = {name: int(value or 0) for name, value in metrics.items() if name.startswith("num_")}, []
+    if num["num_outside"] and asked.box is not None:
+        lower, upper = (", ".join(f"{x:.4g}" for x in corner) for corner in (asked.box.lower, asked.box.upper))
+        place = f"outside the box ({lower}) to ({upper}) m of the {asked.kind.partition(' ')[0]}"
+        what = "have no distance; bake a larger --box" if asked.is_grid else "were never seen; ask inside it"
+        notes.append(f"{num['num_outside']} of {num['num_points']} points lie {place} and {what}")
+    if blank := num["num_points"] - num["num_answered"] - (num["num_outside"] if asked.is_grid else 0):
+        notes.append(f"{blank} points lie next to unseen cells, baked as nan, and have no distance")
+    if num["num_never_seen"]:
+        notes.append(
+            f"{num['num_never_seen']} of {num['num_points']} points are where no camera looked: nothing is known of"
+            " obstacles there; scan it, or count it as an obstacle (sdf-bake --unknown obstacle)"
         )
-        self._knows_seen &= answers.observed is not None
-        self._sum += float(distance.sum())
-        self._least = min(self._least, float(distance.min(initial=np.inf)))
-        self._least_bound = min(self._least_bound, float(bounds.min(initial=np.inf)))
-
-    def metrics(self) -> dict[str, float | None]:
-        num = self._num
-        return {
-            "num_points": num["points"],
-            "num_answered": num["answered"],
-            "num_outside": num["outside"],
-            "num_in_collision": num["in_collision"],
-            "num_never_seen": num["never_seen"] if self._knows_seen else None,
-            "min_distance": self._least if num["answered"] else None,
-            "mean_distance": self._sum / num["answered"] if num["answered"] else None,
-            "min_bound": self._least_bound if np.isfinite(self._least_bound) else None,
-        }
-
-    def notes(self, asked: _Asked) -> tuple[str, ...]:
-        num, notes = self._num, []
-        if num["outside"] and asked.box is not None:
-            lower, upper = (", ".join(f"{x:.4g}" for x in corner) for corner in (asked.box.lower, asked.box.upper))
-            place = f"outside the box ({lower}) to ({upper}) m of the {asked.kind.partition(' ')[0]}"
-            what = "have no distance; bake a larger --box" if asked.is_grid else "were never seen; ask inside it"
-            notes.append(f"{num['outside']} of {num['points']} points lie {place} and {what}")
-        if blank := num["points"] - num["answered"] - (num["outside"] if asked.is_grid else 0):
-            notes.append(f"{blank} points lie next to unseen cells, baked as nan, and have no distance")
-        if self._knows_seen and num["never_seen"]:
-            notes.append(
-                f"{num['never_seen']} of {num['points']} points are where no camera looked: nothing is known of"
-                " obstacles there; scan it, or count it as an obstacle (sdf-bake --unknown obstacle)"
-            )
-        return tuple(notes)
+    return tuple(notes)

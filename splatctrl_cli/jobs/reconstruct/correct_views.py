@@ -64,7 +64,7 @@ class Corrections:
         rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
         moved = list(frames)
         if self.poses:
-            moved, poses = _posed(moved, scale, has_robot, console)
+            moved, poses = _correct_poses(moved, scale, has_robot, console)
             told |= poses
             rows = [
                 row | {"T_world_camera": f.T_world_camera.ravel().tolist()}
@@ -78,7 +78,7 @@ class Corrections:
         return moved, told | {"corrected_views": rows}
 
 
-def _posed(
+def _correct_poses(
     recorded: list[RgbdFrame], scale: float, has_robot: bool, console: Progress
 ) -> tuple[list[RgbdFrame], dict[str, Any]]:
     found, frames = refined_poses(recorded, scale), recorded
@@ -107,11 +107,11 @@ def _posed(
             "turned_max": float(found.turned.max()),
             "held": [f"{f.camera} at {f.stamp_ns}" for f, held in zip(frames, found.is_held, strict=True) if held],
         },
-    } | ({} if has_robot else _told(bends, scale, apart, found.after, console))
+    } | ({} if has_robot else _describe(bends, scale, apart, found.after, console))
 
 
-def _told(bends: FoundBends, scale: float, apart: float, after: float, console: Progress) -> dict[str, Any]:
-    """Log and describe depth bends; apart, after [m]: residuals without and with them."""
+def _describe(bends: FoundBends, scale: float, apart: float, after: float, console: Progress) -> dict[str, Any]:
+    """apart, after [m]: residuals without and with the depth bends."""
     depth = scale * fixed.SCALE_DEPTH
     rows = {
         camera: {
@@ -178,7 +178,7 @@ def corrected_among(
 def _bend_of(
     frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
 ) -> Float64 | None:
-    """Bend of the frame's camera; held-out views use the only camera with their intrinsics."""
+    """Bend of the frame's camera, or of the only one with its intrinsics."""
     cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
     camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
     return next((row.bend for (name, _), row in corrections.items() if name == camera), None)

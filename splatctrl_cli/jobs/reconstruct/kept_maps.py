@@ -38,7 +38,7 @@ class KeptMaps:
     def shows_news(self, fitter: SceneFitter) -> bool:
         """True if at least `NEWS_LEAST` spheres may be a new obstacle.
 
-        They stand out of the last kept map's spheres by more than half a voxel, in voxels free there.
+        They stand out of the last kept map by over half a voxel, where it is free.
         """
         if not self._writer.snapshots:
             return False
@@ -54,7 +54,6 @@ class KeptMaps:
 
 
 def _num_new(spheres: SplatSet, field: SphereField | None, grid: OccupancyGrid) -> int:
-    """Spheres that stand out of a map's field, in its free voxels."""
     centers = spheres.centers.astype(np.float64)
     cells = np.floor((centers - grid.origin) / grid.voxel + 0.5).astype(np.int64)
     is_inside = np.all((cells >= 0) & (cells < grid.log_odds.shape), axis=1)

@@ -21,10 +21,10 @@ from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest, training_cameras
 from splatctrl_cli.jobs.reconstruct.verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
-from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, RobotOptions, other_frame, urdf_of, with_self_model
+from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, RobotOptions, add_self_model, other_frame, urdf_of
 from splatctrl_cli.jobs.running.device import FitDevice
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import check_resumption, checkpoint_to_go_on_from, identity, told_how_to_go_on
+from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, checkpoint_to_go_on_from, identity
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
@@ -62,7 +62,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
     goes_on = check_resumption(checkpoint_file, "run", progress, resume=request.resume)
     with (
         closing(device),
-        told_how_to_go_on(checkpoint_file),
+        advise_resumption(checkpoint_file),
         output_path(
             request.out, force=request.force, is_folder=True, checkpoint=CHECKPOINT, resume=request.resume
         ) as partial,
@@ -72,7 +72,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         run = _identity(request, inputs)
         checkpoint = checkpoint_to_go_on_from(partial, run) if goes_on else None
         with stopwatch.stage("learn"):
-            robot, off = _learned(robot, request, partial, progress, is_new=not goes_on)
+            robot, off = _learn_self(robot, request, partial, progress, is_new=not goes_on)
         fitted = Reconstruction(
             request,
             robot,
@@ -133,12 +133,11 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
     return identity({"seed": request.seed, **request.options, **off}, files, request.config, inputs)
 
 
-def _learned(
+def _learn_self(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
 ) -> tuple[RobotModel | None, dict[str, dict[str, Any]]]:
-    """Add the self-model to the robot, and find `displaced_cameras`.
-
-    The scene's folder keeps the self-model: the given one, the resumed run's, or what the recording shows.
+    """Add the self-model to the robot, and find `displaced_cameras`. It is the given one, the resumed run's, or what
+    the recording shows.
     """
     if robot is None:
         return None, {}
@@ -151,7 +150,7 @@ def _learned(
         except InputError as error:
             progress.log(f"nothing is learned of the robot's own parts: {error.message}")
     if not is_new and request.self_model is None:
-        robot = with_self_model(robot, None, folder)
+        robot = add_self_model(robot, None, folder)
     elif is_new and robot.self_model is not None:
         savez(folder / SELF_MODEL, robot.self_model.arrays())
     return robot, off
@@ -183,7 +182,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         if request.source.joint_names:
             model = model.moved_by(request.source.joint_names)
             model.joint_columns(request.source.joint_names)
-        model = with_self_model(model, request.self_model)
+        model = add_self_model(model, request.self_model)
         if request.urdf is None:
             _check_fits(urdf, request.source)
             progress.log(f"the robot is the log's own: {urdf.path}")
@@ -201,7 +200,6 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
 
 
 def _check_fits(urdf: UrdfFile, source: RecordSource) -> None:
-    """Raise InputError if the log's own robot would stand elsewhere or not move."""
     if words := other_frame(urdf, source):
         raise InputError(
             f"{urdf.path}: {words}", remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one"
@@ -242,7 +240,6 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
 
 
 def arm_of(model: RobotModel, source: FrameSource) -> Arm:
-    """The robot with a log's joint positions."""
     return Arm(model, source.states.of_log(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS))
 
 

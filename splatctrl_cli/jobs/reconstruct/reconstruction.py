@@ -48,10 +48,9 @@ def training_cameras(source: RecordSource) -> list[str]:
 class ReconstructRequest(RunOptions):
     """One reconstruction of `source` into the folder `out`.
 
-    urdf, spheres: the robot, segmented from the splats, by default that of the log `recording`; its reach is the
-    workspace without `box`. points: a coloured cloud to start from instead of depth. declare: a TOML of carried
-    objects. corrections: of a still scene's views. options: what else decides the bytes, by option name; a resumed
-    run must have the same.
+    urdf, spheres: the robot, segmented from the splats (None: the log `recording`'s); its reach is the workspace
+    without `box`. points: a coloured cloud to start from. declare: a TOML of carried objects. corrections: of a still
+    scene's views. options: the rest that decides the bytes, which a resumed run must share.
     """
 
     source: RecordSource
@@ -114,8 +113,12 @@ class Reconstruction:
         self.corrected: dict[str, Any] = {}  # corrections of the views
         self._early: TimeStep | None = None  # the first step without a workspace
         self.depth: RecordedDepth | None = None  # that chose the map's lengths
-        allowed, still, guess = request.allow_disagreement, not self.source.has_clock, guessed_unit(self.source)
-        self.agreement = CameraAgreement(self.source, is_allowed=allowed, is_still=still, guess=guess)
+        self.agreement = CameraAgreement(
+            self.source,
+            is_allowed=request.allow_disagreement,
+            is_still=not self.source.has_clock,
+            guess=guessed_unit(self.source),
+        )
         self._saved_at, self._save_time = -float("inf"), 0.0
         request.corrections.check(request.source)
         if checkpoint is not None:
@@ -222,9 +225,8 @@ class Reconstruction:
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Enlarge a default budget that the first step exceeded next to a robot.
-
-        Without a splat, a whole voxel counts as occupied.
+        """Enlarge a default budget that the first step exceeded next to a robot: without a splat, a whole voxel is
+        occupied.
         """
         least = SceneConfig().max_splats
         if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
@@ -332,8 +334,8 @@ class Reconstruction:
         self.device.history = progress.get("devices", [{**Device().as_dict(), "from_iteration": 0}])
         depth = progress["depth"]
         self._fit_to(None if depth is None else RecordedDepth(**depth))
-        budget = len(checkpoint.state["is_alive"])
-        self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
+        scene = self.config.scene.derived(max_splats=len(checkpoint.state["is_alive"]))
+        self.config = self.config.derived(scene=scene)
         self._fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 
@@ -350,7 +352,7 @@ class Reconstruction:
             self._first_state_ns = record.stamp_ns
 
     def _fit_to(self, depth: RecordedDepth | None, console: Progress = SILENT) -> None:
-        """Choose map lengths, or a robot's sensor error, by the first frames with depth."""
+        """Choose map lengths, or the sensor error, by the first frames with depth."""
         if depth is None:
             return
         self.depth, before = depth, self.config
@@ -360,14 +362,13 @@ class Reconstruction:
 
     def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)
-        human, seed, threads = self.config.human, self.request.seed, self.request.threads
         return SceneFitter(
             scene,
             self.config.occupancy,
             workspace,
-            human=human,
-            seed=seed,
-            threads=threads,
+            human=self.config.human,
+            seed=self.request.seed,
+            threads=self.request.threads,
             has_shell=self.robot is not None and scene.shell > 0,
         )
 

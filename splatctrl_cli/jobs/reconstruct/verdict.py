@@ -48,7 +48,6 @@ class Reconstructed:
 
 
 def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
-    """Judge a reconstruction by every criterion and each ``--require``."""
     metrics, counts = made.metrics, counts_of(made)
     return verdict_of(
         "reconstruct",
@@ -121,7 +120,6 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
 
 
 def _blind(made: Reconstructed) -> Iterator[Reason]:
-    """Cameras with stale depth, or with no depth for longer than evidence lasts."""
     for camera, num in made.metrics["repeated_frames"].items():
         yield note(
             criterion="depth", sentence=f"camera {camera}: {num} frames repeat the depth of the one before: left out"

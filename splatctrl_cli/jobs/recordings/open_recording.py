@@ -27,9 +27,9 @@ from splatctrl_cli.scene.time_steps import TimeStep
 class RecordingRequest:
     """A recording at `path`: log, capture, image folder, or DTU data set.
 
-    scan: None for the only one. options: for a scan its holdout alone. protocol: training and scored views. masks,
-    depths: folders with what a scan lacks. downscale: None for the protocol's size. beside: more logs of the session.
-    Raises UsageError if `beside` is given with an image folder.
+    scan: None for the only one. options: for a scan its holdout alone. protocol: of views. masks, depths: folders for
+    a scan. downscale: None for the protocol's size. beside: more logs of the session. Raises UsageError if `beside`
+    is given with an image folder.
     """
 
     path: Path
@@ -57,7 +57,7 @@ def open_to_train(
     """Open the recording without held-out views.
 
     Raises UsageError for options of other recordings. Raises InputError for a scan without depth, a camera jump above
-    `max_pose_jump` [m], and errors of `check`, except `allowed` codes.
+    `max_pose_jump` [m], and `check`'s errors but `allowed`.
     """
     if recording.is_dtu:
         scan = open_dtu(recording)
@@ -203,7 +203,7 @@ class CameraAgreement:
             console.log(f"warning: {self._name}: {finding.what}")
 
     def _units(self) -> set[float | None]:
-        """Depth units [m per count] of the cameras; None if unknown."""
+        """Depth units [m per count] by camera; None if unknown."""
         units = dict[str, float | None]()
         for frame in self._source.stored() if isinstance(self._source, LOGGED | ImageFolderSource) else ():
             if isinstance(frame, StoredFrame):

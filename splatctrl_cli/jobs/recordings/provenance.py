@@ -25,8 +25,7 @@ from splatctrl_cli.simulate.truth import Truth
 def first_frame(frame: RgbdFrame) -> dict[str, Any]:
     """Facts of a camera's first training frame for ``run.json``.
 
-    intrinsics [px]: fx, fy, cx, cy, width, height; T_world_camera: 16 numbers by row; tiles: coarse colours (0 to
-    255).
+    intrinsics [px]: fx, fy, cx, cy, width, height; T_world_camera: 16 numbers by row; tiles: colours (0 to 255).
     """
     k = frame.intrinsics
     return {
@@ -66,32 +65,30 @@ def changed_files(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """Describe files of equal name but another digest; descriptions (.toml) may change."""
     common = [name for name in then if name in now and not name.endswith(".toml")]
     changed = [name for name in common if then[name] != now[name]]
-    if not changed:
-        return []
     if len(common) == 1:
-        return [f"{changed[0]} has other contents"]
-    return [f"{len(changed)} of {len(common)} files have other contents, such as {changed[0]}"]
+        return [f"{name} has other contents" for name in changed]
+    return [f"{len(changed)} of {len(common)} files have other contents, such as {name}" for name in changed[:1]]
 
 
 def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
-    camera, lines = frame.camera, []
+    camera = frame.camera
     then, now = np.array(first["intrinsics"], np.float64), np.array(first_frame(frame)["intrinsics"])
     if then[4:].tolist() != now[4:].tolist():
         return [f"{camera}: images of {now[4]:g}x{now[5]:g}, not {then[4]:g}x{then[5]:g}"]
     gap = float(np.abs(then[:4] - now[:4]).max())
-    if gap > fixed.SAME_LENS_PIXELS:
-        lines.append(f"{camera}: intrinsics differ by {gap:.1f} px")
-    if apart := (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9:
-        side = "after" if apart > 0 else "before"
-        lines.append(f"{camera}: its nearest frame is {abs(apart):.3g} s {side} the one that trained")
+    apart = (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9
     then_pose = np.array(first["T_world_camera"], np.float64).reshape(4, 4)
     metres, degrees = compare_poses(then_pose, frame.T_world_camera)
-    if metres > fixed.SAME_POSE_METRES or degrees > fixed.SAME_POSE_DEGREES:
-        lines.append(f"{camera}: the pose differs by {1e3 * metres:.0f} mm and {degrees:.1f} degrees")
     levels = float(np.abs(np.array(first["tiles"]) - np.array(_tiles(frame.color))).max())
-    if levels > fixed.SAME_PICTURE_LEVELS:
-        lines.append(f"{camera}: the picture differs by up to {levels:.0f} of 255 levels")
-    return lines
+    side = "after" if apart > 0 else "before"
+    is_moved = metres > fixed.SAME_POSE_METRES or degrees > fixed.SAME_POSE_DEGREES
+    texts = {
+        f"intrinsics differ by {gap:.1f} px": gap > fixed.SAME_LENS_PIXELS,
+        f"its nearest frame is {abs(apart):.3g} s {side} the one that trained": apart != 0,
+        f"the pose differs by {1e3 * metres:.0f} mm and {degrees:.1f} degrees": is_moved,
+        f"the picture differs by up to {levels:.0f} of 255 levels": levels > fixed.SAME_PICTURE_LEVELS,
+    }
+    return [f"{camera}: {text}" for text, differs in texts.items() if differs]
 
 
 def _tiles(color: UInt8) -> list[float]:
@@ -138,8 +135,7 @@ def made_from_mismatches(
 ) -> Iterator[Reason]:
     """Mismatches of a scene or field, by its `SceneFolder.made_from`, with a log and robot.
 
-    Compares digests of files and calibration, training cameras' first frames, and the segmented robot's joints and
-    links; also finds corrected depth.
+    Compares digests, training cameras' first frames, and the segmented robot; also finds corrected depth.
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")
@@ -172,7 +168,6 @@ def made_from_mismatches(
 
 
 def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
-    """Calibrations and perturbations among the input files: names by digest."""
     return {
         digest: name.removeprefix(CALIBRATION)
         for name, digest in files.items()
@@ -181,9 +176,8 @@ def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
-    """Describe how a scene's segmented robot differs from a model; empty if alike.
-
-    Links only the scene's robot has are in neither map nor robot; links only the model has are in both.
+    """Describe how a scene's segmented robot differs from a model, or return an empty text. Links of one robot alone
+    are in neither, or in both map and robot.
     """
     joints = made_from.get("robot_joints")
     if joints is None:
@@ -225,7 +219,10 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
         return
     used = scene.run.get("config", {})
     found = agreement_with_grid(
-        scene.splats(), known, _used(SceneConfig, used.get("scene")), _used(OccupancyConfig, used.get("occupancy"))
+        scene.splats(),
+        known,
+        _read_section(SceneConfig, used.get("scene")),
+        _read_section(OccupancyConfig, used.get("occupancy")),
     )
     if not found.holds and found.num_voxels:
         yield lacking(
@@ -236,7 +233,7 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
         )
 
 
-def _used(section: type[S], values: object) -> S:
+def _read_section(section: type[S], values: object) -> S:
     known = {field.name for field in fields(section)}
     given = values if isinstance(values, dict) else {}
     return section(**{name: value for name, value in given.items() if name in known})

@@ -7,7 +7,6 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import CLOCKS_APART, LIMIT_EXCEEDED, SAME_MOMENT_NS, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
-from splatctrl_cli.control.outside import OutsideController
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
@@ -34,10 +33,6 @@ class Judged:
     def threshold(self) -> float:
         """The margin [m] less solver and rounding error."""
         return self.replay.margin - SLIGHTLY_UNDER
-
-    @property
-    def num_states(self) -> int:
-        return len(self.replay.audit.stamp_ns)
 
     @property
     def past_end_s(self) -> float:
@@ -80,7 +75,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=when,
             remedy="its time of arrival is unknown: cameras must give depth all the time",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
     ahead = nearby(judged, judged.replay.near["ahead"])
     allowed = SAME_MOMENT_NS / 1e9  # frames of one time step differ in time
@@ -94,27 +89,27 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             remedy="a state is judged by what was known then: reconstruct with snapshots, or check the clocks",
             count=ahead[2],
         )
-    near = nearby(judged, judged.replay.near["age"])
-    if near is not None and near[0] > judged.request.max_map_age:
-        words, remedy = _after_end(judged, near[0], near[1])
-        yield lacking(
-            sentence=f"{words}the newest depth near the arm is {near[0]:.2f} s old, allowed "
-            f"{judged.request.max_map_age:g} s",
-            value=near[0],
-            threshold=judged.request.max_map_age,
-            unit="s",
-            time_s=near[1],
-            remedy=remedy
-            or "frames that have no depth or repeat it do not count: check the cameras ('splatctrl check')",
-            count=near[2],
+    near, oldest = nearby(judged, judged.replay.near["age"]), judged.request.max_map_age
+    if near is not None:
+        age, time_s, count = near
+        words, remedy = _end_words(judged, age, time_s)
+        yield (
+            held(f"depth from about the arm at most {age:.2f} s before", age, oldest, "s", count)
+            if age <= oldest
+            else lacking(
+                sentence=f"{words}the newest depth near the arm is {age:.2f} s old, allowed {oldest:g} s",
+                value=age,
+                threshold=oldest,
+                unit="s",
+                time_s=time_s,
+                remedy=remedy
+                or "frames that have no depth or repeat it do not count: check the cameras ('splatctrl check')",
+                count=count,
+            )
         )
-    elif near is not None:
-        words = f"depth from about the arm at most {near[0]:.2f} s before"
-        yield held(words, near[0], judged.request.max_map_age, "s", near[2])
 
 
-def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
-    """First words and remedy if the evidence is old because the log ended."""
+def _end_words(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
     lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""
@@ -129,30 +124,28 @@ def map_age(judged: Judged) -> Iterator[Reason]:
     yield from _overtaken(judged)
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
     known = ages[np.isfinite(ages)]
-    if not len(known):
-        if judged.request.field is not None and judged.inputs.source.has_clock:
-            yield lacking(
-                sentence="the field does not say what time it shows",
-                remedy="give --scene, or bake a reconstruction instead of bare splats",
-                count=judged.num_states,
-            )
-        return
-    most = float(known.max())
-    if most <= allowed:
+    most = float(known.max(initial=-np.inf))
+    if not len(known) and judged.request.field is not None and judged.inputs.source.has_clock:
+        yield lacking(
+            sentence="the field does not say what time it shows",
+            remedy="give --scene, or bake a reconstruction instead of bare splats",
+            count=judged.replay.num_states,
+        )
+    elif len(known) and most <= allowed:
         yield held(f"at most {most:.2f} s", most, allowed, "s", len(known))
-        return
-    worst = max(events_of(judged.replay, EventKind.STALE_MAP), key=lambda event: event.worst)
-    words, remedy = _after_end(judged, most, worst.worst_s)
-    yield lacking(
-        sentence=f"{words}the map is up to {most:.2f} s old, allowed {allowed:g} s, from {worst.start_s:.2f} to "
-        f"{worst.end_s:.2f} s",
-        value=most,
-        threshold=allowed,
-        unit="s",
-        time_s=worst.worst_s,
-        remedy=remedy or "the cameras must cover the motion in time; --max-map-age says how old a map may be",
-        count=len(known),
-    )
+    elif len(known):
+        worst = max(events_of(judged.replay, EventKind.STALE_MAP), key=lambda event: event.worst)
+        words, remedy = _end_words(judged, most, worst.worst_s)
+        yield lacking(
+            sentence=f"{words}the map is up to {most:.2f} s old, allowed {allowed:g} s, from {worst.start_s:.2f} to "
+            f"{worst.end_s:.2f} s",
+            value=most,
+            threshold=allowed,
+            unit="s",
+            time_s=worst.worst_s,
+            remedy=remedy or "the cameras must cover the motion in time; --max-map-age says how old a map may be",
+            count=len(known),
+        )
 
 
 def _overtaken(judged: Judged) -> Iterator[Reason]:
@@ -167,7 +160,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=(worst.stamp_ns - first_ns) * 1e-9,
             remedy="the map comes too late for this motion: lower --latency, or drive more slowly",
-            count=judged.num_states,
+            count=judged.replay.num_states,
             label=CONTACT if worst.clearance < 0 else MARGIN,
         )
     for last in [each for each in found if each.depth_ns > each.stamp_ns][:1]:
@@ -179,7 +172,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=(last.stamp_ns - first_ns) * 1e-9,
             remedy="it may have come earlier: judge a longer time",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
 
 
@@ -188,8 +181,8 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
     limits. No state without a distance or dropped for its stamp (*judged states*). At most `verdict.lead_in` before
     the first map.
     """
-    config, stamps = judged.request.config.verdict, judged.replay.audit.stamp_ns
-    blank = is_blank(judged.replay)
+    config, replay = judged.request.config.verdict, judged.replay
+    stamps, unbounded, blank = replay.audit.stamp_ns, replay.between["unbounded"], is_blank(replay)
     if blank.any():
         yield lacking(
             criterion="judged states",
@@ -201,33 +194,6 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
             remedy="bake with field.unknown = free or obstacle, over a box that holds the motion",
             count=len(stamps),
         )
-    yield from _gaps(judged)
-    dropped = judged.inputs.source.loss.conflicting_states
-    if dropped > config.unjudged * (dropped + len(stamps)):
-        yield lacking(
-            criterion="judged states",
-            sentence=f"{dropped} logged states were dropped: they repeat a stamp with other positions",
-            value=float(dropped),
-            threshold=config.unjudged,
-            remedy="stamp every state with its own time, or give --stamps log",
-            count=len(stamps),
-        )
-    replay = judged.replay
-    if replay.lead_in_s > config.lead_in:
-        yield lacking(
-            sentence=f"the first {replay.lead_in_s:.2f} s ({replay.num_before_scene} states) come before the first "
-            "map",
-            value=replay.lead_in_s,
-            threshold=config.lead_in,
-            unit="s",
-            remedy="judge the rest alone with --start-time first-map",
-            count=judged.num_states,
-        )
-
-
-def _gaps(judged: Judged) -> Iterator[Reason]:
-    replay, config = judged.replay, judged.request.config.verdict
-    stamps, unbounded = replay.audit.stamp_ns, replay.between["unbounded"]
     duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
     share = float(unbounded.sum()) / duration
     if share > config.unjudged:
@@ -242,6 +208,26 @@ def _gaps(judged: Judged) -> Iterator[Reason]:
             remedy=SLOW,
             count=len(stamps),
         )
+    dropped = judged.inputs.source.loss.conflicting_states
+    if dropped > config.unjudged * (dropped + len(stamps)):
+        yield lacking(
+            criterion="judged states",
+            sentence=f"{dropped} logged states were dropped: they repeat a stamp with other positions",
+            value=float(dropped),
+            threshold=config.unjudged,
+            remedy="stamp every state with its own time, or give --stamps log",
+            count=len(stamps),
+        )
+    if replay.lead_in_s > config.lead_in:
+        yield lacking(
+            sentence=f"the first {replay.lead_in_s:.2f} s ({replay.num_before_scene} states) come before the first "
+            "map",
+            value=replay.lead_in_s,
+            threshold=config.lead_in,
+            unit="s",
+            remedy="judge the rest alone with --start-time first-map",
+            count=judged.replay.num_states,
+        )
 
 
 def clocks(judged: Judged) -> Iterator[Reason]:
@@ -250,26 +236,39 @@ def clocks(judged: Judged) -> Iterator[Reason]:
     if clock is None or clock.offset_s is None or clock.uncertainty_s is None:
         return
     offset, uncertainty = float(clock.offset_s), float(clock.uncertainty_s)
-    if abs(offset) - uncertainty <= CLOCKS_APART:
-        yield held(f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
-        return
-    yield lacking(
-        sentence=f"the cameras' clock is {1e3 * abs(offset):.0f} ms {'ahead of' if offset > 0 else 'behind'} "
-        f"the robot's (+- {1e3 * uncertainty:.0f} ms)",
-        value=abs(offset),
-        threshold=CLOCKS_APART,
-        unit="s",
-        remedy="synchronise the clocks, or shift one in the log",
-        count=clock.num_intervals,
+    yield (
+        held(f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
+        if abs(offset) - uncertainty <= CLOCKS_APART
+        else lacking(
+            sentence=f"the cameras' clock is {1e3 * abs(offset):.0f} ms {'ahead of' if offset > 0 else 'behind'} "
+            f"the robot's (+- {1e3 * uncertainty:.0f} ms)",
+            value=abs(offset),
+            threshold=CLOCKS_APART,
+            unit="s",
+            remedy="synchronise the clocks, or shift one in the log",
+            count=clock.num_intervals,
+        )
     )
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
     """Every step of the closed loop is solved; a user's controller always answers validly."""
-    if judged.replay.outside is not None:
-        yield _answers(judged, judged.replay.outside)
+    outside, trace, metrics = judged.replay.outside, judged.replay.closed_loop, judged.metrics
+    if outside is not None:
+        num, failure = outside.num_answers, outside.failure
+        yield (
+            held(f"all {num} steps answered", 0.0, 0.0, "", num)
+            if failure is None
+            else failed(
+                sentence=f"{failure.fault}: {failure.sentence}; after {counted(num, 'answer')},",
+                value=1.0,
+                threshold=0.0,
+                time_s=float(failure.stamp_ns - judged.replay.audit.stamp_ns[0]) * 1e-9,
+                count=num + 1,
+                label=CONTROL,
+            )
+        )
         return
-    trace, metrics = judged.replay.closed_loop, judged.metrics
     if trace is None:
         return
     bad = {name: metrics[f"num_{name}"] or 0 for name in ("relaxed", "minimum_violation", "hold")}
@@ -287,20 +286,6 @@ def controller(judged: Judged) -> Iterator[Reason]:
         who=first.worst_name,
         cause="" if first.obstacle is None else f"near {first.obstacle}",
         count=len(trace.steps),
-        label=CONTROL,
-    )
-
-
-def _answers(judged: Judged, outside: OutsideController) -> Reason:
-    num, failure = outside.num_answers, outside.failure
-    if failure is None:
-        return held(f"all {num} steps answered", 0.0, 0.0, "", num)
-    return failed(
-        sentence=f"{failure.fault}: {failure.sentence}; after {counted(num, 'answer')},",
-        value=1.0,
-        threshold=0.0,
-        time_s=float(failure.stamp_ns - judged.replay.audit.stamp_ns[0]) * 1e-9,
-        count=num + 1,
         label=CONTROL,
     )
 
@@ -356,6 +341,6 @@ def commanded(judged: Judged) -> Reason | None:
         threshold=1.0,
         time_s=seconds_at(judged, int(state)),
         who=name,
-        count=judged.num_states,
+        count=judged.replay.num_states,
         label=LIMITS,
     )

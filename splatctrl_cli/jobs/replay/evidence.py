@@ -1,9 +1,9 @@
 """References of a replay: held-out depth (``--evidence``), and the truth of a simulated log.
 
-The field's value at a surface point is the map's miss there. Let a sphere's true clearance be d, and p the true
-surface point nearest to it. The exact distance is 1-Lipschitz, so the map's clearance is at most d plus the miss at
-p. If no surface within `verdict.evidence_reach` of the motion is missed by more than b (`evaluate.conformal`), the
-true clearance is at least the map's less b, or more than that reach.
+The field's value at a surface point is the map's miss there. Let d be a sphere's true clearance, to surface point p.
+The exact distance is 1-Lipschitz: the map's clearance is at most d plus the miss at p. If no surface within
+`verdict.evidence_reach` of the motion is missed by more than b (`evaluate.conformal`), the true clearance is at least
+the map's less b, or more than that reach.
 """
 
 from collections.abc import Iterable, Iterator
@@ -51,16 +51,15 @@ class Evidence:
     every: int | None = None
 
     def frame_sets(self) -> Iterator[TimeStep]:
-        return held_out(time_steps(self.source.records(), self.cameras, has_clock=True), self.every)
+        return select_held_out(time_steps(self.source.records(), self.cameras, has_clock=True), self.every)
 
 
-def held_out(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
+def select_held_out(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
     """Select each `every`-th frame set, the held-out ones; None selects all."""
     return islice(iter(steps), None if every is None else every - 1, None, every or 1)
 
 
-def trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
-    """Select the training frame sets; None selects all."""
+def select_trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
     return (step for number, step in enumerate(steps, start=1) if every is None or number % every)
 
 
@@ -148,47 +147,34 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
 
 
 def map_error(evidence: Evidence, inputs: ReplayInputs, audit: StoredAudit, config: VerdictConfig) -> MapError:
-    """Bound the map's miss near the judged motion."""
-    found = misses_of(evidence.frame_sets(), inputs, audit, config.evidence_reach)
-    bound = conformal_bound(found.distance, config.confidence)
+    stamps_ns, misses, num_points = misses_of(evidence.frame_sets(), inputs, audit, config.evidence_reach)
+    bound = conformal_bound(misses[:, 0], config.confidence)
     error = MapError(
         source=evidence.name,
-        num_sets=len(found.stamp_ns),
-        num_seen=int(np.isfinite(found.distance).sum()),
-        num_points=found.num_points,
+        num_sets=len(stamps_ns),
+        num_seen=int(np.isfinite(misses[:, 0]).sum()),
+        num_points=num_points,
         bound=None,
     )
     if bound is None:
         return error
-    x, y, z = (float(value) for value in found.place[bound.at])
+    x, y, z = (float(value) for value in misses[bound.at, 1:])
     return replace(
         error,
         bound=replace(bound, bound=max(bound.bound, 0.0)),
-        time_s=float(found.stamp_ns[bound.at] - audit.stamp_ns[0]) * 1e-9,
+        time_s=float(stamps_ns[bound.at] - audit.stamp_ns[0]) * 1e-9,
         place=(x, y, z),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Misses:
-    """Misses of T frame sets.
-
-    stamp_ns (T,). distance (T,) [m]: the largest miss, NaN if no point counts; place (T, 3) [m]. num_points: that
-    count.
-    """
-
-    stamp_ns: Stamps
-    distance: Float64
-    place: Float64
-    num_points: int
-
-
-def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
+def misses_of(
+    frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float
+) -> tuple[list[int], Float64, int]:
     """Largest miss of each held-out frame set near the motion, without the robot.
 
-    Near is within `reach` [m]; sets count within the audited time, one in memory at a time. Each is compared with the
-    map that judged the states just before it, when that map is oldest: the next one contains other cameras of the
-    same moment, and misses less.
+    Returns stamps [ns] of T sets, their largest miss and its place (T, 4) [m], NaN without points, and the number of
+    points. Near is within `reach` [m]; sets count within the audited time. Each is compared with the map just before
+    it: the next one contains other cameras of that moment, and misses less.
     """
     swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
@@ -207,13 +193,10 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
             ]
         )
         stamps.append(step.stamp_ns)
-        known = inputs.scene.at(max(step.stamp_ns - SAME_MOMENT_NS, first_ns))
-        worst.append(largest_miss(points, known.distances["exact"]))
+        exact = inputs.scene.at(max(step.stamp_ns - SAME_MOMENT_NS, first_ns)).distances["exact"]
+        worst.append(largest_miss(points, exact))
         num_points += len(points)
-    rows = np.array(worst).reshape(-1, 4)
-    return Misses(
-        stamp_ns=np.array(stamps, dtype=np.int64), distance=rows[:, 0], place=rows[:, 1:], num_points=num_points
-    )
+    return stamps, np.array(worst).reshape(-1, 4), num_points
 
 
 def surface_points(frame: RgbdFrame) -> Float64:
@@ -291,7 +274,7 @@ class TrueSurfaces:
             yield frame
 
 
-def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
+def add_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
     """Add true clearances and their events; the surfaces are None without a truth."""
     if inputs.truth is None:
         return replay, None
@@ -305,7 +288,7 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
         stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
         for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
             distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
-            gap = _unexpected(inputs, moving, distance - radii, points, stamp, replay.margin)
+            gap = _drop_expected(inputs, moving, distance - radii, points, stamp, replay.margin)
             nearest = int(np.argmin(gap))
             clearance[index], surface[index] = gap[nearest], points[nearest]
             spheres[index] = moving[nearest]
@@ -318,7 +301,7 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
     return replace(replay, true_clearance=truth, events=merged), TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
 
 
-def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
+def add_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
     """Compare the audit with the truth near seen surfaces, after the last frame."""
     truth = np.asarray(replay.true_clearance)
     return replace(
@@ -330,7 +313,7 @@ def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
     )
 
 
-def _unexpected(
+def _drop_expected(
     inputs: ReplayInputs, moving: NDArray[np.intp], gap: Float64, points: Float64, stamp_ns: int, margin: float
 ) -> Float64:
     if not inputs.declared.expected_contact:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -151,16 +152,15 @@ def known_space(judged: Judged) -> Iterator[Reason]:
     of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
     for limit in LIMITS:
-        yield from _within(judged, limit)
+        yield from _check_limit(judged, limit)
     if judged.request.unseen == OCCUPIED:
-        yield from _within(judged, PROOF, partial(failed, label=MARGIN))
+        yield from _check_limit(judged, PROOF, partial(failed, label=MARGIN))
     elif judged.request.require_proof:
-        yield from _within(judged, PROOF)
+        yield from _check_limit(judged, PROOF)
     yield from _unknown_share(judged)
 
 
-def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
-    """Yield that a limit is kept, or its worst state as `broken`."""
+def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
     near = judged.replay.near
     values = limit.values(near)
     if limit is PROOF and np.isnan(near["assumed"]).all():
@@ -207,18 +207,21 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
         yield lacking(sentence="the space that cameras saw is not recorded")
-        return
-    if share <= allowed:
-        yield held(f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.num_states)
-        return
-    yield lacking(
-        sentence=f"{100 * share:.1f} % of the sphere centres lie in unseen space, allowed {100 * allowed:g} %, first",
-        value=share,
-        threshold=allowed,
-        time_s=seconds_at(judged, int(np.argmax(judged.replay.audit.figures["unknown_share"] > allowed))),
-        remedy="add a camera, or give a larger --max-unknown",
-        count=judged.num_states,
-    )
+    elif share <= allowed:
+        yield held(
+            f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.replay.num_states
+        )
+    else:
+        at = int(np.argmax(judged.replay.audit.figures["unknown_share"] > allowed))
+        yield lacking(
+            sentence=f"{100 * share:.1f} % of the sphere centres lie in unseen space, allowed {100 * allowed:g} %, "
+            "first",
+            value=share,
+            threshold=allowed,
+            time_s=seconds_at(judged, at),
+            remedy="add a camera, or give a larger --max-unknown",
+            count=judged.replay.num_states,
+        )
 
 
 def map_error(judged: Judged) -> Iterator[Reason]:
@@ -228,11 +231,9 @@ def map_error(judged: Judged) -> Iterator[Reason]:
     criterion fails. The same holds for too little evidence.
     """
     found, surface = judged.replay.map_error, lowest(judged.replay.between["surface"])
-    if found is None:
-        if judged.request.require_evidence:
-            yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
-        return
-    if found.bound is None:
+    if found is None and judged.request.require_evidence:
+        yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
+    if found is not None and found.bound is None:
         yield lacking(
             sentence=f"not bounded: of {found.num_sets} held-out frame sets in the judged time {found.num_seen} show "
             "surface near the motion, too few for two independent stretches",
@@ -240,10 +241,9 @@ def map_error(judged: Judged) -> Iterator[Reason]:
             remedy="judge a longer motion, or name another camera; verdict.evidence_reach says how near",
             count=found.num_seen,
         )
+    if found is None or found.bound is None or surface is None:  # no distance at any state: others report it
         return
     value = found.bound.bound
-    if surface is None:
-        return  # no distance at any state: other criteria report it
     if surface >= value:
         yield held(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return
@@ -276,7 +276,7 @@ def belonging(judged: Judged) -> Iterator[Reason]:
     yield from judged.inputs.mismatches
 
 
-def displaced(judged: Judged) -> tuple[str, float] | None:
+def find_displaced(judged: Judged) -> tuple[str, float] | None:
     """The worst uncorrected displaced camera and its offset [m]; None without any."""
     rows = judged.inputs.scene.figures().get("displaced_cameras") or {}
     off = {
@@ -290,7 +290,7 @@ def displaced(judged: Judged) -> tuple[str, float] | None:
 def calibration(judged: Judged) -> Iterator[Reason]:
     """Each camera sees the robot, and all together each link, within 5 mm of where its joints put it."""
     figures = judged.inputs.scene.figures()
-    if (camera := displaced(judged)) is not None:
+    if (camera := find_displaced(judged)) is not None:
         yield lacking(
             sentence=f"{camera[0]} sees the robot {mm(camera[1])} from where its joints put it, allowed "
             f"{mm(MISPLACED)}: obstacles near it in the map may be the robot itself",
@@ -307,20 +307,23 @@ def calibration(judged: Judged) -> Iterator[Reason]:
     if residual is None or not isinstance(by_link, dict):
         return
     value = 1e-3 * float(residual)
-    if value <= MISPLACED:
-        yield held(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
-        return
     judged_links = {link: row for link, row in by_link.items() if row.get("is_judged", True)}
-    link, worst = max(judged_links.items(), key=lambda item: abs(float(item[1]["median_mm"])))
-    yield lacking(
-        sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
-        f"joints put it, allowed {mm(MISPLACED)}",
-        value=value,
-        threshold=MISPLACED,
-        unit="m",
-        who=str(link),
-        remedy="calibrate the cameras ('splatctrl check'), or correct URDF, joint zeros or depth scale",
-        count=int(worst["num_pixels"]),
+    link, worst = max(
+        judged_links.items(), key=lambda row: abs(float(row[1]["median_mm"])), default=("", dict[str, Any]())
+    )
+    yield (
+        held(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
+        if value <= MISPLACED
+        else lacking(
+            sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
+            f"joints put it, allowed {mm(MISPLACED)}",
+            value=value,
+            threshold=MISPLACED,
+            unit="m",
+            who=str(link),
+            remedy="calibrate the cameras ('splatctrl check'), or correct URDF, joint zeros or depth scale",
+            count=int(worst["num_pixels"]),
+        )
     )
 
 

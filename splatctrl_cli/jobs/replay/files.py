@@ -43,7 +43,6 @@ def chunks_of(replay: Replay) -> Iterator[Columns]:
 
 
 def columns_of(replay: Replay, rows: slice = slice(None)) -> Columns:
-    """Columns of a range of states, by name."""
     first, last, _ = rows.indices(len(replay.audit.stamp_ns))
     audit, names = replay.audit.block(first, last), sphere_names(replay.model.sphere_set)
     columns: Columns = {
@@ -161,7 +160,6 @@ def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mappin
 
 
 def events_document(replay: Replay) -> dict[str, Any]:
-    """Intervals, static violations and scene changes for events.json."""
     changes = () if replay.closed_loop is None else replay.closed_loop.scene_changes
     numbers = ("worst", "worst_s", "start_s", "end_s")
     return {
@@ -185,11 +183,11 @@ def when_and_why(replay: Replay) -> list[str]:
     lines = []
     if replay.steps and replay.outside is None:
         first = first_intervention(replay.events)
-        lines.append("first intervention: none" if first is None else f"first intervention: {told(first)}")
+        lines.append("first intervention: none" if first is None else f"first intervention: {describe_event(first)}")
     troubles = [event for event in replay.events if event.kind not in INTERVENTIONS and event.source in SHOWN]
     for event in list({(event.kind, event.source): event for event in reversed(troubles)}.values())[::-1]:
         count = sum(other.kind == event.kind and other.source == event.source for other in troubles)
-        told_once = told(event, with_kind=False)
+        told_once = describe_event(event, with_kind=False)
         lines.append(
             f"{event.kind}{SHOWN[event.source]}: {told_once}" + (f"; {count} such intervals" if count > 1 else "")
         )
@@ -198,7 +196,7 @@ def when_and_why(replay: Replay) -> list[str]:
     return lines or ["no event: no state is below the margin, outside its limits or in space that is not known"]
 
 
-def told(event: Event, *, with_kind: bool = True) -> str:
+def describe_event(event: Event, *, with_kind: bool = True) -> str:
     unit = UNITS.get(event.kind, "")
     span = f"{event.start_s:.2f} to {event.end_s:.2f} s"
     more = f" and {event.num_names - 1} more" if event.num_names > 1 else ""
@@ -218,27 +216,27 @@ def write_steps(path: Path, chunks: Iterable[Mapping[str, Sequence[object]]]) ->
     with path.open("w", encoding="utf-8", newline="") as stream:
         for index, columns in enumerate(chunks):
             if index == 0:
-                stream.write(",".join(map(_quoted, columns)) + "\n")
-            parts = [_formatted(values) for values in columns.values()]
+                stream.write(",".join(map(_quote, columns)) + "\n")
+            parts = [_format_cells(values) for values in columns.values()]
             row = ",".join(form for form, _ in parts) + "\n"
             stream.write("".join(map(row.__mod__, zip(*(cells for _, cells in parts), strict=True))))
 
 
-def _formatted(values: Sequence[object]) -> tuple[str, Sequence[object]]:
+def _format_cells(values: Sequence[object]) -> tuple[str, Sequence[object]]:
     kinds = set(map(type, values))
     if kinds == {float} and all(map(math.isfinite, values)):  # type: ignore[arg-type]
         return "%.9g", values
     if kinds == {int}:
         return "%d", values
     if kinds == {str}:
-        known = {value: _quoted(str(value)) for value in set(values)}
+        known = {value: _quote(str(value)) for value in set(values)}
         return "%s", [known[value] for value in values]
     return "%s", [
-        _quoted(str(v)) if not isinstance(v, float) else f"{v:.9g}" if math.isfinite(v) else "" for v in values
+        _quote(str(v)) if not isinstance(v, float) else f"{v:.9g}" if math.isfinite(v) else "" for v in values
     ]
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if _SPECIAL.search(text) else text
 
 
@@ -292,7 +290,7 @@ def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
 def _intervals(
     replay: Replay, is_shown: Callable[[Event], bool], *, at_least: Sequence[str] = ()
 ) -> dict[str, list[tuple[float, float]]]:
-    """Spans [s] of shown events, by kind and measure; kinds in `at_least` always appear."""
+    """Spans [s] of shown events by kind and measure, with all of `at_least`."""
     found: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
     for event in replay.events:
         if is_shown(event):

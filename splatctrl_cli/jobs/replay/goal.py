@@ -18,7 +18,7 @@ from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController, class_c
 from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.control.replay import Waypoint
 from splatctrl_cli.control.step import OURS, Commander, ControlStep
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.replay.request import ReplayRequest
@@ -71,7 +71,7 @@ def goal_waypoints(
 
 
 def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64:
-    """Configuration (J,) of --goal-joints; omitted gripper fingers stay as logged at the end. Raises InputError."""
+    """Configuration (J,) of --goal-joints; omitted fingers as logged at the end."""
     is_arm = [name not in model.urdf.grippers for name in model.joint_names]
     if len(values) == sum(is_arm):
         posture = logged_end.copy()
@@ -86,10 +86,9 @@ def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint,
     Columns or keys: x, y, z, qx, qy, qz, qw, or one per joint name. CSV has a header; TOML tables ``[[waypoint]]``
     with ``pose = [...]`` or ``joints = [...]``. Raises InputError.
     """
-    try:
+    remedy = "give --waypoints a .toml or .csv file"
+    with refuse_faults(f"{path}: cannot be read", OSError, UnicodeDecodeError, remedy=remedy):
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}", remedy="give --waypoints a .toml or .csv file") from None
     rows = list(_csv_rows(path, text, model.joint_names) if path.suffix == ".csv" else _toml_rows(path, text))
     if not rows:
         raise InputError(f"{path}: expected at least one waypoint, got none")
@@ -100,10 +99,8 @@ def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint,
             posture = checked_posture(model, np.array(row), what=what)
             waypoints.append(Waypoint(T_world_goal=model.frame_pose(posture, frame), posture=posture))
             continue
-        try:
+        with refuse_faults(what, ValueError):
             values = checked_pose(row)
-        except ValueError as error:
-            raise InputError(f"{what}: {error}") from None
         waypoints.append(Waypoint(T_world_goal=transform_from(values[:3], values[3:])))
     return tuple(waypoints)
 
@@ -124,10 +121,8 @@ def _csv_rows(path: Path, text: str, joints: tuple[str, ...]) -> Iterator[tuple[
 
 
 def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, list[float]]]:
-    try:
+    with refuse_faults(f"{path}: not valid TOML", tomllib.TOMLDecodeError):
         document: dict[str, Any] = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
     entries = document.get("waypoint", [])
     for number, entry in enumerate(entries if isinstance(entries, list) else [entries]):
         if not isinstance(entry, dict) or len(entry) != 1 or not set(entry) <= {"pose", "joints"}:
@@ -224,7 +219,7 @@ def check_controller(request: ReplayRequest) -> None:
             "--controller, --controller-command: expected --mode open-loop or closed-loop",
             remedy="an audit does not ask a controller",
         )
-    _named_command(request)
+    _read_command(request)
 
 
 @contextmanager
@@ -244,7 +239,7 @@ def commander_of(
     if request.controller is None and request.controller_command is None:
         yield OURS
         return
-    name, command = _named_command(request)
+    name, command = _read_command(request)
     console.log(f"replay: starting the controller {name}")
     with OutsideController(
         name,
@@ -264,7 +259,7 @@ def commander_of(
             )
 
 
-def _named_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:
+def _read_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:
     if request.controller is not None:
         if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", request.controller):
             raise UsageError(f"--controller: expected module:Class, got {request.controller!r}")

@@ -22,7 +22,7 @@ class LaterDepth:
     """A state that kept the margin in the map, but not by later depth.
 
     stamp_ns: of the state. clearance [m]: by the depth of `depth_ns`. since_ns: start of a stretch without depth
-    about the arm that this depth ends, 0 without.
+    about the arm, or 0.
     """
 
     depth_ns: int
@@ -127,7 +127,6 @@ class Hindsight:
                 yield later_ns
 
     def _hold_against(self, since_ns: int, until_ns: int, num: int) -> None:
-        """Compare the first `num` postures, if clear in their own map, with a later one."""
         stamps, q = np.array(self._stamps[:num]), np.asarray(self._postures[:num])
         after = self._clearance_in(until_ns, stamps, q)
         near = np.flatnonzero(after < self._margin)

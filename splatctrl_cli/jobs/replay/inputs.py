@@ -19,7 +19,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.robot.logged_robot import other_frame, urdf_of, with_self_model
+from splatctrl_cli.jobs.robot.logged_robot import add_self_model, other_frame, urdf_of
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.log.stored_frame import FrameSource
@@ -68,7 +68,7 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
         )
     if request.urdf is None and request.base is None and (words := other_frame(urdf, source)):
         progress.log(f"warning: the robot is placed at the origin: {words}; give --base if it stood elsewhere")
-    return with_self_model(model.moved_by(source.joint_names), request.self_model, request.scene), source
+    return add_self_model(model.moved_by(source.joint_names), request.self_model, request.scene), source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,6 @@ def measured_robot(
 
 
 def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
-    """Sentences on the robot to read before trusting this replay."""
     model = robot.model
     if request.mode == "audit":
         return list(model.doubts)
@@ -149,12 +148,14 @@ def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[s
 
 
 def _self_margin_words(robot: MeasuredRobot, kept: Sequence[KeptMargin], config: ControlConfig) -> str:
-    each = ", ".join(f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_told(pair)}" for pair in kept)
+    each = ", ".join(
+        f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_gap_words(pair)}" for pair in kept
+    )
     judged = "" if robot.surfaces is None else "; whether links touch is judged by their surfaces"
     return f"self-collision margin: {1e3 * config.self_margin:g} mm, or what spheres can keep: {each}{judged}"
 
 
-def _told(pair: KeptMargin) -> str:
+def _gap_words(pair: KeptMargin) -> str:
     if pair.surface_gap is None:
         return ""
     if pair.surface_gap <= 0:
@@ -186,7 +187,6 @@ def coverage_words(model: RobotModel, config: ControlConfig) -> str:
 
 
 def _check_bounded(model: RobotModel) -> None:
-    """Raise InputError for a moving link without a sphere, or without a measurement."""
     wanted = "control.coverage = margin"
     if model.coverage is None:
         raise InputError(
@@ -216,7 +216,7 @@ def _proven(link: LinkCoverage) -> float:
 class LoggedStates:
     """States in the model's joint order, their source, and its checks.
 
-    poses: against forward kinematics, None without logged poses. clock: of cameras against the robot.
+    poses: against forward kinematics, None if unlogged. clock: of cameras against the robot.
     """
 
     source: RecordSource
@@ -275,7 +275,7 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
 def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[DeclaredContact]:
     """Contact of a hand's links with a grasped part where it is taken and left.
 
-    It lasts until `GRASPING` after the part is taken, since the map still shows it there.
+    It lasts `GRASPING` longer: the map still shows the part there.
     """
     bodies = model.urdf.rigid_bodies(set(model.joint_names) - set(model.urdf.grippers))
     first_ns = int(states.stamp_ns[0])

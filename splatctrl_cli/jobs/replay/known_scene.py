@@ -56,10 +56,9 @@ class KnownScene:
     """The scene a replay may use at each time; unknown before `first_ns` (None: always known).
 
     `at(stamp_ns)` returns the same object while a scene is in use. observed, cameras: None if not recorded.
-    stamps_ns: of consecutive scenes, each known `latency_ns` after its stamp; empty for one scene for all times.
-    `advance` to a stamp makes the scenes up to it; call `finish` after the replay. box: of a grid's cell centres.
-    moment_ns: the time of a baked field. seen_at: when space was last seen, as known at a stamp; without
-    has_seen_times only if it ever was.
+    stamps_ns: of scenes, each known `latency_ns` later; empty for one scene for all times. `advance` makes the scenes
+    up to a stamp; call `finish` after the replay. box: of a grid's cell centres. moment_ns: of a baked field.
+    seen_at: when space was last seen, as known at a stamp; without has_seen_times, if it ever was.
     """
 
     at: Callable[[int], KnownFields]
@@ -137,7 +136,7 @@ def from_grid(path: Path) -> KnownScene:
     barrier = GridField(grid)
     states = grid.channels.get("observed")
     observed = None if states is None else partial(observed_at, states.astype("uint8"), grid.origin, grid.voxel)
-    seen = None if observed is None else _seen_in_grid(observed, grid)
+    seen = None if observed is None else _grid_seen(observed, grid)
     made_from = made if isinstance(made := grid.header.get("made_from"), dict) else {}
     fields = KnownFields(
         barrier=barrier,
@@ -213,7 +212,7 @@ def seen_of(voxels: SeenVoxels) -> Seen:
     return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel, is_free=voxels.is_free)
 
 
-def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
+def _grid_seen(observed: Observed, grid: DistanceGrid) -> Seen:
     def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
         is_seen = np.isin(observed(points), BY_CAMERA)  # the robot's spheres stick out: swept space is not seen
         classes = np.where(is_seen, EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW).astype(np.uint8)

@@ -20,7 +20,7 @@ from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.reconstruct.reconstruct import arm_seen
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import check_pose_jumps
-from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, trained, training_options
+from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, select_trained, training_options
 from splatctrl_cli.jobs.replay.known_scene import (
     KnownFields,
     KnownScene,
@@ -54,7 +54,7 @@ def check_lockstep(request: ReplayRequest) -> None:
         raise UsageError(f"--device {request.device}: expected --lockstep: only a fit is worth a card", remedy=TO_CPU)
 
 
-def opened_scene(
+def choose_scene(
     request: ReplayRequest,
     model: RobotModel,
     declared: Declarations,
@@ -74,12 +74,10 @@ def opened_scene(
             )
         return from_grid(request.field)
     if request.scene is not None:
-        return from_splats(request.scene, request.config, request.threads, latency_ns=_latency_ns(request))
+        return from_splats(
+            request.scene, request.config, request.threads, latency_ns=int(request.latency * 1e9 + 0.5)
+        )
     return from_log(request, model, folder, console, declared, source, observe)
-
-
-def _latency_ns(request: ReplayRequest) -> int:
-    return int(request.latency * 1e9 + 0.5)
 
 
 def from_log(
@@ -93,8 +91,8 @@ def from_log(
 ) -> KnownScene:
     """Reconstruct a log as the replay goes, into `folder`/scene.
 
-    source: the log, if open already. observe: called with every frame; those after the replay's end in `finish`.
-    Raises InputError for a log without frames or a clock.
+    source: the log, if open already. observe: called with every frame, at last in `finish`. Raises InputError for a
+    log without frames or a clock.
     """
     config = request.config
     source = _training_source(request, model, source)
@@ -125,7 +123,7 @@ def from_log(
     return Lockstep(
         fitted,
         config,
-        _latency_ns(request),
+        int(request.latency * 1e9 + 0.5),
         console,
         ends_with_log=request.mode != "closed-loop",
         held_out_every=every_of(request.evidence),
@@ -154,7 +152,7 @@ class Lockstep:
         self._stopwatch = Stopwatch()
         self._taking: list[tuple[int, float]] = []  # stamp [ns] and duration [s] of each frame set
         self._held_out_every = held_out_every
-        self._steps = trained(fitted.time_steps(), held_out_every)
+        self._steps = select_trained(fitted.time_steps(), held_out_every)
         self._next = next(self._steps, None)
         self._stamps_ns: list[int] = []
         self._files: list[Path] = []
@@ -187,7 +185,7 @@ class Lockstep:
             at=at,
             seen_at=seen_at,
             figures=self._fitted.metrics,
-            observed=self._observed,
+            observed=self._observe,
             first_ns=self._stamps_ns[0] + self._latency_ns,
             cameras=tuple(self._fitted.cameras),
             digests={},
@@ -217,7 +215,7 @@ class Lockstep:
             self._stamps_ns.append(snapshot.stamp_ns)
             self._files.append(snapshot.path)
 
-    def _observed(self, points: Float64) -> UInt8:
+    def _observe(self, points: Float64) -> UInt8:
         while self._ends_with_log and self._next is not None:
             self._take()
         num_taken, known = self._known
@@ -227,7 +225,7 @@ class Lockstep:
         return known(points)
 
     def _finish(self) -> None:
-        """Write a scene folder as `reconstruct` does; later frames go to `observe` alone."""
+        """Write a scene folder; later frames go to `observe` alone."""
         fitted = self._fitted
         if fitted.observe is not None:
             with self._stopwatch.stage("read"):

@@ -44,10 +44,7 @@ from splatctrl_cli.voxels import EvidenceClass
 
 Metrics = dict[str, float | None]
 Declared = tuple[Metric[Replay], ...]
-
-
-def num_states(replay: Replay) -> int:
-    return len(replay.audit.stamp_ns)
+num_states: Callable[[Replay], int] = attrgetter("num_states")
 
 
 def is_blank(replay: Replay) -> Bool:
@@ -71,7 +68,7 @@ def _clearance(field: str) -> Metric[Replay]:
     )
 
 
-def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
+def _column(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
     figures = attrgetter(columns)
     return lambda replay: figures(replay)[name] if part is None else figures(replay)[name][:, part]
 
@@ -103,7 +100,7 @@ AT_GOAL = Scale(unit="m", better=Better.LOWER, absolute=ControlConfig().goal_pos
 TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_rotation)
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
 NEAREST = Shown(column="clearance_exact", pick="least")
-AUDIT = partial(_of, "audit.figures")
+AUDIT = partial(_column, "audit.figures")
 OF_AUDIT: Declared = (
     _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
     _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links), FAULTS),
@@ -148,24 +145,26 @@ OF_STATES: Declared = (
         scale=LIMIT,
         shown=Shown(column="limit_margin", pick="least"),
     ),
-    folded("max_velocity_share", LARGEST, _of("strain", "velocity"), _intervals, scale=BAD_SHARE),
-    folded("max_acceleration_share", LARGEST, _of("strain", "acceleration"), _num_sudden, scale=BAD_SHARE),
-    folded("min_clearance_surface", LEAST, _of("between", "surface"), scale=GAP, shown=NEAREST),
-    folded("min_clearance_between", LEAST, _of("between", "lower"), scale=GAP, shown=NEAREST),
-    folded("min_clearance_splats", LEAST, _of("between", "represented"), scale=GAP, shown=NEAREST),
-    folded("max_unseen_share", LARGEST, _of("near", "unseen"), scale=BAD_SHARE),
-    folded("max_assumed_share", LARGEST, _of("near", "assumed"), scale=BAD_SHARE),
-    folded("min_unseen_to_surface", LEAST, _of("near", "unseen_to_surface"), num_states, scale=GAP),
-    folded("min_blind_to_surface", LEAST, _of("near", "blind_to_surface"), num_states, scale=GAP),
+    folded("max_velocity_share", LARGEST, _column("strain", "velocity"), _intervals, scale=BAD_SHARE),
+    folded("max_acceleration_share", LARGEST, _column("strain", "acceleration"), _num_sudden, scale=BAD_SHARE),
+    folded("min_clearance_surface", LEAST, _column("between", "surface"), scale=GAP, shown=NEAREST),
+    folded("min_clearance_between", LEAST, _column("between", "lower"), scale=GAP, shown=NEAREST),
+    folded("min_clearance_splats", LEAST, _column("between", "represented"), scale=GAP, shown=NEAREST),
+    folded("max_unseen_share", LARGEST, _column("near", "unseen"), scale=BAD_SHARE),
+    folded("max_assumed_share", LARGEST, _column("near", "assumed"), scale=BAD_SHARE),
+    folded("min_unseen_to_surface", LEAST, _column("near", "unseen_to_surface"), num_states, scale=GAP),
+    folded("min_blind_to_surface", LEAST, _column("near", "blind_to_surface"), num_states, scale=GAP),
     *(
         figure
         for kind in EvidenceClass
         for figure in (
-            folded(f"max_share_{kind.name.lower()}", LARGEST, _of("near", "shares", kind), scale=BAD_SHARE),
-            folded(f"min_distance_{kind.name.lower()}", LEAST, _of("near", "nearest", kind), num_states, scale=GAP),
+            folded(f"max_share_{kind.name.lower()}", LARGEST, _column("near", "shares", kind), scale=BAD_SHARE),
+            folded(
+                f"min_distance_{kind.name.lower()}", LEAST, _column("near", "nearest", kind), num_states, scale=GAP
+            ),
         )
     ),
-    folded("max_evidence_age_s", LARGEST, _of("near", "age"), scale=AGE),
+    folded("max_evidence_age_s", LARGEST, _column("near", "age"), scale=AGE),
     _single("unjudged_s", lambda r: float(r.between["unbounded"].sum()) + r.lead_in_s, _intervals, AGE),
     folded(
         "unknown_share",
@@ -198,7 +197,7 @@ LARGEST_DIFFERENCE, LEAST_SLACK = (
     Shown(column="velocity_difference", pick="largest"),
     Shown(column="barrier_margin_logged", pick="least"),
 )
-STEPS, ASKED = partial(_of, "kept_steps.figures"), partial(_of, "open_loop.figures")
+STEPS, ASKED = partial(_column, "kept_steps.figures"), partial(_column, "open_loop.figures")
 
 
 def _rung(rung: Rung) -> Metric[Replay]:
@@ -278,9 +277,9 @@ OF_CLOSED_LOOP: Declared = (
         )
         for prefix, fold in (("max", LARGEST), ("end", LAST))
         for name, unit, column in (
-            ("joints", "rad", _of("divergence", "joints")),
-            ("position", "m", _of("divergence", "position")),
-            ("rotation_deg", "degrees", lambda replay: np.degrees(_of("divergence", "rotation")(replay))),
+            ("joints", "rad", _column("divergence", "joints")),
+            ("position", "m", _column("divergence", "position")),
+            ("rotation_deg", "degrees", lambda replay: np.degrees(_column("divergence", "rotation")(replay))),
         )
     ),
 )
@@ -296,7 +295,7 @@ AGREEMENT = {
 }  # scales of clearance_agreement's figures, except its tolerance
 
 
-def _declared(mode: str, of_fields: Sequence[str]) -> Declared:
+def _list_metrics(mode: str, of_fields: Sequence[str]) -> Declared:
     return (*OF_AUDIT, *map(_clearance, of_fields), *OF_STATES, *OF_MODE[mode])
 
 
@@ -304,7 +303,7 @@ def metric_scales(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
     """Comparison scales of `metrics_of` and of the log's own figures, by name."""
-    of_states = {metric.name: metric.scale for metric in _declared(mode, of_fields)}
+    of_states = {metric.name: metric.scale for metric in _list_metrics(mode, of_fields)}
     scales = of_states | LOG_FIGURES | (TWIST_FIGURES if has_twists else {})
     if has_truth:
         scales |= {f"truth_{figure}_{name}": scale for name in of_fields for figure, scale in AGREEMENT.items()}
@@ -313,14 +312,13 @@ def metric_scales(
 
 
 def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Shown]:
-    """Columns of ``steps.csv`` that show a metric, by metric name."""
-    return {metric.name: metric.shown for metric in _declared(mode, of_fields) if metric.shown is not None}
+    return {metric.name: metric.shown for metric in _list_metrics(mode, of_fields) if metric.shown is not None}
 
 
 def metrics_of(replay: Replay) -> Metrics:
     """Every printed, written and gated figure by name; None without a value."""
     metrics: Metrics = {
-        metric.name: metric.value(replay) for metric in _declared(replay.mode, tuple(replay.audit.clearance))
+        metric.name: metric.value(replay) for metric in _list_metrics(replay.mode, tuple(replay.audit.clearance))
     }
     metrics |= replay.twist_figures
     for name, agreement in replay.agreement.items():
@@ -332,7 +330,9 @@ def metrics_of(replay: Replay) -> Metrics:
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
     """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
     found = dict.fromkeys(metrics, num_states(replay))
-    found |= {metric.name: metric.count(replay) for metric in _declared(replay.mode, tuple(replay.audit.clearance))}
+    found |= {
+        metric.name: metric.count(replay) for metric in _list_metrics(replay.mode, tuple(replay.audit.clearance))
+    }
     for field, agreement in replay.agreement.items():
         compared = int(agreement["num_compared"] or 0)
         found |= {f"truth_{name}_{field}": compared for name in AGREEMENT if name != "num_compared"}
@@ -345,7 +345,7 @@ def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> f
     None for metrics that are not of single states.
     """
     running = next(
-        (of.running for of in _declared(replay.mode, tuple(replay.audit.clearance)) if of.name == metric), None
+        (of.running for of in _list_metrics(replay.mode, tuple(replay.audit.clearance)) if of.name == metric), None
     )
     start, values = (np.nan, ()) if running is None else running(replay)
     if running is None or not holds(start):

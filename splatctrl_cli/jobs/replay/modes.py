@@ -30,18 +30,18 @@ from splatctrl_cli.robot.model import RobotModel
 def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
-    mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[request.mode]
+    mode = {"audit": _audit, "open-loop": _ask, "closed-loop": _drive}[request.mode]
     return mode(request, inputs, config, console)
 
 
-def _audited(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
+def _audit(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     for stamps, positions, velocities in _blocks(record, inputs.states, first):
         record.explain(record.measured(stamps, positions, velocities))
-    return _logged(request, inputs, config, record, first)
+    return _finish_logged(request, inputs, config, record, first)
 
 
-def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
+def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     scene, model, states = inputs.scene, inputs.model, inputs.states
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     frame = request.frame or model.frame_names[-1]
@@ -69,7 +69,7 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
             record.explain(part, trace.steps)
     audit = record.audit
     return replace(
-        _logged(request, inputs, config, record, first),
+        _finish_logged(request, inputs, config, record, first),
         open_loop=asked,
         kept_steps=asked.kept,
         twist_figures=twist_figures(
@@ -79,8 +79,8 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
     )
 
 
-def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -> ReplayTrace:
-    """Add the change to the first scene after the motion: an obstacle may have appeared."""
+def _add_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -> ReplayTrace:
+    """Add the change to the first scene after the motion."""
     last_ns = int(trace.stamp_ns[-1])
     next_ns = scene.next_ns(last_ns)
     if next_ns is None:
@@ -90,7 +90,7 @@ def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -
     return replace(trace, scene_changes=(*trace.scene_changes, change))
 
 
-def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
+def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
     motion = inputs.motion()
     task = _task(
@@ -117,7 +117,7 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
             distance_to=scene.at(task.stamp_ns).distances["exact"],
             balls_at=lambda stamp: scene.at(stamp).balls,
         )
-    trace = _with_next_scene(trace, scene, model)
+    trace = _add_next_scene(trace, scene, model)
     apart = Figures()
     for first, last in record.blocks(trace.stamp_ns):
         stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])
@@ -126,7 +126,7 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
         joints, position, rotation = divergence(model, task.frame, stamps, positions, motion)
         apart.append(joints=joints, position=position, rotation=rotation)
     return replace(
-        _replay(request, inputs, config, record, trace.static_violations, radius_of=0),
+        _finish(request, inputs, config, record, trace.static_violations, radius_of=0),
         closed_loop=trace,
         kept_steps=loop.kept,
         divergence=apart,
@@ -157,10 +157,12 @@ def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[
         yield states.stamp_ns[part], states.position[part], states.velocity[part]
 
 
-def _logged(request: ReplayRequest, inputs: ReplayInputs, config: Config, record: ReplayRecord, first: int) -> Replay:
+def _finish_logged(
+    request: ReplayRequest, inputs: ReplayInputs, config: Config, record: ReplayRecord, first: int
+) -> Replay:
     states, model = inputs.states, inputs.model
     last = inputs.scene.at(int(states.stamp_ns[-1]))
-    return _replay(
+    return _finish(
         request,
         inputs,
         config,
@@ -170,7 +172,7 @@ def _logged(request: ReplayRequest, inputs: ReplayInputs, config: Config, record
     )
 
 
-def _replay(
+def _finish(
     request: ReplayRequest,
     inputs: ReplayInputs,
     config: Config,
@@ -207,10 +209,6 @@ def _replay(
 
 
 def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
-    """Stamp from which to replay the log.
-
-    Raises InputError for a start after its end, NotEvaluableError if the log ends before the scene.
-    """
     scene, stamps = inputs.scene, inputs.states.stamp_ns
     if scene.first_ns is not None and scene.first_ns > stamps[-1]:
         apart = times_apart(stamps, (scene.first_ns, max((scene.first_ns, *scene.stamps_ns))))

@@ -32,10 +32,8 @@ from splatctrl_cli.robot.self_margins import least_gap
 def clearance(judged: Judged) -> Iterator[Reason]:
     """The exact distance of every moving sphere to the splats keeps the margin."""
     represented = lowest(judged.replay.between["represented"])
-    if represented is not None and represented >= judged.threshold:
-        yield from _unrepresented(judged, represented)
-    else:
-        yield from _by_source(judged, "exact")
+    is_starved = represented is not None and represented >= judged.threshold
+    yield from _check_source(judged, "exact", represented if is_starved else None)
 
 
 def certified_clearance(judged: Judged) -> Iterator[Reason]:
@@ -45,7 +43,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
         return
     least, exact = (lowest(np.asarray(clearance[name])) for name in ("certified", "exact"))
     if least is None or exact is None or not least < judged.threshold <= exact:
-        yield from _by_source(judged, "certified")
+        yield from _check_source(judged, "certified")
         return
     room, loss = exact - judged.threshold, exact - least
     voxel = judged.metrics.get("voxel") or 0.02
@@ -55,7 +53,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
         threshold=judged.replay.margin,
         unit="m",
         remedy=f"bake again with --voxel at most {max(voxel * room / loss, 1e-3):.2g}, or give --scene",
-        count=judged.num_states,
+        count=judged.replay.num_states,
     )
 
 
@@ -63,28 +61,42 @@ def clearance_of_people(judged: Judged) -> Iterator[Reason]:
     """The arm keeps `control.human_margin` from people; judged if that exceeds the margin."""
     control = judged.request.config.control
     if control.human_margin > control.margin:
-        yield from _by_source(judged, "barrier")
+        yield from _check_source(judged, "barrier")
 
 
 def true_clearance(judged: Judged) -> Iterator[Reason]:
     """The true clearance of every moving sphere keeps the margin; judged with `--truth`."""
     if judged.replay.true_clearance is not None:
-        yield from _by_source(judged, "true")
+        yield from _check_source(judged, "true")
 
 
-def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
+def _check_source(judged: Judged, source: str, represented: float | None = None) -> Iterator[Reason]:
+    """represented [m]: clearance to splats, if voxels without one alone break the margin."""
     replay = judged.replay
     least = lowest(np.asarray(replay.true_clearance if source == "true" else replay.audit.clearance[source]))
     if least is None:
         return
     if least >= judged.threshold:
-        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
+        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.replay.num_states)
         return
-    events = events_of(replay, EventKind.IN_COLLISION if least < 0 else EventKind.BELOW_MARGIN, source)
+    is_contact = least < 0 and represented is None
+    events = events_of(replay, EventKind.IN_COLLISION if is_contact else EventKind.BELOW_MARGIN, source)
     worst = min(events, key=lambda event: event.worst)
+    if represented is not None:
+        starved = lacking(
+            sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats "
+            f"are {mm(represented)} away), margin {mm(replay.margin)}",
+            value=least,
+            threshold=replay.margin,
+            unit="m",
+            remedy="the map is starved: raise --max-splats",
+            count=judged.replay.num_states,
+        )
+        yield _locate(worst, starved)
+        return
     states = sum(event.num_states for event in events)
     apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
-    yield _at_worst(
+    yield _locate(
         worst,
         failed(
             sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}, {states} states in "
@@ -92,35 +104,13 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
             value=least,
             threshold=replay.margin,
             unit="m",
-            count=judged.num_states,
+            count=judged.replay.num_states,
             label=CONTACT if least < 0 else MARGIN,
         ),
     )
 
 
-def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
-    replay = judged.replay
-    least = lowest(np.asarray(replay.audit.clearance["exact"]))
-    assert least is not None
-    if least >= judged.threshold:
-        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
-        return
-    worst = min(events_of(replay, EventKind.BELOW_MARGIN, "exact"), key=lambda event: event.worst)
-    yield _at_worst(
-        worst,
-        lacking(
-            sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats "
-            f"are {mm(represented)} away), margin {mm(replay.margin)}",
-            value=least,
-            threshold=replay.margin,
-            unit="m",
-            remedy="the map is starved: raise --max-splats",
-            count=judged.num_states,
-        ),
-    )
-
-
-def _at_worst(event: Event, reason: Reason) -> Reason:
+def _locate(event: Event, reason: Reason) -> Reason:
     there = event.obstacle
     return replace(
         reason,
@@ -142,13 +132,13 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
         return
     if not events:
         yield (
-            _beside_fixture(judged)
+            _check_fixture(judged)
             or _brought_together(judged)
-            or held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
+            or held(f"at least {mm(least)}", least, 0.0, "m", judged.replay.num_states)
         )
         return
     worst = min(events, key=lambda event: event.worst)
-    yield _at_worst(
+    yield _locate(
         worst,
         failed(
             sentence=f"{worst.worst_name} overlap by {mm(-worst.worst)}",
@@ -156,13 +146,13 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
             threshold=0.0,
             unit="m",
             remedy="pairs that may touch are named by --srdf",
-            count=judged.num_states,
+            count=judged.replay.num_states,
             label=CONTACT,
         ),
     )
 
 
-def _beside_fixture(judged: Judged) -> Reason | None:
+def _check_fixture(judged: Judged) -> Reason | None:
     found = [(gap, stamp, pair) for pair, (gap, stamp) in judged.replay.closest.items() if pair.is_fixture]
     gap, stamp, pair = min(found, key=lambda one: one[0] - one[2].apart, default=(np.inf, 0, None))
     if pair is None or gap >= pair.apart - SLIGHTLY_UNDER:
@@ -176,13 +166,12 @@ def _beside_fixture(judged: Judged) -> Reason | None:
         who=" and ".join(pair.links),
         time_s=float(stamp - int(judged.replay.audit.stamp_ns[0])) * 1e-9,
         remedy="pairs that may touch are named by --srdf",
-        count=judged.num_states,
+        count=judged.replay.num_states,
         label=MARGIN,
     )
 
 
 def _brought_together(judged: Judged) -> Reason | None:
-    """The worst pair that our controller brought below its margin and the recording's distance."""
     inputs, replay = judged.inputs, judged.replay
     if replay.outside is not None:
         return None
@@ -200,7 +189,7 @@ def _brought_together(judged: Judged) -> Reason | None:
                 threshold=min(pair.apart, before),
                 unit="m",
                 remedy="fit finer spheres there (splatctrl robot spheres), or lower control.self_margin",
-                count=judged.num_states,
+                count=judged.replay.num_states,
                 label=MARGIN,
                 time_s=float(stamp - int(replay.audit.stamp_ns[0])) * 1e-9,
                 who=" and ".join(pair.links),
@@ -233,12 +222,9 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
 def position_limits(judged: Judged) -> Iterator[Reason]:
     """Joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise."""
     least = lowest(judged.replay.audit.figures["limit_margin"])
-    tolerance = judged.request.config.control.limit_tolerance
-    if least is None:
-        return
-    if least < -tolerance:
+    if least is not None and least < -judged.request.config.control.limit_tolerance:
         worst = min(events_of(judged.replay, EventKind.OUTSIDE_LIMITS), key=lambda event: event.worst)
-        yield _at_worst(
+        yield _locate(
             worst,
             failed(
                 sentence=f"{worst.worst_name} is {-least:.4f} rad or m outside its limits",
@@ -246,12 +232,12 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
                 threshold=0.0,
                 unit="rad",
                 remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
-                count=judged.num_states,
+                count=judged.replay.num_states,
                 label=LIMITS,
             ),
         )
-    else:
-        yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.num_states)
+    elif least is not None:
+        yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.replay.num_states)
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
@@ -270,19 +256,19 @@ def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Re
     most = float(np.max(values)) if len(values) else 0.0
     if most > LIMIT_EXCEEDED:
         worst = max(events_of(judged.replay, kind), key=lambda event: event.worst)
-        yield _at_worst(
+        yield _locate(
             worst,
             failed(
                 sentence=f"{worst.worst_name} reaches {most:.2f} times its limit",
                 value=most,
                 threshold=1.0,
                 remedy="check the stamps and units of the states, and the URDF's limits",
-                count=judged.num_states,
+                count=judged.replay.num_states,
                 label=LIMITS,
             ),
         )
     elif len(judged.replay.model.joint_names) and (kind is EventKind.TOO_FAST or most > 0):
-        yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.num_states)
+        yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.replay.num_states)
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
@@ -301,7 +287,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             who=bare[0],
             remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {judged.inputs.model.urdf.path}",
         )
-    spheres, surface, between = _of_body(judged)
+    spheres, surface, between = _body_clearance(judged)
     if surface is None:
         return
     if surface < judged.threshold:
@@ -313,16 +299,16 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=seconds_at(judged, int(np.nanargmin(judged.replay.between["surface"]))),
             remedy="use spheres that cover the robot: splatctrl robot spheres",
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
     elif between is None or between >= judged.threshold:
-        yield held(f"at least {mm(surface)}", surface, judged.replay.margin, "m", judged.num_states)
+        yield held(f"at least {mm(surface)}", surface, judged.replay.margin, "m", judged.replay.num_states)
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
     """A lower bound by the spheres' lever arms keeps the margin; intervals with too low a bound are halved."""
     model, columns = judged.replay.model, judged.replay.between
-    _, surface, between = _of_body(judged)
+    _, surface, between = _body_clearance(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
         return
     if between < judged.threshold <= surface:
@@ -335,14 +321,13 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
             unit="m",
             time_s=seconds_at(judged, int(np.nanargmin(columns["lower"]))),
             remedy=SLOW,
-            count=judged.num_states,
+            count=judged.replay.num_states,
         )
 
 
-def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
-    """Least clearance [m] of spheres, surface, and between states.
-
-    The last two are None if unknown. If the spheres break the margin, they are None and the first is NaN.
+def _body_clearance(judged: Judged) -> tuple[float, float | None, float | None]:
+    """Least clearance [m] of spheres, surface, and between states. The last two are None if unknown, or if the
+    spheres, then NaN, break the margin.
     """
     clearance = judged.replay.audit.clearance
     spheres = lowest(np.asarray(clearance["certified" if "certified" in clearance else "exact"]))  # as `surface` is

@@ -16,11 +16,11 @@ from splatctrl_cli.jobs.recordings.provenance import made_from_mismatches, scene
 from splatctrl_cli.jobs.replay.criteria import Judged
 from splatctrl_cli.jobs.replay.evidence import (
     Evidence,
+    add_agreement,
+    add_truth,
     check_evidence,
     map_error,
     open_evidence,
-    with_agreement,
-    with_truth,
 )
 from splatctrl_cli.jobs.replay.files import draw_worst_frames, worst_sights, write_replay
 from splatctrl_cli.jobs.replay.goal import check_controller, check_goal, check_twists
@@ -37,7 +37,7 @@ from splatctrl_cli.jobs.replay.inputs import (
     words_of,
 )
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
-from splatctrl_cli.jobs.replay.lockstep import check_lockstep, opened_scene
+from splatctrl_cli.jobs.replay.lockstep import check_lockstep, choose_scene
 from splatctrl_cli.jobs.replay.metrics import Metrics, metric_scales, metrics_of
 from splatctrl_cli.jobs.replay.modes import replayed
 from splatctrl_cli.jobs.replay.request import MODES, Replay, ReplayInputs, ReplayRequest
@@ -86,7 +86,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         inputs.scene.finish()
         logged = replace(logged, clock=clock_of(inputs.model, logged, motion))
         with stopwatch.stage("truth"):
-            found, sights = _seen_by_cameras(request, inputs, found)
+            found, sights = _watch(request, inputs, found)
         if evidence is not None:
             with stopwatch.stage("evidence"):
                 found = replace(found, map_error=map_error(evidence, inputs, found.audit, config.verdict))
@@ -126,27 +126,24 @@ def check_request(request: ReplayRequest) -> None:
     check_controller(request)
 
 
-def _seen_by_cameras(
-    request: ReplayRequest, inputs: ReplayInputs, replay: Replay
-) -> tuple[Replay, list[Sight | None]]:
-    """Add the truth and images of the worst moments in one pass over the frames."""
+def _watch(request: ReplayRequest, inputs: ReplayInputs, replay: Replay) -> tuple[Replay, list[Sight | None]]:
     off = inputs.scene.figures().get("displaced_cameras") or {}
     recorded = frames_of(inputs.source) if inputs.source.cameras else iter(())
-    replay, surfaces = with_truth(inputs, replay)
+    replay, surfaces = add_truth(inputs, replay)
     seen = (placed(frame, off) for frame in recorded)
     frames = seen if surfaces is None else surfaces.watching(seen)
     sights = worst_sights(inputs, replay, request.worst_frames, frames)
     if surfaces is not None:
         for _ in frames:  # those that no moment needs
             pass
-        replay = with_agreement(replay, surfaces)
+        replay = add_agreement(replay, surfaces)
     return replay, sights
 
 
 def _read(
     request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
 ) -> tuple[ReplayInputs, LoggedStates, Evidence | None, MeasuredRobot]:
-    """Read the inputs; `motion` sees every frame of the log now, or during a lockstep."""
+    """`motion` sees every frame of the log now, or during a lockstep."""
     model, opened = open_log(request, progress)
     if request.urdf is None:  # for who looks at the run
         (folder / ROBOT).write_text(model.urdf.text, encoding="utf-8", newline="")
@@ -165,7 +162,7 @@ def _read(
     if source.cameras and observe is None:
         for frame in frames_of(source):
             motion.add(frame)
-    scene = opened_scene(request, model, declared, folder, progress, source, observe)
+    scene = choose_scene(request, model, declared, folder, progress, source, observe)
     given = (request.urdf, request.spheres, request.self_model, request.srdf, request.truth, request.declare)
     files = [path for path in given if path not in (None, NO_SELF_MODEL)]
     inputs = ReplayInputs(

@@ -39,9 +39,9 @@ class ReplayRequest(RobotOptions, RunOptions):
     log: read by `options`. urdf: None for the robot of the log. The scene is `scene` (a reconstruction), `field` (a
     baked grid) or `lockstep` (reconstruct meanwhile, on `device`). Times are in seconds; start_time may be
     "first-map". evidence: a held-out camera, or k for each k-th frame set. require_evidence, require_proof: no pass
-    without evidence, or with space about the arm assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's
-    class ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the verdict sets no exit
-    code, except by `require`.
+    without evidence, or with space assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's class
+    ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the verdict sets no exit code,
+    except by `require`.
     """
 
     log: Path
@@ -111,8 +111,8 @@ class ReplayInputs:
 class MapError:
     """The map's error by held-out frame sets; `bound` is None if they are too few.
 
-    num_sets: within the judged time, num_seen of them with points near the motion. time_s (since the first judged
-    state), place (3,) [m]: where the miss equals the bound, which is at least 0.
+    num_sets: in the judged time; num_seen: with points near the motion. time_s (since the first judged state), place
+    (3,) [m]: where the miss equals the bound, which is at least 0.
     """
 
     source: str
@@ -128,10 +128,10 @@ class MapError:
 class Replay:
     """A finished replay of T states: audit, trace of its mode, and truth if known.
 
-    num_before_scene: requested states before the first scene, left out, over lead_in_s [s]. start_time_s: of the
-    first state. between, near, strain, statics, closest: as in `ReplayRecord`. unwatched, overtaken: from later
-    depth. obstacles (T,): nearest to the nearest sphere, in words. map_age_s (T,): of the scene in use. divergence:
-    of a closed loop from the log: joints [rad], position [m], rotation [rad]. outside: a user's controller.
+    num_before_scene: states left out before the first scene, over lead_in_s [s]. start_time_s: of the first state.
+    between, near, strain, statics, closest: as in `ReplayRecord`. unwatched, overtaken: from later depth. obstacles
+    (T,): nearest to the nearest sphere, in words. map_age_s (T,): of the scene in use. divergence: of a closed loop
+    from the log: joints [rad], position [m], rotation [rad]. outside: a user's controller.
     """
 
     model: RobotModel
@@ -161,6 +161,10 @@ class Replay:
     twist_figures: Mapping[str, float | None] = made_by(default_factory=dict)
     map_error: MapError | None = None
     outside: OutsideController | None = None
+
+    @property
+    def num_states(self) -> int:
+        return len(self.audit.stamp_ns)
 
     @property
     def margin(self) -> float:

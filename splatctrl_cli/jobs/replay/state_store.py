@@ -28,21 +28,11 @@ AUDITED = ("position", "limit_margin", "limit_joint", "self_clearance", "self_pa
 T = TypeVar("T")
 
 
-@dataclass(eq=False)
-class StampColumn:
-    """Stamps [ns] in memory, eight bytes each."""
-
-    _parts: list[Stamps] = field(default_factory=list)
-
-    def append(self, stamp_ns: Stamps) -> None:
-        self._parts.append(stamp_ns)
-
-    @property
-    def all(self) -> Stamps:
-        """(T,)."""
-        if len(self._parts) != 1:
-            self._parts = [np.concatenate([np.zeros(0, dtype=np.int64), *self._parts])]
-        return self._parts[0]
+def join_stamps(parts: list[Stamps]) -> Stamps:
+    """Stamps (T,) [ns] of blocks, which become one block in place."""
+    if len(parts) != 1:
+        parts[:] = [np.concatenate([np.zeros(0, dtype=np.int64), *parts])]
+    return parts[0]
 
 
 class StoredObjects(Sequence[T], Generic[T]):
@@ -114,7 +104,7 @@ class StoredAudit:
     """An `AuditTrace` in files; its clearances are distances alone, their spheres are in `figures`."""
 
     def __init__(self) -> None:
-        self._stamps, self.figures = StampColumn(), Figures()
+        self._stamps, self.figures = list[Stamps](), Figures()
         self._names: tuple[str, ...] = ()
 
     def add(self, part: AuditTrace) -> None:
@@ -129,7 +119,7 @@ class StoredAudit:
     @property
     def stamp_ns(self) -> Stamps:
         """(T,)."""
-        return self._stamps.all
+        return join_stamps(self._stamps)
 
     @property
     def position(self) -> Rows:
@@ -192,14 +182,14 @@ class StoredLoop(StepRecord):
 
     def __init__(self, num_joints: int) -> None:
         self.kept, self._num_joints = StoredSteps(), num_joints
-        self._stamps, self._position = StampColumn(), RowFile((num_joints,))
+        self._stamps, self._position = list[Stamps](), RowFile((num_joints,))
         self._waiting: list[tuple[int, Float64, ControlStep]] = []
 
     @property
     def stamp_ns(self) -> Stamps:
         """(T,)."""
         self._flush()
-        return self._stamps.all
+        return join_stamps(self._stamps)
 
     @property
     def position(self) -> Rows:
@@ -230,8 +220,8 @@ class StoredLoop(StepRecord):
 class StoredOpenLoop:
     """An `OpenLoopTrace` in files.
 
-    figures (T,): size and largest of the difference; slack of the logged velocity to the tightest barrier row and
-    limit. Also logged and difference (commanded less logged) (T, J) [rad/s].
+    figures (T,): size and largest of the difference; the logged velocity's slack to barrier and limit. Also logged
+    and difference (commanded less logged) (T, J) [rad/s].
     """
 
     def __init__(self) -> None:

@@ -7,7 +7,7 @@ from operator import attrgetter
 from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict, gate_reasons, verdict_of
 from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, nearby
-from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words, displaced
+from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words, find_displaced
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION
 from splatctrl_cli.jobs.replay.request import ReplayRequest
@@ -30,7 +30,7 @@ CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 def replay_verdict(judged: Judged) -> Verdict:
     replay, request = judged.replay, judged.request
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
-    if displaced(judged) is not None:
+    if find_displaced(judged) is not None:
         by_map = (*BY_MAP, *(() if replay.outside else BY_OUR_CONTROLLER))
         reasons = [  # what failed may be the robot itself, as an obstacle of the map
             replace(reason, outcome=Outcome.NOT_EVALUABLE, label="")
@@ -64,7 +64,7 @@ def replay_verdict(judged: Judged) -> Verdict:
 
 
 def _how(judged: Judged) -> str:
-    """Return "waived", "proven" (cameras saw all space within the margin free), or an empty text."""
+    """Return "waived", "proven" (all space within the margin seen free), or an empty text."""
     if any(waivers(judged.request)):
         return "waived"
     assumed = nearby(judged, judged.replay.near["assumed"])

@@ -24,7 +24,7 @@ from splatctrl_cli.jobs.runs.run_folder import (
     open_batch,
     open_run,
 )
-from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, packed, picture, rendered
+from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, pack, picture, render_page
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
 MOST_ROWS = 40  # of recordings that are shown at once
@@ -45,8 +45,8 @@ class ViewRequest(FolderRequest):
 class WriteReportRequest(ViewRequest):
     """A report on a run's or batch's folder into HTML; out: None for PATH.html.
 
-    against: an earlier run, batch or baseline to compare with. all_scenes: every scene of a batch in 3-D, not only
-    failed, changed and worst ones.
+    against: an earlier run, batch or baseline to compare with. all_scenes: of a batch in 3-D, not only failed,
+    changed and worst ones.
     """
 
     against: Path | None = None
@@ -67,10 +67,11 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
 
     Raises InputError if `path` is no run or batch, incomplete, too new, or not comparable with `against`.
     """
-    if is_batch(request.path):
-        page = _of_batch(request, open_batch(request.path), progress)
-    else:
-        page = _of_run(request, open_run(request.path))
+    page = (
+        _page_of_batch(request, open_batch(request.path), progress)
+        if is_batch(request.path)
+        else _page_of_run(request, open_run(request.path))
+    )
     file = _write(request, page)
     return WriteReportResult(
         file=file,
@@ -82,21 +83,21 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
 
 
 def _write(request: FolderRequest, page: Page) -> Path:
-    out = request.out or beside(request.path)
+    out = request.out or default_page(request.path)
     with output_path(out, force=request.force, is_folder=False) as partial:
-        partial.write_text(rendered(page), encoding="utf-8")
+        partial.write_text(render_page(page), encoding="utf-8")
     return out
 
 
-def beside(path: Path) -> Path:
+def default_page(path: Path) -> Path:
     place = path.absolute() if not path.name.strip(".") else path
     return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
 
 
-def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
+def _page_of_run(request: WriteReportRequest, run: RunFolder) -> Page:
     section, scenes = section_of(run, anchor="run", title=run.path.absolute().name), dict[str, str]()
     if run.command in WITH_SPACE:
-        section = _in_space(section, run, request.roots, scenes, "scene")
+        section = _add_space(section, run, request.roots, scenes, "scene")
     return Page(
         title=f"{run.command} {run.path.absolute().name}",
         state=section.state,
@@ -108,11 +109,11 @@ def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
     )
 
 
-def _in_space(
+def _add_space(
     section: RunSection, run: RunFolder, roots: tuple[Path, ...], scenes: dict[str, str], name: str
 ) -> RunSection:
     try:
-        scenes[name] = packed(space_of_run(run, roots))
+        scenes[name] = pack(space_of_run(run, roots))
         return replace(section, space=name)
     except SplatCtrlError as error:
         return replace(section, no_space=f"not in 3-D: {error}")
@@ -133,7 +134,7 @@ class _Job:
         return min((float(value) for value in values if isinstance(value, int | float)), default=math.inf)
 
 
-def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
+def _page_of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
     changes, changed = changes_since(request.against, request.path, has_links=True)
     jobs = sorted(
         (_job(batch, ran, ran.node in changed) for ran in batch.runs),
@@ -206,7 +207,6 @@ def _job(batch: BatchFolder, ran: Run, is_changed: bool) -> _Job:
 
 
 def _is_told(job: _Job, *, is_seen: bool) -> bool:
-    """True for jobs with a section: replays, unexpected or changed results, and maps to show."""
     if is_seen and job.ran.command == "reconstruct" and job.run is not None:
         return True
     if job.ran.state in ("skipped", "to do"):  # without a run
@@ -238,7 +238,7 @@ def _section(
         )
     if not has_space:
         return replace(section, no_space="not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else "")
-    return _in_space(section, run, (batch.path, *request.roots), scenes, f"scene-{len(scenes)}")
+    return _add_space(section, run, (batch.path, *request.roots), scenes, f"scene-{len(scenes)}")
 
 
 def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[Table]:
@@ -308,7 +308,7 @@ def view(request: ViewRequest) -> ViewResult:
         state="",
         sentence="",
         runs=[RunSection(anchor="scene", title="", state="", sentence="", space="scene")],
-        scenes={"scene": packed(space)},
+        scenes={"scene": pack(space)},
         opens=True,
     )
     file = _write(request, page)

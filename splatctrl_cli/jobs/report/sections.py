@@ -75,7 +75,6 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
 
 
 def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:
-    """Spans [s] of events by kind and measure: faults, then what shaped a command."""
     found: dict[str, list[tuple[float, float]]] = {}
     shown = [event for event in (run.json_of("events.json") or {}).get("events", []) if event["source"] in SHOWN]
     for event in sorted(shown, key=lambda event: event["kind"] in INTERVENTIONS):
@@ -124,7 +123,7 @@ def _provenance(run: RunFolder) -> Table:
 
 
 HEADER = ("job", "what", "before", "now", "", "allowed", "unit", "where")
-STATES = {Change.WORSE: "failed"}  # of a row
+STATES: Mapping[str, str] = {Change.WORSE: "failed"}  # of a row
 
 
 def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple[list[Table], frozenset[str]]:
@@ -165,8 +164,8 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
     better = rows([one for one in found.figures if one.change is Change.BETTER])
     first = [
         (
-            (job(one.run), "verdict", one.before, one.after, one.change, None, None, None),
-            STATES.get(one.change, ""),
+            (job(one["run"]), "verdict", one["before"], one["after"], one["change"], None, None, None),
+            STATES.get(one["change"], ""),
         )
         for one in found.verdicts
     ]
@@ -183,4 +182,4 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
         tables.append(
             Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)
         )
-    return tables, frozenset([one.run for one in found.verdicts] + [one.run for one in worse])
+    return tables, frozenset([one["run"] for one in found.verdicts] + [one.run for one in worse])

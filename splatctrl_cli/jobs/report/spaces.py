@@ -19,7 +19,7 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
 from splatctrl_cli.recording.capture.capture import ROBOT
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
-from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_of, coarsened
+from splatctrl_cli.report.page import Motion, Space, Surface, bodies_of, coarsen
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
@@ -38,12 +38,10 @@ def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
     if path.suffix == ".npz":
         return space_of_grid(path)
     splats = read_splats(path)[0]
-    chosen = splats if isinstance(splats, SplatSet) else nearest_splats(splats)
-    return Space(splats={0.0: chosen})
+    return Space(splats={0.0: splats if isinstance(splats, SplatSet) else nearest_splats(splats)})
 
 
 def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
-    """`space_of` an open run."""
     path = run.path
     if run.command == REPLAY:
         return space_of_replay(run, roots)
@@ -57,10 +55,9 @@ def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 
 
 def space_of_scene(scene: SceneFolder) -> Space:
-    """Final splats of a scene, and unobserved space."""
     if scene.is_anisotropic:
         return Space(splats={0.0: nearest_splats(scene.gaussians())})
-    return _with_unknown(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
+    return _add_unknown(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
 
 
 def space_of_grid(path: Path) -> Space:
@@ -84,7 +81,7 @@ def space_of_grid(path: Path) -> Space:
     if "observed" not in grid.channels:
         return space
     is_unknown = np.asarray(grid.channels["observed"]) == VoxelState.NEVER_SEEN
-    return replace(space, unknown=coarsened(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN))
+    return replace(space, unknown=coarsen(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN))
 
 
 def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
@@ -124,7 +121,7 @@ def _robot(
     packages: tuple[Path, ...],
     _digests: tuple[str, ...],
 ) -> RobotModel:
-    """Cached, since runs of a batch share robots; the digests detect changed files."""
+    """Cached: runs of a batch share robots."""
     T = None if pose is None else transform_from(pose[:3], pose[3:])
     return RobotModel.from_urdf(urdf, spheres, T_world_base=T, locked=dict(locks), packages=packages)
 
@@ -145,18 +142,18 @@ def _file(run: RunFolder, given: str, roots: tuple[Path, ...]) -> Path:
     return place
 
 
-def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding: Deciding | None) -> Space:
+def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding: Mapping[str, Any] | None) -> Space:
     if (grid := run.option("--field")) is not None:
         place = _file(run, grid, roots)
         return space_of_grid(place / "field.npz" if place.is_dir() else place)
     scene = scene_of(run, roots)
     known = sets_known(run, states, scene)
     times, used = [time for time, _ in known], [snapshot for _, snapshot in known]
-    when = 0.0 if deciding is None else deciding.time_s
+    when = 0.0 if deciding is None else deciding["time"]
     chosen = spread(times, when)
     sets = {times[i] if n else 0.0: used[i].splats() for n, i in enumerate(chosen)}
     at = max((i for i in chosen if times[i] <= when), default=None)
-    return _with_unknown(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
+    return _add_unknown(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
 
 
 def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
@@ -192,16 +189,15 @@ def spread(times: list[float], when: float) -> list[int]:
     nearest = min(range(most), key=lambda i: abs(even[i] - at))
     if 0 < nearest < most - 1:
         even[nearest] = at
-        return sorted(set(even))
     return sorted({*even, at})
 
 
-def _with_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
+def _add_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
     if grid is None:
         return space
     used: Mapping[str, Any] = scene.run.get("config", {}).get("occupancy", {})
     states = grid.states(float(used.get("free_below", 0.3)), float(used.get("occupied_above", 0.7)))
-    return replace(space, unknown=coarsened(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN))
+    return replace(space, unknown=coarsen(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN))
 
 
 def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
@@ -233,26 +229,32 @@ def position_of(states: States, robot: RobotModel, state: int) -> Float64:
         ) from None
 
 
-def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | None:
+def _deciding(run: RunFolder, states: States, robot: RobotModel) -> dict[str, Any] | None:
     for reason in run.verdict.get("reasons", []):
         if reason["outcome"] != "passed" and reason["place"] is not None and reason["time_s"] is not None:
             words = f"{reason['sentence']} at {reason['time_s']:.2f} s, {reason['cause']}"
-            return _decided(states, robot, words, float(reason["time_s"]), reason["place"], str(reason["who"]))
+            return _find_deciding(states, robot, words, float(reason["time_s"]), reason["place"], str(reason["who"]))
     worst = states.worst()
     if worst is None or not states.obstacles or not (place := PLACE.search(states.obstacles[worst])):
         return None
     least = float(np.fmin.reduce([values[worst] for values in states.clearance.values()]))
     time_s = float(states.seconds[worst])
     words = f"least clearance {1e3 * least:.1f} mm at {time_s:.2f} s, near {states.obstacles[worst]}"
-    return _decided(states, robot, words, time_s, [float(part) for part in place.groups()], "")
+    return _find_deciding(states, robot, words, time_s, [float(part) for part in place.groups()], "")
 
 
-def _decided(states: States, robot: RobotModel, words: str, time_s: float, place: list[float], who: str) -> Deciding:
+def _find_deciding(
+    states: States, robot: RobotModel, words: str, time_s: float, place: list[float], who: str
+) -> dict[str, Any]:
     state = int(np.argmin(np.abs(states.seconds - time_s)))
     centers, radii = robot.sphere_centers(position_of(states, robot, state)), robot.sphere_set.radii
     names = sphere_names(robot.sphere_set)
     gaps = np.linalg.norm(centers - np.array(place), axis=1) - radii
     sphere = names.index(who) if who in names else int(np.argmin(np.where(robot.moving_spheres, gaps, np.inf)))
-    return Deciding(
-        sentence=words, time_s=time_s, place=np.array(place), sphere=(centers[sphere], float(radii[sphere]))
-    )
+    return {
+        "sentence": words,
+        "time": time_s,
+        "place": np.array(place).tolist(),
+        "center": centers[sphere].tolist(),
+        "radius": float(radii[sphere]),
+    }

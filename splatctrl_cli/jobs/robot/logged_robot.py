@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.formats.arrays import DAMAGE, read_arrays
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.geometry import transform_from
@@ -27,8 +27,8 @@ TAKE = "leave --urdf out to take the log's own, or correct the file"
 class RobotOptions:
     """Options to read a robot's URDF.
 
-    spheres: None for the URDF's own. packages: folders of meshes. base: root pose in world, x, y, z, qx, qy, qz, qw.
-    locked: values [rad or m] of unlogged joints.
+    spheres: None for the URDF's. packages: mesh folders. base: root pose in world, x, y, z, qx, qy, qz, qw. locked:
+    values [rad or m] of unlogged joints.
     """
 
     spheres: Path | None = None
@@ -70,20 +70,17 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
     return file
 
 
-def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = None) -> RobotModel:
+def add_self_model(model: RobotModel, given: Path | None, scene: Path | None = None) -> RobotModel:
     """Add a self-model (`robot learn`): the given file, else the scene's if of this robot.
 
-    `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or one given for another robot.
+    `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or another robot's.
     """
     path = scene / SELF_MODEL if given is None and scene is not None else given
     if path is None or path == NO_SELF_MODEL or (given is None and not path.is_file()):
         return model
-    try:
+    faults, remedy = (*DAMAGE, OSError, TypeError, AttributeError), "write it with: splatctrl robot learn"
+    with refuse_faults(f"{path}: not a self-model", *faults, remedy=remedy):
         found = SelfModel.from_arrays(read_arrays(path, most=2**30))  # bytes
-    except (*DAMAGE, OSError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: not a self-model: {error}", remedy="write it with: splatctrl robot learn"
-        ) from None
     try:
         found.check_robot(model.surface, model.urdf.links, path)
     except InputError:

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
@@ -29,7 +31,7 @@ from splatctrl_cli.robot.link_meshes import Solid, mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import SelfCollisionPairs, read_srdf, self_collision_pairs
 from splatctrl_cli.robot.sphere_files import (
-    SphereFile,
+    RENAMED,
     are_links_renamed,
     match_links,
     own_spheres,
@@ -81,95 +83,32 @@ class RobotRequest(RobotOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageResult:
-    """Coverage of a robot by spheres; file: None if just fitted; links_left_out: unknown links."""
+    """Coverage of a robot by spheres; document: for JSON; remarks: on the sphere file."""
 
     report: CoverageReport
     verdict: Verdict
-    spheres: Path
-    file: SphereFile | None = None
-    is_renamed: bool = False
-    links_left_out: tuple[str, ...] = ()
-
-    def as_dict(self) -> dict[str, Any]:
-        links = [
-            {
-                "link": link.link,
-                "num_spheres": link.num_spheres,
-                "area": link.area,
-                "uncovered_share": link.uncovered_share,
-                "uncovered_bounds": [bound / link.area for bound in link.uncovered_bounds],
-                "deficit": None if link.deficit is None else max(0.0, link.deficit.proven),
-                "deficit_found": None if link.deficit is None else max(0.0, link.deficit.found),
-                "place": None if link.deficit is None else link.deficit.place.tolist(),
-                "protrusion": link.protrusion,
-                "worst_sphere": link.worst_sphere,
-                "is_closed": link.is_closed,
-            }
-            for link in self.report.links
-        ]
-        return {"metrics": {name: of(self.report) for name, of in METRICS.items()}, "links": links}
+    document: Mapping[str, Any]
+    remarks: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class PairsResult:
-    """Links that may collide; num_foreign: SRDF pairs with unknown links."""
-
-    found: SelfCollisionPairs
-    num_foreign: int
-    doubts: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        rows = [
-            {
-                "links": list(pair.links),
-                "left_out": pair.left_out,
-                "sphere_pairs": pair.num_sphere_pairs,
-                "least_gap": finite(pair.least_gap),
-                "largest_gap": finite(pair.largest_gap),
-                "hit_share": finite(pair.hit_share),
-            }
-            for pair in self.found.link_pairs
-        ]
-        return {"num_sphere_pairs": len(self.found.pairs), "num_postures": self.found.num_postures, "pairs": rows}
-
-
-@dataclass(frozen=True, kw_only=True)
-class RobotResult:
-    """A robot, its locked joints, and faults of missing meshes."""
-
-    model: RobotModel
-    locked: Mapping[str, float]
-    lost_meshes: tuple[str, ...]
-
-    @property
-    def joints(self) -> list[tuple[str, float, float, float]]:
-        """Name, lower and upper limit [rad or m], and velocity limit of each joint."""
-        model = self.model
-        limits = zip(model.joint_names, model.lower, model.upper, model.velocity_limit, strict=True)
-        return [(name, float(lower), float(upper), float(velocity)) for name, lower, upper, velocity in limits]
-
-    @property
-    def doubts(self) -> list[str]:
-        return list(self.model.doubts) if len(self.model.sphere_set.radii) else []
-
-    def as_dict(self) -> dict[str, Any]:
-        urdf = self.model.urdf
-        joints = [
-            {"name": name, "lower": finite(lower), "upper": finite(upper), "velocity": finite(velocity)}
-            for name, lower, upper, velocity in self.joints
-        ]
-        return {
-            "urdf": str(urdf.path),
-            "joints": joints,
-            "locked": dict(self.locked),
-            "links": list(urdf.links),
-            "collision_links": list(urdf.collision_links),
-            "num_meshes": len(urdf.meshes),
-            "num_shapes": len(urdf.shapes),
-            "num_spheres": len(self.model.sphere_set.radii),
-            "doubts": self.doubts,
-            "meshes_not_found": list(self.lost_meshes),
+def _figures(report: CoverageReport) -> dict[str, Any]:
+    links = [
+        {
+            "link": link.link,
+            "num_spheres": link.num_spheres,
+            "area": link.area,
+            "uncovered_share": link.uncovered_share,
+            "uncovered_bounds": [bound / link.area for bound in link.uncovered_bounds],
+            "deficit": None if link.deficit is None else max(0.0, link.deficit.proven),
+            "deficit_found": None if link.deficit is None else max(0.0, link.deficit.found),
+            "place": None if link.deficit is None else link.deficit.place.tolist(),
+            "protrusion": link.protrusion,
+            "worst_sphere": link.worst_sphere,
+            "is_closed": link.is_closed,
         }
+        for link in report.links
+    ]
+    return {"metrics": {name: of(report) for name, of in METRICS.items()}, "links": links}
 
 
 def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageResult:
@@ -189,7 +128,8 @@ def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageRes
     return CoverageResult(
         report=report,
         verdict=_verdict(report, urdf, solids, "robot spheres", request.require, allowed),
-        spheres=request.out,
+        document={"urdf": str(request.urdf), "spheres": str(request.out), "seed": request.seed, **_figures(report)},
+        remarks=("", f"written: {request.out}"),
     )
 
 
@@ -203,40 +143,85 @@ def check_robot(request: RobotRequest) -> CoverageResult:
     report = coverage_of_solids(urdf, solids, spheres)
     if request.picture is not None:
         _draw(request.picture, urdf, solids, spheres)
+    texts = {
+        f"{file.num_off} spheres are switched off (radius 0 or less) and cover nothing": file.num_off,
+        RENAMED: are_links_renamed(file.spheres, urdf),
+        f"spheres of {', '.join(left_out)} are left out: {request.urdf.name} has no such link": left_out,
+    }
+    document = {
+        "urdf": str(request.urdf),
+        "spheres": str(path),
+        "layout": file.layout,
+        "num_switched_off": file.num_off,
+        "links_left_out": list(left_out),
+    }
     return CoverageResult(
         report=report,
         verdict=_verdict(report, urdf, solids, "robot check", request.require, DEFAULT_MARGIN),
-        spheres=path,
-        file=file,
-        is_renamed=are_links_renamed(file.spheres, urdf),
-        links_left_out=tuple(left_out),
+        document=document | _figures(report),
+        remarks=tuple(text for text, holds in texts.items() if holds),
     )
 
 
-def robot_pairs(request: RobotRequest) -> PairsResult:
-    """Find links that may collide, and why others may not."""
+def robot_pairs(request: RobotRequest) -> tuple[SelfCollisionPairs, dict[str, Any]]:
+    """Find links that may collide, and why others may not; also as a document."""
     model = RobotModel.from_urdf(request.urdf, request.spheres, locked=request.locked)
     disabled, foreign = ((), ()) if request.srdf is None else read_srdf(request.srdf, model.urdf)
-    return PairsResult(
-        found=self_collision_pairs(
-            model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
-        ),
-        num_foreign=len(foreign),
-        doubts=tuple(model.doubts),
+    found = self_collision_pairs(
+        model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
     )
+    return found, {
+        "urdf": str(request.urdf),
+        "seed": request.seed,
+        "num_foreign_pairs": len(foreign),
+        "num_sphere_pairs": len(found.pairs),
+        "num_postures": found.num_postures,
+        "pairs": [
+            {
+                "links": list(pair.links),
+                "left_out": pair.left_out,
+                "sphere_pairs": pair.num_sphere_pairs,
+                "least_gap": finite(pair.least_gap),
+                "largest_gap": finite(pair.largest_gap),
+                "hit_share": finite(pair.hit_share),
+            }
+            for pair in found.link_pairs
+        ],
+        "doubts": list(model.doubts),
+    }
 
 
-def describe_robot(request: RobotRequest) -> RobotResult:
-    """Describe joints, links, shapes and spheres, by default the URDF's own spheres."""
-    urdf = read_urdf(request.urdf)
+def describe_robot(request: RobotRequest) -> tuple[RobotModel, dict[str, Any]]:
+    """Read a robot with its locked joints, by default with the URDF's own spheres; also as a document.
+
+    Limits are in rad or m, velocities per second; meshes_not_found: sentences.
+    """
+    urdf, lost = read_urdf(request.urdf), []
     locked = urdf.with_followers(request.locked)
-    return RobotResult(
-        model=RobotModel.from_urdf(
-            request.urdf, own_spheres(urdf) if request.spheres is None else request.spheres, locked=locked
-        ),
-        locked=locked,
-        lost_meshes=_lost_meshes(urdf, request.packages),
-    )
+    spheres = own_spheres(urdf) if request.spheres is None else request.spheres
+    model = RobotModel.from_urdf(request.urdf, spheres, locked=locked)
+    for mesh in urdf.meshes:
+        try:
+            mesh_path(urdf.path, mesh, request.packages)
+        except InputError as error:
+            lost.append(str(error))
+    rows = np.column_stack([model.lower, model.upper, model.velocity_limit]).tolist()
+    limits = zip(model.joint_names, rows, strict=True)
+    return model, {
+        "urdf": str(model.urdf.path),
+        "joints": [
+            {"name": name, "lower": finite(lower), "upper": finite(upper), "velocity": finite(velocity)}
+            for name, (lower, upper, velocity) in limits
+        ],
+        "locked": dict(locked),
+        "links": list(model.urdf.links),
+        "collision_links": list(model.urdf.collision_links),
+        "num_meshes": len(model.urdf.meshes),
+        "num_shapes": len(model.urdf.shapes),
+        "num_spheres": len(model.sphere_set.radii),
+        "doubts": list(model.doubts) if len(model.sphere_set.radii) else [],
+        "meshes_not_found": lost,
+    }
 
 
 def coverage_summary(report: CoverageReport) -> str:
@@ -253,7 +238,6 @@ def coverage_summary(report: CoverageReport) -> str:
 
 
 def bare_links(report: CoverageReport) -> str:
-    """Sentence on links without a sphere, else empty."""
     bare = ", ".join(report.bare_links)
     return f"no sphere stands for {bare}: these links are not judged" if bare else ""
 
@@ -266,9 +250,8 @@ def _verdict(
     require: Sequence[str],
     allowed: float,
 ) -> Verdict:
-    """Judge spheres: uncovered surface, bare links, and each ``--require``.
-
-    Fails for surface more than `allowed` [m] outside, or a bare moving link; a gate on max_deficit replaces that.
+    """Fail for surface more than `allowed` [m] outside the spheres, or a bare moving link; a gate on max_deficit
+    replaces that.
     """
     num, bare = len(report.links), bare_links(report)
     counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)
@@ -281,7 +264,7 @@ def _verdict(
         unit="m",
         count=num,
     )
-    faults = _uncovered(report, urdf, allowed)
+    faults = _uncovered_links(report, urdf, allowed)
     if faults and not any(parse_gate(requirement)[0] == "max_deficit" for requirement in require):
         covered = replace(
             covered,
@@ -303,21 +286,11 @@ def _verdict(
     )
 
 
-def _uncovered(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[str]:
+def _uncovered_links(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[str]:
     bodies, root = urdf.rigid_bodies(), urdf.root
     bare = [f"{link} moves and has no sphere" for link in report.bare_links if bodies[link][0] != root]
     far = [(link.deficit.proven, link.link) for link in report.links if link.deficit is not None]
     return bare + [f"{link} is up to {1e3 * far:.1f} mm outside" for far, link in sorted(far)[::-1] if far > allowed]
-
-
-def _lost_meshes(urdf: UrdfFile, packages: Sequence[Path]) -> tuple[str, ...]:
-    lost = []
-    for mesh in urdf.meshes:
-        try:
-            mesh_path(urdf.path, mesh, packages)
-        except InputError as error:
-            lost.append(str(error))
-    return tuple(lost)
 
 
 def _comments(urdf: Path, report: CoverageReport) -> list[str]:

@@ -46,7 +46,7 @@ class Device:
         return {"device": self.name, **known}
 
 
-def opened(name: str, source: str = FIT) -> Device:
+def open_device(name: str, source: str = FIT) -> Device:
     """Open ``cuda`` or ``cuda:N`` for a source's kernels. Raises DeviceError with a remedy."""
     if missing := [module for module in EXTRA if not is_installed(module)]:
         raise DeviceError(f"the extra [cuda] is not installed ({missing[0]})", remedy=INSTALL)
@@ -61,12 +61,12 @@ def opened(name: str, source: str = FIT) -> Device:
     return Device(name=f"{CUDA}:{index}", card=card, memory=memory)
 
 
-def demanded(name: str, source: str = FIT) -> Device | None:
+def demand_device(name: str, source: str = FIT) -> Device | None:
     """Device of --device; None for auto. Raises UsageError if unusable."""
     if name in (AUTO, CPU):
         return None if name == AUTO else Device()
     try:
-        return opened(name, source)
+        return open_device(name, source)
     except DeviceError as error:
         raise UsageError(
             f"--device {name}: {error}", remedy=f"{error.remedy}, or {TO_CPU}" if error.remedy else TO_CPU
@@ -80,23 +80,23 @@ def automatic(
     try:
         if too_little:
             raise DeviceError(too_little)
-        device = opened(name, source)
+        device = open_device(name, source)
         assert device.memory is not None
         if needed > device.memory.available():
             raise DeviceError("too little memory is free on the card")
     except DeviceError as error:
         progress.log(f"computes on cpu: {error}")
         return Device()
-    progress.log(f"computes on {shown(device.as_dict())}")
+    progress.log(f"computes on {describe_device(device.as_dict())}")
     return device
 
 
-def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
+def choose_device(name: str, is_enough: bool, progress: Progress) -> Device:
     """Device of --device for fields; auto uses a card if the work is enough.
 
     Raises UsageError if unusable.
     """
-    if (device := demanded(name, FIELD)) is not None:
+    if (device := demand_device(name, FIELD)) is not None:
         return device
     return automatic(progress, source=FIELD) if is_enough else Device()
 
@@ -104,12 +104,12 @@ def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
 class FitDevice:
     """The device of a fit, and its earlier ones.
 
-    history: as in ``run.json``, with the first iteration of each. auto starts where the work is worth it, and resumes
-    where it was. Raises UsageError for an unusable device.
+    history: as in ``run.json``, with first iterations. auto starts where the work is worth it, and resumes where it
+    was. Raises UsageError for an unusable device.
     """
 
     def __init__(self, name: str = CPU) -> None:
-        self._device = demanded(name)
+        self._device = demand_device(name)
         self._fit: DeviceFit | None = None
         self.history: list[dict[str, Any]] = []
 
@@ -119,20 +119,20 @@ class FitDevice:
         sizes = [(frame.intrinsics.height, frame.intrinsics.width) for frame in frames]
         sizes += [max(sizes)] * window
         if self._device is None:
-            self._device = self._chosen(num_splats, sizes, progress)
+            self._device = self._choose(num_splats, sizes, progress)
         device, last = self._device, self.history[-1] if self.history else None
         if last is None or any(last.get(name) != device.as_dict().get(name) for name in ("device", "card")):
             begins = fitter.descent.num_iterations
             self.history.append({**device.as_dict(), "from_iteration": begins})
             if last is not None:
                 progress.log(
-                    f"warning: computed on {shown(last)} before iteration {begins}, on {shown(device.as_dict())} from"
-                    " there; for the bytes of one of them alone start over"
+                    f"warning: computed on {describe_device(last)} before iteration {begins}, on"
+                    f" {describe_device(device.as_dict())} from there; for the bytes of one of them alone start over"
                 )
         if device.memory is not None:
             self._fit = fitter.descent.device = DeviceFit(device.memory, num_splats, sizes)
 
-    def _chosen(self, num_splats: int, sizes: Sequence[tuple[int, int]], progress: Progress) -> Device:
+    def _choose(self, num_splats: int, sizes: Sequence[tuple[int, int]], progress: Progress) -> Device:
         last = self.history[-1]["device"] if self.history else ""
         if last == CPU:
             return Device()
@@ -148,14 +148,13 @@ class FitDevice:
 
     @contextmanager
     def told_how_to_go_on(self, checkpoint: Path) -> Iterator[None]:
-        """Add device and remedy to its failures."""
         try:
             yield
         except DeviceError as error:
-            raise named(error, self._device, checkpoint) from error
+            raise explain_fault(error, self._device, checkpoint) from error
 
 
-def named(error: DeviceError, device: Device | None, checkpoint: Path | None = None) -> DeviceFault:
+def explain_fault(error: DeviceError, device: Device | None, checkpoint: Path | None = None) -> DeviceFault:
     """Describe a device's failure, with a remedy from `checkpoint` if it exists."""
     kind = DeviceFull if isinstance(error, OutOfMemory) else DeviceFault
     remedies = [error.remedy] if error.remedy else []
@@ -164,9 +163,11 @@ def named(error: DeviceError, device: Device | None, checkpoint: Path | None = N
         remedies.append(f"{kept} is kept: go on with --resume, and --device cpu if it fails again")
     else:
         remedies.append("start over, with --device cpu if it fails again")
-    return kind(f"{'device' if device is None else shown(device.as_dict())}: {error}", remedy="; ".join(remedies))
+    return kind(
+        f"{'device' if device is None else describe_device(device.as_dict())}: {error}", remedy="; ".join(remedies)
+    )
 
 
-def shown(device: dict[str, Any]) -> str:
+def describe_device(device: dict[str, Any]) -> str:
     card = f" ({device['card']}, driver {device['driver']})" if "card" in device else ""
     return f"{device['device']}{card}"

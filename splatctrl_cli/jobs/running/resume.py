@@ -58,8 +58,7 @@ def deciding_versions() -> dict[str, str]:
 
 
 @contextmanager
-def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
-    """Add to Ctrl-C what was kept, by default the folder two above the checkpoint."""
+def advise_resumption(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
@@ -95,7 +94,9 @@ def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any])
     """Raise UsageError naming deciding values that differ from the interrupted run."""
     before, after = dict(_flat(run)), dict(_flat(now))
     if differing := [name for name in {**before, **after} if before.get(name) != after.get(name)]:
-        said = ", ".join(f"{n} was {_shown(before.get(n))}, is {_shown(after.get(n))}" for n in differing[:3])
+        said = ", ".join(
+            f"{n} was {_format_value(before.get(n))}, is {_format_value(after.get(n))}" for n in differing[:3]
+        )
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise UsageError(
             f"{folder}: --resume: the interrupted run differs: {said}{more}",
@@ -111,6 +112,6 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield f"{prefix}{name}", value
 
 
-def _shown(value: object) -> str:
+def _format_value(value: object) -> str:
     text = "not given" if value is None or value == [] else str(value)
     return text if len(text) <= 40 else f"{text[:12]}..."

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.files.output import PARTIAL, Parts, sha256
 from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Run, run_of_document
 from splatctrl_cli.records import Float64, Stamps
@@ -61,7 +61,6 @@ class RunFolder:
 
     @property
     def verdict(self) -> Mapping[str, Any]:
-        """Verdict in ``run.json``, empty without one."""
         return self._object("verdict")
 
     @property
@@ -80,13 +79,11 @@ class RunFolder:
         return [str(word) for word in given] if isinstance(given, list) else []
 
     def options(self, name: str) -> list[str]:
-        """Values of a repeatable option."""
         words = self.arguments
         found = [words[i + 1] for i, word in enumerate(words[:-1]) if word == name]
         return found + [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
 
     def option(self, name: str) -> str | None:
-        """Last value of an option."""
         return next(iter(self.options(name)[::-1]), None)
 
     def json_of(self, name: str) -> Any:
@@ -94,10 +91,8 @@ class RunFolder:
         file = self.path / name
         if not self.parts.has(file):
             return None
-        try:
+        with refuse_faults(f"{file}: is not JSON", ValueError):
             return json.loads(self.parts.checked(file).read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise InputError(f"{file}: is not JSON: {error}") from None
 
     def pictures(self) -> list[Path]:
         found = [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
@@ -109,10 +104,8 @@ class RunFolder:
         file = self.path / "steps.csv"
         if self.command != REPLAY or not self.parts.has(file):
             return None
-        try:
+        with refuse_faults(f"{file}: expected the columns of a replay", ValueError, KeyError, StopIteration):
             return _states(read_columns(self.parts.checked(file)))
-        except (ValueError, KeyError, StopIteration) as error:
-            raise InputError(f"{file}: expected the columns of a replay: {error}") from None
 
     def place_of(self, given: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
         """Find a path of the command line: as typed, above the run, or below `roots`.
@@ -141,9 +134,6 @@ class WrittenFile:
     file: Path
     bytes: int
 
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def open_run(path: Path) -> RunFolder:
     """Open a run's folder. Raises InputError if it is no run, incomplete, or too new."""
@@ -171,10 +161,8 @@ def open_run(path: Path) -> RunFolder:
 
 def read_object(file: Path) -> dict[str, Any]:
     """Read a JSON object. Raises InputError for anything else."""
-    try:
+    with refuse_faults(f"{file}: cannot be read", OSError, ValueError):
         document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
     if not isinstance(document, dict):
         raise InputError(
             f"{file}: expected what a command of splatctrl writes, got {type(document).__name__}",
@@ -184,7 +172,6 @@ def read_object(file: Path) -> dict[str, Any]:
 
 
 def read_columns(file: Path) -> dict[str, tuple[str, ...]]:
-    """Cells of a CSV table by column."""
     with file.open(encoding="utf-8", newline="") as stream:
         rows = csv.reader(stream)
         header = next(rows)

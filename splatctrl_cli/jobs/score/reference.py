@@ -77,7 +77,6 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
 
 
 def _session_reference(paths: Sequence[Path], options: SourceOptions) -> Reference:
-    """Join logs with one tf tree; raises InputError otherwise."""
     source = open_session(paths, options)
     stamps_ns: dict[str, list[int]] = {}
     for stamp, camera, _ in source.poses():
@@ -193,7 +192,7 @@ def recording_check(
 ) -> dict[str, Any]:
     """Compare the recording with the scene's own; raises InputError for another, unless allowed.
 
-    Compares first frames of training cameras (an older version kept none), and digests of equal file names.
+    Compares training cameras' first frames, if kept, and digests of equal file names.
     """
     recorded = scene.run.get("metrics", {}).get("first_frames")
     then = scene.run.get("inputs", {})

@@ -41,9 +41,9 @@ from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, vie
 class ScoreRequest:
     """One scene, or a folder of scenes named like scans, to score on views.
 
-    recording: its options' cameras are scored. baseline: score.json of an earlier score. newest: render a view from
-    the newest snapshot not later than it, else from the final splats. images: pictures of ``all`` views, each
-    camera's ``best-worst``, or ``none``. Raises UsageError for ``all`` without `out`.
+    recording: its options' cameras are scored. baseline: score.json of an earlier score. newest: render from the
+    newest snapshot not later than a view, else the final splats. images: of ``all`` views, each camera's
+    ``best-worst``, or ``none``. Raises UsageError for ``all`` without `out`.
     """
 
     scene: Path
@@ -76,7 +76,6 @@ class ScoreResult:
 
     @property
     def metrics(self) -> Mapping[str, float | None]:
-        """Mean figures, None without a value."""
         return dict(self.report["metrics"])
 
     @property
@@ -85,7 +84,6 @@ class ScoreResult:
 
     @property
     def notes(self) -> Sequence[str]:
-        """Doubts about the figures."""
         return tuple(self.report["warnings"])
 
 
@@ -140,7 +138,7 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
     protocol = _protocol(scorer)
     definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
     metrics = (
-        total_score(scorer.views)
+        total_score(scorer.figures)
         | surface
         | {
             "free_mass": _free_mass(request.scene, scene),
@@ -149,7 +147,7 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
         }
     )
     report = _report(request, scorer, same, protocol | {"definitions": definitions}, as_json(metrics))
-    result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
+    result = _conclude(request, report, is_damaged=bool(reference.source.loss.damaged))
     if folder:
         write_table(folder / "views.csv", list(report["views"][0]), report["views"])
         with stopwatch.stage("pictures"):
@@ -187,9 +185,7 @@ def _report(
         "metrics": metrics,
         "warnings": [*other, *scorer.doubts],
         "skipped_views": scorer.skipped,
-        "views": [
-            {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scorer.views
-        ],
+        "views": [view | as_json(figures) for view, figures in zip(scorer.views, scorer.figures, strict=True)],
     }
 
 
@@ -206,7 +202,7 @@ def _protocol(scorer: Scorer) -> dict[str, Any]:
         "left_out_views": None if split is None else list(split.left_out),
         "split": "by camera" if split is None else split.words(),
         "mask_rule": reference.mask_rule,
-        "resolution": [f"{width}x{height}" for width, height in sorted({view.size for view in scorer.views})],
+        "resolution": [f"{width}x{height}" for width, height in sorted(scorer.sizes)],
         "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
         "published_scans": None if named is None or not named.scans else list(named.scans),
         "background": [round(value, 4) for value in scorer.scene.background],
@@ -215,7 +211,6 @@ def _protocol(scorer: Scorer) -> dict[str, Any]:
 
 
 def _free_mass(path: Path, scene: SceneFolder) -> float:
-    """Free mass of the scene, NaN without an occupancy grid."""
     if not (path / "occupancy.npz").is_file():
         return nan
     where = str(path / "run.json")
@@ -224,7 +219,7 @@ def _free_mass(path: Path, scene: SceneFolder) -> float:
     return free_mass(spheres.splats, scene.occupancy(), free_below)
 
 
-def _concluded(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
+def _conclude(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
     if request.baseline is not None:
         report["metrics"] |= changes(report, request.baseline)
     return ScoreResult(
@@ -258,7 +253,7 @@ def _write_result(
 
 
 def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
-    """Scenes by scan in a folder of them; empty for a single scene. Raises InputError."""
+    """Scenes by scan in a folder of them; empty for a single scene."""
     folder, recording = request.scene, request.recording
     if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}
@@ -278,14 +273,16 @@ def _score_scans(
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
         # gates and baseline apply to the means alone
-        alone = replace(request, scene=scene, recording=of_scan(request.recording, scan), require=(), baseline=None)
+        alone = replace(
+            request, scene=scene, recording=select_scan(request.recording, scan), require=(), baseline=None
+        )
         results[scan] = _score_scene(alone, folder and folder / scan, progress)
     report = {
         "scenes": str(request.scene),
         "reference": str(request.recording.path),
         **report_of_scans({scan: result.report for scan, result in results.items()}),
     }
-    result = _concluded(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
+    result = _conclude(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
     if folder is not None:
         names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
         rows = ({"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items())
@@ -294,7 +291,7 @@ def _score_scans(
     return result
 
 
-def of_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
+def select_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
     """Recording of one scan with its masks in DIR/SCAN.
 
     Raises InputError without them: masks of one scan fit no other.

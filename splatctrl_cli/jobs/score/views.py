@@ -1,21 +1,22 @@
 """Scores of rendered views and of surfaces."""
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import isnan
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
+from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, space_out, thin
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
-from splatctrl_cli.evaluate.score import ViewScore, score_view
+from splatctrl_cli.evaluate.score import CORRECTABLE, CORRECTED, score_view
 from splatctrl_cli.evaluate.score_report import Doubts
 from splatctrl_cli.evaluate.views import View, seen_by, seen_pixels, surface_points, views_to_score
 from splatctrl_cli.files.output import Stopwatch
@@ -37,9 +38,8 @@ Ranked = tuple[float, ComparisonRow]
 class Scorer:
     """Scorer of views of `reference`; `draw` gets every view's row of pictures.
 
-    newest: render from the newest snapshot not later than the view, else from the final splats. Filled by `run`:
-    views; skipped: names before the first snapshot; extremes: best and worst by camera; training: frames known at
-    the last view; doubts.
+    newest: as in `ScoreRequest`. Filled by `run`: views, their figures and sizes [px]; skipped: names before the
+    first snapshot; extremes: best and worst by camera; training: frames known at the last view; doubts.
     """
 
     scene: SceneFolder
@@ -49,7 +49,9 @@ class Scorer:
     newest: bool = True
     allow_training: bool = False
     threads: int = 0
-    views: list[ViewScore] = field(default_factory=list)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, float]] = field(default_factory=list)
+    sizes: set[tuple[int, int]] = field(default_factory=set)
     skipped: list[str] = field(default_factory=list)
     extremes: dict[str, tuple[Ranked, Ranked]] = field(default_factory=dict)
     training: tuple[RgbdFrame, ...] = ()
@@ -112,7 +114,7 @@ class Scorer:
                 remedy="give the recording that the scene was reconstructed from, or other --cameras",
             )
         has_training = self.scene.names_its_views
-        if has_training and self.reference.has_depth and not any(view.seen.share for view in self.views):
+        if has_training and self.reference.has_depth and not any(view["seen_share"] for view in self.figures):
             raise NotEvaluableError(
                 f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
                 remedy="is it the same world and the same scene? give the recording that reconstruct was given",
@@ -120,14 +122,17 @@ class Scorer:
 
     def _score_one(self, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None) -> None:
         frame = view.frame
-        score, row = self._compared(view, frame, splats, shell)
+        figures, row = self._compare(view, frame, splats, shell)
         doubts.look(view, row.render, row.mask)
         if self.scene.corrections:
             there = corrected_among(frame, view.training, self.scene.corrections)
-            score = replace(score, corrected=self._compared(view, there, splats, shell)[0])
-        self.views.append(score)
+            figures_there, _ = self._compare(view, there, splats, shell)
+            figures |= {f"{n}{CORRECTED}": value for n, value in figures_there.items() if n in CORRECTABLE}
+        self.views.append({"view": view.name, "camera": frame.camera, "stamp_ns": frame.stamp_ns})
+        self.figures.append(figures)
+        self.sizes.add((frame.intrinsics.width, frame.intrinsics.height))
         self.training = view.training
-        rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
+        rank = figures["psnr_all" if isnan(figures["psnr_seen"]) else "psnr_seen"]
         if self.draw is not None:
             self.draw(row)
         best, worst = self.extremes.get(frame.camera, ((rank, row), (rank, row)))
@@ -136,14 +141,13 @@ class Scorer:
             min(worst, (rank, row), key=itemgetter(0)),
         )
 
-    def _compared(
+    def _compare(
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
-    ) -> tuple[ViewScore, ComparisonRow]:
+    ) -> tuple[dict[str, float], ComparisonRow]:
         protocol = self.reference.protocol
-        rendering, depth = rendered_with_shell(splats, shell, frame, self.scene.background, self.threads)
+        rendering, depth = render_with_shell(splats, shell, frame, self.scene.background, self.threads)
         mask = None if self.reference.mask is None else self.reference.mask(frame)
-        score = score_view(
-            view=view.name,
+        figures = score_view(
             color=rendering.color,
             depth=depth,
             frame=frame,
@@ -152,9 +156,9 @@ class Scorer:
             fill=0.0 if protocol is None else protocol.fill,
             is_zero_padded=protocol is not None and protocol.is_zero_padded,
         )
-        return score, ComparisonRow(
+        return figures, ComparisonRow(
             title=view.name,
-            figures=_figures(score),
+            figures=_caption(figures),
             photo=frame.color,
             render=rendering.color,
             photo_depth=frame.depth,
@@ -163,13 +167,13 @@ class Scorer:
         )
 
 
-def _figures(score: ViewScore) -> str:
-    seen = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} seen"]
-    masked = [] if score.masked is None else [f"{score.masked.psnr:.1f} masked"]
-    return "dB: " + ", ".join([*seen, *masked, f"{score.all.psnr:.1f} all"])
+def _caption(figures: Mapping[str, float]) -> str:
+    values = {name: figures.get(f"psnr_{name}") for name in ("seen", "masked", "all")}
+    parts = [f"{v:.1f} {name}" for name, v in values.items() if v is not None and not (name == "seen" and isnan(v))]
+    return "dB: " + ", ".join(parts)
 
 
-def rendered_with_shell(
+def render_with_shell(
     splats: SplatSet | GaussianSet,
     shell: SplatSet | None,
     frame: RgbdFrame,
@@ -178,14 +182,14 @@ def rendered_with_shell(
 ) -> tuple[Rendering, Float32]:
     """Render splats before a background; their depth (H, W) [m] is without the shell."""
     camera = frame.intrinsics, frame.T_world_camera
-    rendering = rendered(splats, *camera, threads)
+    rendering = render_splats(splats, *camera, threads)
     depth = rendering.normalised_depth()
     if isinstance(splats, SplatSet) and shell is not None:
-        rendering = rendered(splats.joined(shell), *camera, threads)
+        rendering = render_splats(splats.joined(shell), *camera, threads)
     return rendering.before(background), depth
 
 
-def rendered(
+def render_splats(
     splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int = 0
 ) -> Rendering:
     if isinstance(splats, GaussianSet):
@@ -202,7 +206,7 @@ class CloudSettings:
     """Reference points or mesh at `path`, or a folder of them by scan.
 
     unit: metres per unit of the file. Points beyond `max_distance` [m] count in a share, not in a mean. Both sides
-    are thinned to `spacing` [m]. masks: DTU's folder of observed space, read for one scan into `space`.
+    are thinned to `spacing` [m]. masks: DTU's folder of observed space, for `space`.
     """
 
     path: Path
@@ -229,7 +233,7 @@ def cloud_figures(
     settings: CloudSettings, scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int
 ) -> dict[str, float]:
     """Surface figures by flat name, seen from training views `frames`."""
-    reference, space, counts = spaced(_reference(settings), settings.spacing), settings.space, None
+    reference, space, counts = space_out(_reference(settings), settings.spacing), settings.space, None
     points = _surface(scene, frames, threads, settings.spacing)
     if space is not None:
         reference, points = reference[space.above(reference)], points[space.near(points)]
@@ -256,7 +260,7 @@ def _surface(scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int, spac
     """World points (P, 3) [m] of the final depth at `frames`, without robot, `spacing` apart."""
     splats = final_splats(scene)
     splats = splats.select(splats.labels != Label.ROBOT)
-    shown = (rendered(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)
+    shown = (render_splats(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)
     seen = (replace(f, depth=image.normalised_depth()) for f, image in zip(frames, shown, strict=True))
-    parts = [thinned(surface_points(frame)[0], spacing / 2) for frame in seen]
-    return spaced(np.concatenate(parts), spacing) if parts else np.empty((0, 3))
+    parts = [thin(surface_points(frame)[0], spacing / 2) for frame in seen]
+    return space_out(np.concatenate(parts), spacing) if parts else np.empty((0, 3))

@@ -40,9 +40,9 @@ from splatctrl_cli.simulate.truth import Truth, distance_along, truth_document
 class SimulateRequest:
     """One simulation into the folder `out`: log.mcap, truth.json and robot files; dtu: a scan, too.
 
-    urdf: of another arm, its base on the table at the world's origin. spheres: None to fit them. is_slim: images show
-    shapes inside the collision shapes. unmodelled: `UNMODELLED` parts that move along, in images and truth alone.
-    scene: objects and motion in place of the options' table.
+    urdf: of another arm, its base at the world's origin. spheres: None to fit them. is_slim: images show shapes
+    inside the collision shapes. unmodelled: `UNMODELLED` parts, in images and truth alone. scene: objects and motion
+    in place of the options' table.
     """
 
     out: Path
@@ -168,11 +168,11 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
         robot = RobotModel.from_urdf(urdf, spheres)
     else:
         progress.log(f"simulate: reading {request.urdf.name}")
-        robot, surfaces = copied_arm(request.urdf, request.spheres, request.packages, folder, progress)
+        robot, surfaces = copy_arm(request.urdf, request.spheres, request.packages, folder, progress)
     scene = Scene.of(options) if request.scene is None else request.scene(robot)
     if surfaces is not None and request.scene is None:
         progress.log("simulate: looking for a way through the scene")
-        scene = replace(scene, motion=adapted_motion(scene, robot, surfaces))
+        scene = replace(scene, motion=adapt_motion(scene, robot, surfaces))
     return Recording(options, robot, scene, request.unmodelled)
 
 
@@ -188,17 +188,17 @@ LATE = 1e3  # [rad/s] a second longer than its time costs as much: every way in 
 REMEDY = "give the URDF of an arm whose base stands on the table's top"
 
 
-def copied_arm(
+def copy_arm(
     urdf: Path, given: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
 ) -> tuple[RobotModel, SelfSurfaces]:
     """Copy ``robot.urdf``, its ``meshes/`` and ``robot_spheres.yaml`` into a folder and read them.
 
-    The spheres come from the file `given`, or are fitted. Raises InputError without collision geometry or meshes.
+    Spheres are `given`, or fitted. Raises InputError without collision geometry or meshes.
     """
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
     copy = folder / "robot.urdf"
-    copy.write_text(_with_own_meshes(original, packages, folder, progress), encoding="utf-8")
+    copy.write_text(_copy_meshes(original, packages, folder, progress), encoding="utf-8")
     spheres = folder / "robot_spheres.yaml"
     if given is not None:
         shutil.copyfile(given, spheres)
@@ -213,13 +213,12 @@ def copied_arm(
     return model, SelfSurfaces(model, solids)
 
 
-def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
+def adapt_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
     """Adapt the scene's motion to another arm, whose tip follows the simulated arm's hand.
 
     The tip is the URDF's last link, its z pointing away from the arm. It goes as far as it reaches, turned any way
-    about z, by the shortest clear way through the postures found, or the least slowed one if none keeps the velocity
-    limits. An arm that fits the original postures keeps the original motion. Raises InputError for an unreachable
-    waypoint, or if every way collides.
+    about z, by the shortest clear way, or the least slowed one if none keeps the velocity limits. An arm that fits
+    the original postures keeps the motion. Raises InputError for an unreachable waypoint, or if every way collides.
     """
     times, ours = scene.motion.times, scene.motion.waypoints
     if ours.shape[1] == model.num_joints and all(
@@ -241,10 +240,9 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
     return Motion(times=times, waypoints=np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)]))
 
 
-def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
-    """Copy a URDF's meshes into the folder, visual ones as STL, and return its text.
-
-    A link whose visual mesh is unreadable shows its collision geometry, if any.
+def _copy_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
+    """Copy a URDF's meshes, visual ones as STL, and return its text. A link with an unreadable visual mesh shows its
+    collision geometry.
     """
     root, copies = ElementTree.fromstring(urdf.text), dict[tuple[str, str], str]()
     parts = [(link, part) for link in root.iter("link") for tag in ("collision", "visual") for part in link.iter(tag)]
@@ -282,10 +280,8 @@ def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_
 
 
 def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
-    """Find postures (K, J) with the tip at a pose (4, 4).
-
-    If out of reach, the pose moves nearer to the base. q: the simulated arm's, a first guess for an arm of as many
-    joints.
+    """Find postures (K, J) with the tip at a pose (4, 4), moved nearer to the base if out of reach. q: the simulated
+    arm's, a first guess.
     """
     tip = model.frame_names[-1]
     guesses = [model.middle, *random_postures(model, fixed.SIMULATED_GUESSES, seed=0)]
@@ -309,7 +305,7 @@ def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
 
 
 def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
-    """Yield poses turned about z, `nearer` times as far from the base axis."""
+    """Yield poses about z, `nearer` times as far from the base axis."""
     for angle in 2 * np.pi * np.arange(fixed.SIMULATED_TURNS) / fixed.SIMULATED_TURNS:
         T = T_base_hand.copy()
         c, s = np.cos(angle), np.sin(angle)
@@ -319,9 +315,8 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """Cost of a leg: length [rad], more if close or slowed; infinite in collision.
-
-    A slowed leg meets objects at other times: it must avoid all, and is refused if one moves.
+    """Cost of a leg: length [rad], more if close or slowed; infinite in collision. A slowed leg must avoid all, since
+    objects move.
     """
     slowed = leg.within(model.velocity_limit)
     is_late = slowed.times[-1] > leg.times[-1]

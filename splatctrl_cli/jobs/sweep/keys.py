@@ -1,7 +1,7 @@
 """Keys that a sweep may vary, and a run's jobs with their values."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,7 @@ PLACES = ("obstacle-x", "obstacle-y", "obstacle-radius")  # in the order of simu
 class Key:
     """A varied value: its unit, and the option of each command that takes it.
 
-    lockstep: options for a run that makes its own map. is_monotone: the verdict can turn only once, so few values are
-    tried.
+    lockstep: options for a run that makes its own map. is_monotone: the verdict can turn only once.
     """
 
     name: str
@@ -83,46 +82,34 @@ def key_of(name: str) -> Key:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
-    """A command of a run: options by name, and training cameras."""
+class Stage(Job):
+    """A command of a run, with its training cameras."""
 
-    command: str
-    options: Mapping[str, Any]
     cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """Commands of a run from the first that a key varies on, the replay last."""
+    """Commands of a run from the first that a key varies on, the replay last; options of keys fit the run."""
 
     stages: tuple[Stage, ...]
     keys: Mapping[str, Key]
 
     def jobs(self, values: Mapping[str, float]) -> tuple[Job, ...]:
-        return tuple(self._job(stage, values) for stage in self.stages)
-
-    def _job(self, stage: Stage, values: Mapping[str, float]) -> Job:
-        chosen: dict[str, list[Any]] = {}
-        for name, key in self.keys.items():
-            option = options_for(key, is_lockstep="lockstep" in self.stages[-1].options).get(stage.command)
-            if option is not None:
-                chosen[option] = [
-                    self._given(stage, option, values, int(values[name]) if key.is_whole else values[name])
-                ]
-        return Job(name=stage.command, command=stage.command, options=stage.options, matrix=chosen)
-
-    def _given(self, stage: Stage, option: str, values: Mapping[str, float], value: float) -> Any:
-        if option == "cameras":
-            return list(stage.cameras[: len(stage.cameras) - int(value)])
-        if option == "visitor":
-            before = stage.options.get(option, VISITOR)
-            return [values.get(name, given) for name, given in zip(PLACES, before, strict=True)]
-        return value
-
-
-def options_for(key: Key, *, is_lockstep: bool) -> Mapping[str, str]:
-    """Option of each command that takes the value."""
-    return key.lockstep if is_lockstep and key.lockstep else key.options
+        jobs = list[Job]()
+        for stage in self.stages:
+            chosen: dict[str, Any] = {
+                key.options[stage.command]: int(values[name]) if key.is_whole else values[name]
+                for name, key in self.keys.items()
+                if stage.command in key.options
+            }
+            if "cameras" in chosen:
+                chosen["cameras"] = list(stage.cameras[: len(stage.cameras) - int(chosen["cameras"])])
+            if "visitor" in chosen:
+                before = stage.options.get("visitor", VISITOR)
+                chosen["visitor"] = [values.get(name, given) for name, given in zip(PLACES, before, strict=True)]
+            jobs.append(replace(stage, matrix={option: [value] for option, value in chosen.items()}))
+        return tuple(jobs)
 
 
 def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine) -> Chain:
@@ -131,15 +118,24 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
     Raises InputError for moved or changed inputs, UsageError for a key without effect.
     """
     stages = [_stage(run, command_line)]
-    is_lockstep = "lockstep" in stages[0].options
-    wanted = {command for key in keys.values() for command in options_for(key, is_lockstep=is_lockstep)}
-    is_driven = stages[0].options.get("mode") == "closed-loop"
+    is_driven, is_lockstep = stages[0].options.get("mode") == "closed-loop", "lockstep" in stages[0].options
+    searched = {
+        name: replace(
+            key,
+            options=key.lockstep if is_lockstep and key.lockstep else key.options,
+            is_monotone=key.is_monotone and not is_driven,  # a driven arm moves differently with another value
+        )
+        for name, key in keys.items()
+    }
+    wanted = {command for key in searched.values() for command in key.options}
     if "speed" in keys and not is_driven:
         raise UsageError(
             "--over speed: the arm moves as it was recorded", remedy="sweep a replay of --mode closed-loop"
         )
     simulation = _simulation_of(stages[0]) if SIMULATE in wanted else None
-    while wanted & {FIT, BAKE, SIMULATE} and (option := _made_before(stages[0])) is not None:
+    while wanted & {FIT, BAKE, SIMULATE} and (
+        option := next((o for o in MADE_BEFORE.get(stages[0].command, ()) if o in stages[0].options), None)
+    ):
         before = open_run(Path(stages[0].options[option]))
         if before.command not in (FIT, BAKE):
             raise UsageError(
@@ -149,27 +145,22 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
         stages[0] = replace(stages[0], options={**stages[0].options, option: f"{{{before.command}}}"})
         stages.insert(0, _stage(before, command_line))
     if simulation is not None:
-        stages = _simulated(simulation, stages, command_line)
+        stages = _add_simulation(simulation, stages, command_line)
     made = {stage.command for stage in stages}
-    for name, key in keys.items():
-        options = options_for(key, is_lockstep=is_lockstep)
-        if not made & options.keys():
+    for name, key in searched.items():
+        if not made & key.options.keys():
             raise UsageError(
-                f"--over {name}: the run has no {' or '.join(options)} that it could change",
+                f"--over {name}: the run has no {' or '.join(key.options)} that it could change",
                 remedy="sweep a replay with --scene or --lockstep",
             )
-        if "cameras" in options.values() and not all(stage.cameras for stage in stages if stage.command in options):
+        takers = [stage for stage in stages if stage.command in key.options]
+        if "cameras" in key.options.values() and not all(stage.cameras for stage in takers):
             raise UsageError(f"--over {name}: the run does not say which cameras trained", remedy="reconstruct again")
-    searched = {name: replace(key, is_monotone=key.is_monotone and not is_driven) for name, key in keys.items()}
-    return Chain(stages=tuple(stages), keys=searched)  # a driven arm moves differently with another value
-
-
-def _made_before(stage: Stage) -> str | None:
-    return next((option for option in MADE_BEFORE.get(stage.command, ()) if option in stage.options), None)
+    return Chain(stages=tuple(stages), keys=searched)
 
 
 def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
-    """Read a command's options with current paths. Raises InputError for moved or changed files."""
+    """Read a command's options with current paths."""
     options = command_line.options_of(run.arguments)
     found: list[Path] = []
 
@@ -188,33 +179,24 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
         return str(place.absolute())
 
     options = {name: placed(value) for name, value in options.items()}
-    _check_inputs(run, found)
+    for recorded, digest in run.run.get("inputs", {}).items():
+        name = recorded.removeprefix(CALIBRATION)
+        places = [p for at in found for p in (*((at,) if at.name == name else ()), at / name, at.parent / name)]
+        files = [file for file in places if file.is_file()]
+        if not recorded.startswith(PERTURB) and not any(sha256(file) == digest for file in files):
+            raise InputError(
+                f"{files[0]}: has changed since {run.path} was made"
+                if files
+                else f"{run.path}: {recorded} has moved",
+                remedy="put it back as it was, or make the run again and sweep that",
+            )
     of_map = run.path / "scene"
     has_map = "lockstep" in options and (of_map / "run.json").is_file()
     metrics = open_run(of_map).metrics if has_map else run.metrics
-    return Stage(command=run.command, options=options, cameras=tuple(metrics.get("cameras") or ()))
-
-
-def _check_inputs(run: RunFolder, places: Sequence[Path]) -> None:
-    """Raise InputError for a missing or changed input."""
-    for name, digest in run.run.get("inputs", {}).items():
-        if name.startswith(PERTURB):
-            continue
-        files = [file for place in places for file in _named(place, name.removeprefix(CALIBRATION)) if file.is_file()]
-        if not any(sha256(file) == digest for file in files):
-            raise InputError(
-                f"{files[0]}: has changed since {run.path} was made" if files else f"{run.path}: {name} has moved",
-                remedy="put it back as it was, or make the run again and sweep that",
-            )
-
-
-def _named(place: Path, name: str) -> Iterator[Path]:
-    yield from (place,) if place.name == name else ()
-    yield from (place / name, place.parent / name)
+    return Stage(name=run.command, command=run.command, options=options, cameras=tuple(metrics.get("cameras") or ()))
 
 
 def _simulation_of(replayed: Stage) -> RunFolder:
-    """Simulation of a replay's truth. Raises UsageError without one."""
     folder = Path(replayed.options.get("truth", "")).parent
     simulation = open_run(folder) if (folder / "run.json").is_file() else None
     if simulation is None or simulation.command != SIMULATE:
@@ -225,23 +207,16 @@ def _simulation_of(replayed: Stage) -> RunFolder:
     return simulation
 
 
-def _simulated(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:
-    """Prepend the simulation. Raises UsageError if the stages read another recording."""
+def _add_simulation(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:
     folder = simulation.path
-    log, made = folder / "log.mcap", _stage(simulation, command_line)
-    for stage in stages:
-        for option in ("log", "source", "seen-by"):
-            given = stage.options.get(option)
-            if given is not None and sha256(log) not in _digests_behind(Path(given)):
-                raise UsageError(f"{given}: is not the recording of {folder}", remedy=f"replay {log}")
-    kept: dict[str, Any] = dict.fromkeys(("log", "source", "seen-by"), f"{{{SIMULATE}}}/log.mcap")
-    kept["truth"] = f"{{{SIMULATE}}}/truth.json"
+    log, logs = folder / "log.mcap", ("log", "source", "seen-by")
+    for given in [Path(stage.options[option]) for stage in stages for option in logs if option in stage.options]:
+        header = given / "capture.json"
+        sources = json.loads(header.read_text())["sources"].values() if header.is_file() else (sha256(given),)
+        if sha256(log) not in sources:
+            raise UsageError(f"{given}: is not the recording of {folder}", remedy=f"replay {log}")
+    kept = dict.fromkeys(logs, f"{{{SIMULATE}}}/log.mcap") | {"truth": f"{{{SIMULATE}}}/truth.json"}
     return [
-        made,
+        _stage(simulation, command_line),
         *(replace(s, options={**s.options, **{k: kept[k] for k in kept if k in s.options}}) for s in stages),
     ]
-
-
-def _digests_behind(recording: Path) -> Iterable[str]:
-    header = recording / "capture.json"
-    return json.loads(header.read_text())["sources"].values() if header.is_file() else (sha256(recording),)

@@ -1,7 +1,7 @@
 """Search for a change of outcome over one or several values."""
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -11,18 +11,22 @@ from scipy.stats import qmc
 
 from splatctrl_cli.config.fixed import SWEEP_DIRECTIONS, SWEEP_SAMPLES, SWEEP_SEARCHED
 
+P = TypeVar("P")
+
 
 @dataclass(frozen=True, kw_only=True)
-class Flip:
-    """The flip nearest to the start: last value before it, first after; None without one.
+class Flip(Generic[P]):
+    """The flip nearest to the start: last point before it, first after; None without one.
 
-    outcomes: by distance from the start. is_monotone: at most one change. spacing: largest gap tried before the flip
-    (or anywhere without one); a narrower flip may be missed.
+    tried: by distance from the start. is_monotone: at most one change. spacing: largest gap tried before the flip (or
+    anywhere).
     """
 
-    last: float | None
-    first: float | None
-    outcomes: Mapping[float, str]
+    start: P
+    end: P
+    last: P | None
+    first: P | None
+    tried: Sequence[P]
     is_monotone: bool
     spacing: float
 
@@ -35,56 +39,45 @@ def find_flip(
     tolerance: float,
     is_whole: bool = False,
     is_monotone: bool = False,
-) -> Flip:
+) -> Flip[float]:
     """Find the flip nearest to `start` within `tolerance` (1 for whole values).
 
-    judge: outcomes of values, in parallel. It tries the ends and SWEEP_SAMPLES values evenly between; SWEEP_SEARCHED
-    if the outcome is not declared monotone, or turns back. Then it bisects the nearest pair with different outcomes.
+    judge: outcomes of values, in parallel. It tries the ends and SWEEP_SAMPLES values between; SWEEP_SEARCHED if the
+    outcome may turn back, or does. Then it bisects the nearest pair with different outcomes.
     """
     known: dict[float, str] = {}
 
-    def try_all(values: Sequence[float]) -> None:
-        new = [value for value in dict.fromkeys(values) if value not in known]
-        known.update(zip(new, judge(new), strict=True) if new else ())
-
-    def value_at(share: float) -> float:
-        value = start + (end - start) * share
+    def rounded(value: float) -> float:
         return float(round(value)) if is_whole else float(f"{value:.6g}")
 
-    def between(num: int) -> list[float]:
-        return [value_at((k + 1) / (num + 1)) for k in range(num)]
+    def tried(values: Sequence[float]) -> list[float]:
+        """Try what is new; return all values by their distance from the start."""
+        new = [value for value in dict.fromkeys(values) if value not in known]
+        known.update(zip(new, judge(new), strict=True) if new else ())
+        return sorted(known, key=lambda value: abs(value - start))
 
-    try_all([start, end, *between(SWEEP_SAMPLES if is_monotone else SWEEP_SEARCHED)])
-    if is_monotone and _num_changes(_ordered(known, start)) > 1:
-        try_all(between(SWEEP_SEARCHED))
-    ordered = _ordered(known, start)
-    tried = list(ordered)
-    index = next((k for k, value in enumerate(tried) if known[value] != known[start]), None)
-    spacing = max([abs(b - a) for a, b in itertools.pairwise(tried[:index])], default=0.0)
-    if index is None:
-        return Flip(last=None, first=None, outcomes=ordered, is_monotone=True, spacing=spacing)
-    last, first = tried[index - 1], tried[index]
-    least = 1.0 if is_whole else tolerance
-    while abs(first - last) > least * (1 + 1e-9):
-        middle = float(round((last + first) / 2)) if is_whole else float(f"{(last + first) / 2:.6g}")
+    def num_changes() -> int:
+        is_first = [known[value] == known[start] for value in values]
+        return sum(a != b for a, b in itertools.pairwise(is_first))
+
+    searched = [rounded(start + (end - start) * ((k + 1) / (SWEEP_SEARCHED + 1))) for k in range(SWEEP_SEARCHED)]
+    sampled = [rounded(start + (end - start) * ((k + 1) / (SWEEP_SAMPLES + 1))) for k in range(SWEEP_SAMPLES)]
+    values = tried([start, end, *(sampled if is_monotone else searched)])
+    if is_monotone and num_changes() > 1:
+        values = tried(searched)
+    is_single = num_changes() <= 1
+    index = next((k for k, value in enumerate(values) if known[value] != known[start]), None)
+    spacing = max([abs(b - a) for a, b in itertools.pairwise(values[:index])], default=0.0)
+    last, first = (None, None) if index is None else values[index - 1 : index + 1]
+    while (
+        last is not None and first is not None and abs(first - last) > (1.0 if is_whole else tolerance) * (1 + 1e-9)
+    ):
+        middle = rounded((last + first) / 2)
         if middle in (last, first):  # as near as six digits come
             break
-        try_all([middle])
+        values = tried([middle])
         last, first = (middle, first) if known[middle] == known[start] else (last, middle)
-    is_single, outcomes = _num_changes(ordered) <= 1, _ordered(known, start)
-    return Flip(last=last, first=first, outcomes=outcomes, is_monotone=is_single, spacing=spacing)
-
-
-def _ordered(known: Mapping[float, str], start: float) -> dict[float, str]:
-    return {value: known[value] for value in sorted(known, key=lambda value: abs(value - start))}
-
-
-def _num_changes(ordered: Mapping[float, str]) -> int:
-    is_first = [outcome == next(iter(ordered.values())) for outcome in ordered.values()]
-    return sum(a != b for a, b in itertools.pairwise(is_first))
-
-
-P = TypeVar("P")
+    return Flip(start=start, end=end, last=last, first=first, tried=values, is_monotone=is_single, spacing=spacing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +106,7 @@ def find_least(
 
     Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
     SWEEP_DIRECTIONS of Halton's sequence, then turns the best by a quarter and an eighth towards and away from each
-    value. Each is tried at the best length so far, and bisected to `tolerance` if it flips.
+    value. Each is tried at the best length, and bisected to `tolerance` if it flips.
     """
     num = len(alone)
     start = judge([(0.0,) * num])[0]
@@ -146,7 +139,7 @@ def find_least(
 
 
 def _directions(num: int) -> Iterator[np.ndarray]:
-    """Non-negative unit vectors (num,): the diagonal, then evenly by Halton's points."""
+    """Non-negative unit vectors (num,): the diagonal, then Halton's points."""
     points = qmc.Halton(num, scramble=False).random(SWEEP_DIRECTIONS + 1)[1:]
     for way in (np.ones(num), *ndtri((1.0 + points) / 2.0)):
         yield way / np.linalg.norm(way)

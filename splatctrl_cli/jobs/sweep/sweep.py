@@ -1,17 +1,20 @@
 """A sweep: replay with other values until the verdict flips."""
 
+import json
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome
-from splatctrl_cli.files.output import check_can_be_written, write_durably, write_json
-from splatctrl_cli.jobs.batch.batch import check_same_asked, scheduling, write_batch
+from splatctrl_cli.files.output import MARKERS, check_can_be_written, write_durably, write_json
+from splatctrl_cli.jobs.batch.batch import scheduling, write_batch
 from splatctrl_cli.jobs.batch.graph import CommandLine, Node, nodes_of
+from splatctrl_cli.jobs.batch.ledger import FILE as BATCH
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run
 from splatctrl_cli.jobs.batch.run import ERROR, SKIPPED, Scheduler
 from splatctrl_cli.jobs.batch.suite import Recording, Suite
@@ -30,8 +33,8 @@ REFUSED, BY_ITS_VALUES = "refused", (2, 4)  # an outcome, and the exit codes it 
 class SweepRequest:
     """Repeat a replay over ranges KEY=A:B.
 
-    tolerance: distance of a flip's two sides, as a share of the range. out: folder to continue in. workers: parallel
-    runs. dask: address of a scheduler to use instead.
+    tolerance: distance of a flip's sides, as a share of the range. out: may be continued. workers: parallel runs.
+    dask: address of a scheduler instead.
     """
 
     replay: Path
@@ -57,32 +60,25 @@ class Tried:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeyFlip:
+class KeyFlip(Flip[Tried]):
     """Effect of one key alone: runs at both ends, and around the flip."""
 
     key: Key
-    start: Tried
-    end: Tried
-    last: Tried | None
-    first: Tried | None
-    tried: Sequence[Tried]
-    is_monotone: bool
-    spacing: float
 
     @property
     def sentence(self) -> str:
         unit = f" {self.key.unit}" if self.key.unit else ""
         name, num = self.key.name, len(self.tried)
-        a, b = self.start.values[name], self.end.values[name]
+        a, b, labels = self.start.values[name], self.end.values[name], [each.label.upper() for each in self.tried]
         if self.last is None or self.first is None:
-            all_labels = " or ".join(dict.fromkeys(each.label.upper() for each in self.tried))
-            return f"{name}: no flip between {a:g} and {b:g}{unit}: {all_labels} at all {num} values tried"
-        last, first = self.last.values[name], self.first.values[name]
-        way, labels = "up" if b > a else "down", (self.last.label.upper(), self.first.label.upper())
-        found = f"{name}: {labels[0]} {way} to {last:.6g}{unit}, {labels[1]} at {first:.6g}"
-        later = [each.label.upper() for each in self.tried if abs(each.values[name] - a) > abs(first - a)]
-        others = [label for label in dict.fromkeys(later) if label != self.first.label.upper()]
-        return found + (f"; beyond it also {', '.join(others)}" if others else "")
+            every = " or ".join(dict.fromkeys(labels))
+            return f"{name}: no flip between {a:g} and {b:g}{unit}: {every} at all {num} values tried"
+        last, first, way = self.last.values[name], self.first.values[name], "up" if b > a else "down"
+        before, after = self.last.label.upper(), self.first.label.upper()
+        later = labels[self.tried.index(self.first) + 1 :]
+        others = [label for label in dict.fromkeys(later) if label != after]
+        beyond = f"; beyond it also {', '.join(others)}" if others else ""
+        return f"{name}: {before} {way} to {last:.6g}{unit}, {after} at {first:.6g}{beyond}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +114,12 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
     Raises UsageError for invalid ranges or another sweep's output, InputError for an invalid run or changed inputs,
     NotEvaluableError without a verdict to flip.
     """
-    run, ranges = _judged(request.replay), ranges_of(request.over)
+    run, ranges = open_run(request.replay), ranges_of(request.over)
+    if run.command != REPLAY:
+        raise UsageError(
+            f"{run.path}: a run of {run.command}, expected one of replay", remedy="sweep the replay of it"
+        )
+    _check_judged(str(run.path), run.verdict)
     keys = {name: key_of(name) for name in ranges}
     for name, (a, b) in ranges.items():
         if keys[name].is_whole and not (a.is_integer() and b.is_integer()):
@@ -132,23 +133,50 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
         "tolerance": request.tolerance,
     }
     check_can_be_written(out)
-    check_same_asked(out, FILE, asked, what="sweep")
+    _check_same(out, asked)
     runs = Runs(run=run, chain=chain, out=out, command_line=command_line)
     starts = {name: a for name, (a, _) in ranges.items()}
     runs.nodes_at(starts | {name: b for name, (_, b) in ranges.items()})  # refuses what an option does not take
+    began = time.time()
     with (
         Ledger(out) as ledger,
-        scheduling(ledger, command_line.entry, progress, workers=request.workers, dask=request.dask) as scheduler,
+        scheduling(
+            ledger, command_line.entry, progress, workers=request.workers, dask=request.dask
+        ) as runs.scheduler,
     ):
-        _write(out, asked, None)
-        runs.scheduler = scheduler
-        try:
-            result = _found(request, run, ranges, runs)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("interrupted; run the same command again to continue") from None
-        _write(out, asked, result)
+        _write(out, asked, {})
+        start = runs.at([starts])[0]
+        _check_judged(_words(starts), vars(start))
+        if start.outcome == REFUSED:
+            raise InputError(f"{_words(starts)}: is refused: {start.sentence}", remedy="begin at a value that is not")
+        _check_settings(run, open_run(out / start.folder), chain)
+        flips = [_vary_alone(name, starts, b, runs, request.tolerance) for name, (_, b) in ranges.items()]
+        least = _vary_together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None
+        num_new = sum(each.started >= began for each in runs.scheduler.runs.values())
+        result = SweepResult(
+            out=request.out, before=run.verdict, flips=flips, least=least, num_runs=len(runs.nodes), num_new=num_new
+        )
+        _write(out, asked, {"is_done": True, **result.as_dict()})
         write_batch(out, runs.suite(starts), [*runs.nodes.values()], ledger.latest(), runs.keys)
     return result
+
+
+def _check_same(out: Path, asked: Mapping[str, Any]) -> None:
+    """Raise unless `out` is empty, or a sweep of the same settings."""
+    file = out / FILE
+    if not file.is_file():
+        if any((out / other).exists() for other in (*MARKERS, BATCH)):
+            raise UsageError(f"{out}: is no sweep, but something else", remedy="give another --out")
+        return
+    try:
+        before = json.loads(file.read_text(encoding="utf-8"))["asked"]
+        differs = [key for key in asked if before.get(key) != asked[key]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{file}: is not what a sweep writes", remedy="give another --out") from None
+    if differs:
+        raise UsageError(
+            f"{out}: was begun with other settings: {', '.join(differs)}", remedy="give them again, or another --out"
+        )
 
 
 def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -172,19 +200,12 @@ def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
     return ranges
 
 
-def _judged(path: Path) -> RunFolder:
-    run = open_run(path)
-    if run.command != REPLAY:
-        raise UsageError(f"{path}: a run of {run.command}, expected one of replay", remedy="sweep the replay of it")
-    if run.verdict.get("outcome") == Outcome.NOT_EVALUABLE:
-        raise _not_evaluable(str(path), str(run.verdict["sentence"]))
-    return run
-
-
-def _not_evaluable(what: str, sentence: str) -> NotEvaluableError:
-    return NotEvaluableError(
-        f"{what}: there is no verdict to flip: {sentence}", remedy="give it the evidence that it lacks first"
-    )
+def _check_judged(what: str, verdict: Mapping[str, Any]) -> None:
+    if verdict.get("outcome") == Outcome.NOT_EVALUABLE:
+        raise NotEvaluableError(
+            f"{what}: there is no verdict to flip: {verdict['sentence']}",
+            remedy="give it the evidence that it lacks first",
+        )
 
 
 @dataclass(kw_only=True)
@@ -227,65 +248,28 @@ class Runs:
         self.nodes |= nodes
         self.keys |= self.scheduler.keys
         for values, each in made.items():
-            self.tried[values] = self._tried(new[values], [found[node.name] for node in each])
+            self.tried[values] = self._read_tried(new[values], [found[node.name] for node in each])
         return [self.tried[tuple(point.values())] for point in points]
 
-    def _tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
-        """Result of a run. Raises InputError if it failed for another cause than its values."""
-        last = runs[-1]
-        outcome = next(
-            (o for o, code in EXIT_CODES.items() if not last.outcome and code and code == last.exit_code), ""
-        )
-        if outcome != Outcome.NOT_EVALUABLE and (last.state in (ERROR, SKIPPED) or not last.outcome):
-            wrong = next(run for run in runs if run.state in (ERROR, SKIPPED) or run is last)
-            if not wrong.cause and wrong.exit_code in BY_ITS_VALUES:
-                return Tried(
-                    values=dict(values),
-                    outcome=REFUSED,
-                    label=REFUSED,
-                    sentence=f"{wrong.job}: {wrong.sentence}",
-                    folder="",
-                )
+    def _read_tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
+        """Raise InputError if a run failed for another cause than its values."""
+        last, unknown = runs[-1], str(Outcome.NOT_EVALUABLE)
+        tried = partial(Tried, values=dict(values))
+        if not last.outcome and last.exit_code == EXIT_CODES[Outcome.NOT_EVALUABLE]:
+            return tried(outcome=unknown, label=unknown, sentence=last.sentence, folder=last.out)
+        if last.outcome and last.state not in (ERROR, SKIPPED):
+            return tried(outcome=last.outcome, label=last.label, sentence=last.sentence, folder=last.out)
+        wrong = next(run for run in runs if run.state in (ERROR, SKIPPED) or run is last)
+        if wrong.cause or wrong.exit_code not in BY_ITS_VALUES:
             raise InputError(
-                f"{_told(values)}: {wrong.job} came to no verdict: {wrong.cause or wrong.sentence}",
+                f"{_words(values)}: {wrong.job} came to no verdict: {wrong.cause or wrong.sentence}",
                 remedy=f"see {self.out / wrong.log}",
             )
-        return Tried(
-            values=dict(values),
-            outcome=last.outcome or str(outcome),
-            label=last.label if last.outcome else str(outcome),
-            sentence=last.sentence,
-            folder=last.out,
-        )
-
-
-def _found(
-    request: SweepRequest, run: RunFolder, ranges: Mapping[str, tuple[float, float]], runs: Runs
-) -> SweepResult:
-    began, starts = time.time(), {name: a for name, (a, _) in ranges.items()}
-    start = runs.at([starts])[0]
-    if start.outcome == Outcome.NOT_EVALUABLE:
-        raise _not_evaluable(_told(starts), start.sentence)
-    if start.outcome == REFUSED:
-        raise InputError(f"{_told(starts)}: is refused: {start.sentence}", remedy="begin at a value that is not")
-    _check_settings(run, open_run(runs.out / start.folder), runs.chain)
-    flips = [_alone(name, starts, b, runs, request.tolerance) for name, (_, b) in ranges.items()]
-    return SweepResult(
-        out=request.out,
-        before=run.verdict,
-        flips=flips,
-        least=_together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None,
-        num_runs=len(runs.nodes),
-        num_new=sum(each.started >= began for each in runs.scheduler.runs.values()) if runs.scheduler else 0,
-    )
+        return tried(outcome=REFUSED, label=REFUSED, sentence=f"{wrong.job}: {wrong.sentence}", folder="")
 
 
 def _check_settings(run: RunFolder, again: RunFolder, chain: Chain) -> None:
-    """Raise InputError if settings other than the varied ones changed."""
-    options = (
-        option for key in chain.keys.values() for each in (key.options, key.lockstep) for option in each.values()
-    )
-    varied = {option.removeprefix("set.") for option in options}
+    varied = {option.removeprefix("set.") for key in chain.keys.values() for option in key.options.values()}
     differs = [
         f"{section}.{name}"
         for section, values in run.run.get("config", {}).items()
@@ -299,18 +283,19 @@ def _check_settings(run: RunFolder, again: RunFolder, chain: Chain) -> None:
         )
 
 
-def _told(values: Mapping[str, float]) -> str:
+def _words(values: Mapping[str, float]) -> str:
     return ", ".join(f"{name}={value:g}" for name, value in values.items())
 
 
-def _alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, tolerance: float) -> KeyFlip:
-    key = runs.chain.keys[name]
+def _vary_alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, tolerance: float) -> KeyFlip:
+    key, at = runs.chain.keys[name], dict[float | None, Tried]()
 
-    def at(value: float) -> Tried:
-        return runs.at([{**starts, name: value}])[0]
+    def judge(values: Sequence[float]) -> list[str]:
+        at.update(zip(values, runs.at([{**starts, name: value} for value in values]), strict=True))
+        return [at[value].outcome for value in values]
 
-    found: Flip = find_flip(
-        lambda values: [each.outcome for each in runs.at([{**starts, name: value} for value in values])],
+    found = find_flip(
+        judge,
         starts[name],
         end,
         tolerance=tolerance * abs(end - starts[name]),
@@ -319,17 +304,17 @@ def _alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, toler
     )
     return KeyFlip(
         key=key,
-        start=at(starts[name]),
-        end=at(end),
-        last=None if found.last is None else at(found.last),
-        first=None if found.first is None else at(found.first),
-        tried=[at(value) for value in found.outcomes],
+        start=at[found.start],
+        end=at[found.end],
+        last=at.get(found.last),
+        first=at.get(found.first),
+        tried=[at[value] for value in found.tried],
         is_monotone=found.is_monotone,
         spacing=found.spacing,
     )
 
 
-def _together(
+def _vary_together(
     flips: Sequence[KeyFlip], ranges: Mapping[str, tuple[float, float]], runs: Runs, tolerance: float
 ) -> LeastChange[Tried] | None:
     def values_at(shares: Sequence[float]) -> dict[str, float]:
@@ -351,7 +336,6 @@ def _together(
     return LeastChange(length=float(f"{found.length:.6g}"), last=last, first=first)
 
 
-def _write(out: Path, asked: Mapping[str, Any], result: SweepResult | None) -> None:
-    found = {} if result is None else result.as_dict()
-    document = {"format": FORMAT, "version": VERSION, "is_done": result is not None, "asked": asked, **found}
+def _write(out: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+    document = {"format": FORMAT, "version": VERSION, "is_done": False, "asked": asked, **found}
     write_durably(out / FILE, lambda path: write_json(path, document))

@@ -201,15 +201,15 @@ def test_held_out_depth_agrees_with_splats_on_the_true_surface(
     folder = sample_data / "tabletop"
     robot = {"urdf": folder / "robot.urdf", "spheres": folder / "robot_spheres.yaml"}
     held_out = {"held_out": folder / "log.mcap", "held_out_cameras": ("cam3",)}
-    found = bake_true(true_splats, tmp_path / "field", **held_out, **robot).accuracy.held_out_depth
-    assert found is not None and found.num_frames == 1
+    found = bake_true(true_splats, tmp_path / "field", **held_out, **robot).accuracy["held_out_depth"]
+    assert found["num_frames"] == 1
     half_a_cell = 0.015  # which the interpolation of a surface between two cells may read on it
-    on_surface, near = found.on_surface["hard"].median, found.before.seen["sdf"][0]
-    assert on_surface is not None and 0 < on_surface < half_a_cell
-    assert near.median is not None and abs(near.median) < half_a_cell
-    assert near.count > 20
-    with_robot = bake_true(true_splats, tmp_path / "robot", **held_out).accuracy.held_out_depth
-    assert with_robot is not None and with_robot.num_measured > found.num_measured, (
+    near = found["before"]["seen"]["sdf"][0]
+    assert 0 < found["on_surface"]["hard"]["median"] < half_a_cell
+    assert abs(near["median"]) < half_a_cell
+    assert near["count"] > 20
+    with_robot = bake_true(true_splats, tmp_path / "robot", **held_out).accuracy["held_out_depth"]
+    assert with_robot["num_measured"] > found["num_measured"], (
         "pixels of the robot count where nobody says where it is"
     )
 
@@ -225,11 +225,11 @@ def test_probability_is_held_to_the_truth(true_splats: Path, sample_data: Path, 
     folder = sample_data / "tabletop"
     truth = {"truth": folder / "truth.json", "seen_by": folder / "log.mcap"}
     result = bake_true(true_splats, tmp_path / "field", **truth, with_probability=True, no_report=False)
-    found = result.accuracy.truth
-    assert found is not None and found.error_sigma is not None and 0 < found.error_sigma < 0.02
-    calibrated, paper = found.reliability["calibrated"], found.reliability["paper"]
-    assert calibrated.count.sum() == paper.count.sum() > 50
-    assert calibrated.calibration_error < 0.2
+    found = result.accuracy["truth"]
+    assert 0 < found["error_sigma"] < 0.02
+    calibrated, paper = found["reliability"]["calibrated"], found["reliability"]["paper"]
+    assert calibrated["count"].sum() == paper["count"].sum() > 50
+    assert calibrated["calibration_error"] < 0.2
     pictures = sorted(path.name for path in (tmp_path / "field" / "report").iterdir())
     assert pictures == ["gradient.png", "probability.png", "reliability.png", "slices.png"]
 

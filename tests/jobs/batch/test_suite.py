@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.jobs.batch.graph import COMMANDS, Node, columns_of, nodes_of, of_shard
+from splatctrl_cli.jobs.batch.graph import COMMANDS, Node, columns_of, nodes_of, select_shard
 from splatctrl_cli.jobs.batch.ledger import NAME, VERSION, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batch.suite import Limits, read_suite
 
@@ -23,7 +23,7 @@ def nodes(folder: Path, text: str, shard: tuple[int, int] = (1, 1)) -> list[Node
         (folder / name).touch()
     (folder / "suite.toml").write_text(text)
     suite = read_suite(folder / "suite.toml", COMMANDS)
-    return of_shard(nodes_of(suite, folder / "out", OfThisProgram(threads=1)), shard)
+    return select_shard(nodes_of(suite, folder / "out", OfThisProgram(threads=1)), shard)
 
 
 def options(node: Node) -> dict[str, str]:

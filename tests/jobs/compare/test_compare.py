@@ -124,7 +124,7 @@ def test_only_a_verdict_from_green_to_red_is_a_regression(
     old = changed(audit, tmp_path / "old", judged(*before))
     result = compared(old, changed(audit, tmp_path / "new", judged(*after)))
     (one,) = result.verdicts
-    assert (one.before, one.after, one.change) == (before[1], after[1], change)
+    assert (one["before"], one["after"], one["change"]) == (before[1], after[1], change)
     assert result.verdict.exit_code == code
     assert any(f"from '{before[1]}' to '{after[1]}'" in reason.sentence for reason in result.verdict.reasons)
     if code:
@@ -189,7 +189,7 @@ def test_a_node_that_ended_as_expected_and_does_no_more_is_a_regression(audit: P
         tmp_path / "x", audit, {"a": {}}, lambda n: n.update(state="error", outcome=None, cause="timed out")
     )
     result = compared(old, gone)
-    assert (result.verdict.exit_code, result.verdicts[0].after) == (1, "timed out")
+    assert (result.verdict.exit_code, result.verdicts[0]["after"]) == (1, "timed out")
 
 
 def test_a_node_without_run_json_is_read_from_what_it_printed(audit: Path, tmp_path: Path) -> None:

@@ -81,14 +81,14 @@ def test_a_file_that_renders_differently_is_not_left_behind(scene: Path, monkeyp
 def test_an_exact_format_whose_rendering_differs_is_not_left_behind(
     scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    render, calls = job.rendered, []
+    render, calls = job.render_splats, []
 
     def darker_every_second_time(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64) -> Rendering:
         calls.append(1)
         seen = render(splats, intrinsics, T_world_camera)
         return seen if len(calls) % 2 else replace(seen, color=seen.color * np.float32(0.9995))
 
-    monkeypatch.setattr(job, "rendered", darker_every_second_time)
+    monkeypatch.setattr(job, "render_splats", darker_every_second_time)
     with pytest.raises(WriteError, match="does not render as its source: PSNR "):
         export(scene, "out.glb")
     assert not list(scene.parent.glob("out.*"))

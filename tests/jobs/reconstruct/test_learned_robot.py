@@ -15,7 +15,7 @@ from splatctrl_cli.jobs.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruct import LearnRequest, ReconstructRequest, learn_robot
 from splatctrl_cli.jobs.replay.inputs import grasp_contacts, open_log, read_states
 from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, with_self_model
+from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, add_self_model
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -42,7 +42,7 @@ def learned(request: ReconstructRequest, *, is_new: bool = True) -> tuple[RobotM
     heard, robot = Said(), RobotModel.from_urdf(request.urdf, request.spheres)  # type: ignore[arg-type]
     robot = robot.moved_by(request.source.joint_names)
     request.out.mkdir(exist_ok=True)
-    found, off = reconstruct._learned(robot, request, request.out, heard, is_new=is_new)
+    found, off = reconstruct._learn_self(robot, request, request.out, heard, is_new=is_new)
     assert found is not None
     assert not robot.surface.trees or max(row["distance_mm"] for row in off.values()) < 1.0
     return found, heard.lines
@@ -156,7 +156,7 @@ def test_a_log_whose_arm_is_as_its_urdf_draws_it_gives_a_self_model_without_part
     assert found.pieces() == [] and len(found.learned) > 3
     assert "panda_link0" in found.unknown
     model = RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
-    assert len(with_self_model(model, out).surface.triangles) == len(model.surface.triangles)
+    assert len(add_self_model(model, out).surface.triangles) == len(model.surface.triangles)
     out.write_bytes(out.read_bytes()[:400])
     with pytest.raises(InputError, match="not a self-model"):
-        with_self_model(model, out)
+        add_self_model(model, out)

@@ -33,6 +33,7 @@ def judged(**replay: Any) -> Any:
         "audit": SimpleNamespace(stamp_ns=stamps, clearance={}, unknown_share=np.zeros(NUM)),
         "between": {"unbounded": np.zeros(NUM - 1), "surface": np.full(NUM, 0.1)},
         "margin": 0.02,
+        "num_states": NUM,
         "near": NOTHING_NEAR,
         "unwatched": (),
         "overtaken": (),
@@ -57,7 +58,6 @@ def judged(**replay: Any) -> Any:
         ),
         inputs=SimpleNamespace(source=SimpleNamespace(loss=SimpleNamespace(conflicting_states=0), has_clock=True)),
         metrics={"unknown_share": 0.0, "num_scene_hits": 0},
-        num_states=NUM,
         past_end_s=0.0,
     )
 

@@ -15,7 +15,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.replay import evidence
-from splatctrl_cli.jobs.replay.evidence import apart_from_robot, held_out, open_evidence, trained
+from splatctrl_cli.jobs.replay.evidence import apart_from_robot, open_evidence, select_held_out, select_trained
 from splatctrl_cli.jobs.replay.lockstep import from_log
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.running.progress import SILENT
@@ -282,7 +282,10 @@ def test_every_set_either_trains_or_is_evidence(recording: Path) -> None:
     steps = [s.stamp_ns for s in time_steps(source.records(), source.cameras, has_clock=True)]
     for every in (2, 3, 5):
         given = list(time_steps(source.records(), source.cameras, has_clock=True))
-        kept, left = [s.stamp_ns for s in trained(given, every)], [s.stamp_ns for s in held_out(given, every)]
+        kept, left = (
+            [s.stamp_ns for s in select_trained(given, every)],
+            [s.stamp_ns for s in select_held_out(given, every)],
+        )
         assert sorted(kept + left) == steps and not set(kept) & set(left) and left == steps[every - 1 :: every]
 
 

@@ -52,12 +52,12 @@ def test_the_scene_of_a_replay_is_the_one_known_at_each_time(run: Runs, arm: Rob
     space = space_of(run())
     assert space.motion is not None
     assert space.deciding is not None
-    assert space.deciding.sphere is not None
     assert list(map(len, space.splats.values())) == [1, 1, 2, 2, 2]
     assert list(space.splats) == [0.0, 0.25, 0.5, 0.75, 1.0]
     worst = int(np.argmin(space.motion.clearance))
     np.testing.assert_allclose(space.motion.path[worst], arm.frame_pose(passing()[worst].position, "hand")[:3, 3])
-    gap = np.linalg.norm(space.deciding.sphere[0] - space.deciding.place) - space.deciding.sphere[1]
+    deciding = space.deciding
+    gap = np.linalg.norm(np.subtract(deciding["center"], deciding["place"])) - deciding["radius"]
     assert gap == pytest.approx(0.012, abs=1e-4)
 
 

@@ -170,7 +170,7 @@ def test_a_model_of_the_command_line_that_differs_as_a_mechanism_is_said(
     assert words in said.lines[0]
     assert said.lines[0].startswith("warning: ")
     assert said.lines[0].endswith("leave --urdf out to take the log's own, or correct the file")
-    findings = check(CheckRequest(paths=(path,), urdf=file)).report.findings
+    findings = check(CheckRequest(paths=(path,), urdf=file))[0].findings
     assert [finding.what for finding in findings if finding.code == "robot-model"] == [differs(found, [path])]
 
 
@@ -238,7 +238,7 @@ def test_a_replay_keeps_the_robot_of_its_log_for_who_looks_at_it(
 def test_a_capture_keeps_the_description(tmp_path: Path) -> None:
     path = log_with(tmp_path / "run.mcap", described(robot()))
     assert describe(path).facts["robot_description"] == ["/robot_description"]
-    capture = ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture")).capture
+    capture = ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture"))[0]
     assert is_capture(capture)
     assert (capture / "robot_description.urdf").read_text() == robot()
     found = logged_urdf([capture])

@@ -46,7 +46,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cards(patch: pytest.MonkeyPatch, memory: Memory, name: str = "Card") -> None:
     """Let every card be this one."""
     card = Card(index=0, name=name, capability=(9, 0), driver="580.1")
-    patch.setattr(device, "opened", lambda *_: Device(name="cuda:0", card=card, memory=memory))
+    patch.setattr(device, "open_device", lambda *_: Device(name="cuda:0", card=card, memory=memory))
 
 
 @pytest.fixture
@@ -204,7 +204,7 @@ def test_auto_goes_on_where_the_run_was(
             assert reconstruct(views, tmp_path / name, "--device", begins, "-q") in (70, 130)
         cards(monkeypatch, EmulatedDevice())
         if not has_card:
-            monkeypatch.setattr(device, "opened", no_card)
+            monkeypatch.setattr(device, "open_device", no_card)
         capsys.readouterr()
         assert reconstruct(views, tmp_path / name, "--resume") == 0
         found = run_of(tmp_path / name)["metrics"]["devices"]
@@ -248,7 +248,7 @@ from splatctrl_cli.jobs.running import device
 sys.modules["cuda"] = None
 before, start = set(sys.modules), time.perf_counter()
 try:
-    device.opened("cuda")
+    device.open_device("cuda")
 except Exception as error:
     print(f"{1e3 * (time.perf_counter() - start):.2f}", sorted(set(sys.modules) - before), error)
 """

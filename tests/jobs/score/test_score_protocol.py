@@ -13,7 +13,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.score import lines_of
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.held_out_depth import spaced
+from splatctrl_cli.evaluate.held_out_depth import space_out
 from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, is_folder_of_views
@@ -259,7 +259,7 @@ def test_the_surface_is_compared_where_dtus_own_evaluation_looks(
     result = scored(place, "mvsnet", cloud=replace(settings, masks=tmp_path))
     metrics = figures(result)
     assert 100 < metrics["num_points"] < 0.5 * whole["num_points"]
-    above = spaced(points, 0.004)[:, 2] > 0.03
+    above = space_out(points, 0.004)[:, 2] > 0.03
     assert metrics["num_reference"] == pytest.approx(np.count_nonzero(above), rel=0.05)
     assert "within the masks and above the planes of" in result.report["protocol"]["definitions"]["cloud"]
     with pytest.raises(InputError):
