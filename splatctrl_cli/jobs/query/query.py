@@ -250,38 +250,31 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
             out = stack.enter_context(partial.open("w", encoding="utf-8", newline=""))
             out.write(",".join(TITLES) + "\n")
         with stopwatch.stage("read"):
-            asked = _open_source(request, progress)
+            kind, answer, box, device = _open_source(request, progress)
         with stopwatch.stage("answer"):
             for points in _blocks(request.points, progress):
                 try:
-                    answers = asked.at(points)
+                    answers = answer(points)
                 except DeviceError as error:
-                    raise explain_fault(error, asked.device) from error
+                    raise explain_fault(error, device) from error
                 figures.append(_figures_of(answers))
                 if out is not None:
                     out.write(rows_of(points, answers))
     metrics = _metrics_of(figures)
     return QueryResult(
         out=request.out,
-        kind=asked.kind,
+        kind=kind,
         metrics=metrics,
-        notes=_notes_of(asked, metrics),
+        notes=_notes_of(kind, box, metrics),
         seconds=stopwatch.seconds,
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Asked:
-    """Source of the answers; a grid has no distance outside its box."""
-
-    kind: str
-    at: Callable[[Float64], Answers]
-    box: Box | None
-    is_grid: bool = False
-    device: Device | None = None
+Answering = tuple[str, Callable[[Float64], Answers], Box | None, Device | None]
+"""The kind of a source, its answers at points (Q, 3), its box, and the device that computes."""
 
 
-def _open_source(request: QueryRequest, progress: Progress) -> _Asked:
+def _open_source(request: QueryRequest, progress: Progress) -> Answering:
     file = _grid_file(request.source)
     if file is None:
         if request.scene is not None:
@@ -291,7 +284,7 @@ def _open_source(request: QueryRequest, progress: Progress) -> _Asked:
         source = read_bake_source(request.source, request.at)
         device = choose_device(request.device, _is_enough(request.points), progress)
         scene = _scene(source, request, request.labels, request.config, device)
-        return _Asked(kind="scene", at=scene.at, box=source.workspace, device=device)
+        return "scene", scene.at, source.workspace, device
     if request.at is not None:
         raise UsageError(f"--at: {request.source} is a field of one time", remedy="give the scene, or leave --at out")
     check_room(str(file), file.stat().st_size, "bake a smaller --box or a larger --voxel")
@@ -300,7 +293,7 @@ def _open_source(request: QueryRequest, progress: Progress) -> _Asked:
     if request.scene is None:
         if request.device.startswith(CUDA):
             raise UsageError(f"--device {request.device}: a baked field is read on the processor", remedy=TO_CPU)
-        return _Asked(kind="field", at=of_grid.at, box=of_grid.box, is_grid=True)
+        return "field", of_grid.at, of_grid.box, None
     where = str(request.source)
     labels = run_value(
         grid.header, ("labels",), lambda names: frozenset(Label[name.upper()] for name in names), where=where
@@ -313,7 +306,7 @@ def _open_source(request: QueryRequest, progress: Progress) -> _Asked:
     def at(points: Float64) -> Answers:
         return both.complete(points, of_grid.at(points))
 
-    return _Asked(kind="field and scene", at=at, box=of_grid.box, is_grid=True, device=device)
+    return "field and scene", at, of_grid.box, device
 
 
 def _is_enough(points: Path | TextIO) -> bool:
@@ -393,14 +386,15 @@ def _metrics_of(figures: Sequence[Mapping[str, Any]]) -> dict[str, float | None]
     }
 
 
-def _notes_of(asked: _Asked, metrics: Mapping[str, float | None]) -> tuple[str, ...]:
+def _notes_of(kind: str, box: Box | None, metrics: Mapping[str, float | None]) -> tuple[str, ...]:
     num, notes = {name: int(value or 0) for name, value in metrics.items() if name.startswith("num_")}, []
-    if num["num_outside"] and asked.box is not None:
-        lower, upper = (", ".join(f"{x:.4g}" for x in corner) for corner in (asked.box.lower, asked.box.upper))
-        place = f"outside the box ({lower}) to ({upper}) m of the {asked.kind.partition(' ')[0]}"
-        what = "have no distance; bake a larger --box" if asked.is_grid else "were never seen; ask inside it"
+    is_grid = kind != "scene"  # which has no distance outside its box
+    if num["num_outside"] and box is not None:
+        lower, upper = (", ".join(f"{x:.4g}" for x in corner) for corner in (box.lower, box.upper))
+        place = f"outside the box ({lower}) to ({upper}) m of the {kind.partition(' ')[0]}"
+        what = "have no distance; bake a larger --box" if is_grid else "were never seen; ask inside it"
         notes.append(f"{num['num_outside']} of {num['num_points']} points lie {place} and {what}")
-    if blank := num["num_points"] - num["num_answered"] - (num["num_outside"] if asked.is_grid else 0):
+    if blank := num["num_points"] - num["num_answered"] - (num["num_outside"] if is_grid else 0):
         notes.append(f"{blank} points lie next to unseen cells, baked as nan, and have no distance")
     if num["num_never_seen"]:
         notes.append(
