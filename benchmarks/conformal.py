@@ -25,7 +25,7 @@ from benchmarks.random_tabletop import random_things
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.config.fixed import FEWEST_STRETCHES
 from splatctrl_cli.evaluate.conformal import autocorrelation_time, conformal_rank, stretch_scores, stretches
-from splatctrl_cli.jobs.replay.evidence import Misses, misses_of
+from splatctrl_cli.jobs.replay.evidence import misses_of
 from splatctrl_cli.jobs.replay.inputs import open_log, read_states
 from splatctrl_cli.jobs.replay.lockstep import from_log
 from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
@@ -137,7 +137,7 @@ def trial_of(seed: int) -> Trial | None:
         )
         record, over = audited(inputs, recording, config)
         reach = config.verdict.evidence_reach
-        measured, exact = (misses_of(sets, inputs, record.audit, reach) for sets in evidence_of(recording))
+        measured, exact = (misses_of(sets, inputs, record.audit, reach)[1][:, 0] for sets in evidence_of(recording))
     return judged(seed, measured, exact, over, config.verdict.confidence, time.process_time() - start)
 
 
@@ -206,12 +206,12 @@ def audited(inputs: ReplayInputs, recording: Recording, config: Config) -> tuple
 
 
 def judged(
-    seed: int, measured: Misses, exact: Misses, over: Float64, confidence: float, seconds: float
+    seed: int, measured: Float64, exact: Float64, over: Float64, confidence: float, seconds: float
 ) -> Trial | None:
     """The two questions, of a scene's misses with and without noise."""
-    length = autocorrelation_time(measured.distance)
-    stretch = stretches(len(measured.distance), length)
-    scores, deciding = stretch_scores(measured.distance, stretch)
+    length = autocorrelation_time(measured)
+    stretch = stretches(len(measured), length)
+    scores, deciding = stretch_scores(measured, stretch)
     if len(scores) < FEWEST_STRETCHES:
         return None
     drawn = int(np.random.default_rng([seed, 8]).integers(len(scores)))
@@ -225,7 +225,7 @@ def judged(
         length=length,
         bound=_bound(others, ASKED)[0],
         promise=_bound(others, ASKED)[1],
-        further=float(np.nanmax(exact.distance[core])),
+        further=float(np.nanmax(exact[core])),
         highest=_bound(others, confidence)[0],
         highest_promise=_bound(others, confidence)[1],
         full=_bound(scores, confidence)[0],
