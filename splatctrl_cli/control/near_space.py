@@ -20,7 +20,6 @@ NEVER_SEEN = (
     *(EvidenceClass.HIDDEN_BY_ARM, EvidenceClass.HIDDEN_BY_THING, EvidenceClass.OUT_OF_VIEW),
     *(EvidenceClass.NO_RETURN, EvidenceClass.CONTRADICTED, EvidenceClass.UNANSWERED),
 )
-NOT_OCCLUDED = EvidenceClass.OUT_OF_VIEW, EvidenceClass.NO_RETURN  # where nothing in front explains missing depth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +45,8 @@ class Account:
     shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
     unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place;
-    blind_to_surface [m]: of `NOT_OCCLUDED` points, about spheres with almost only never-seen points (`NEAR_BLIND`).
-    Infinite and NaN without any. age [s]: quantile `NEAR_FRESH_SHARE` of ages; ahead [s]: to the latest view. NaN
-    without views.
+    blind_to_surface [m]: likewise, about spheres with almost only such points (`NEAR_BLIND`). Infinite and NaN
+    without any. age [s]: quantile `NEAR_FRESH_SHARE` of ages; ahead [s]: to the latest view. NaN without views.
     """
 
     shares: Float64
@@ -126,7 +124,7 @@ class NearSpace:
         num, num_never = (np.bincount(spheres[which], minlength=len(centers)) for which in (is_within, is_never))
         is_blind = (num_never >= fixed.NEAR_BLIND * num) & (num >= fixed.NEAR_FEWEST)
         to_unseen, unseen_place = _nearest_of(points[is_never], away[is_never])
-        is_in_blind = is_within & np.isin(classes, NOT_OCCLUDED) & is_blind[spheres]
+        is_in_blind = is_never & is_blind[spheres]
         to_blind, blind_place = _nearest_of(points[is_in_blind], away[is_in_blind])
         return Account(
             shares=np.bincount(classes[is_within], minlength=len(EvidenceClass)) / max(num.sum(), 1),

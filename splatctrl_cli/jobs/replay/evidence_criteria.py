@@ -95,9 +95,8 @@ LIMITS = (
         remedy="add a camera that sees that side",
     ),
     Limit(
-        asked="out of view or no return, in space about a sphere of the arm that is nine tenths never seen, from a "
-        "surface of the map",
-        why="the surface may extend out of view, or an object without depth may be there",
+        asked="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
+        why="space that is almost entirely unseen may hold a whole object",
         column="blind_to_surface",
         least=BEYOND,
         words="a part of the arm enters space that is over 90 % unseen, {} from a surface of the map, allowed "
