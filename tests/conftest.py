@@ -1,15 +1,36 @@
 """Where tests find data: the project's own sample_data/, an arm without meshes, and real recordings kept outside."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 ROOT = Path(__file__).parent.parent
 
 # As the command line does before numpy is imported; and torch, which only tests use, waits for its threads as much.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+LAY_OUT, PAINT = ConstrainedLayoutEngine.execute, Figure.savefig
+
+
+@pytest.fixture(scope="session", autouse=True)
+def unpainted() -> Iterator[None]:
+    """Make figures in full, but neither lay out nor paint them, which takes longer than a replay."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
+        patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
+        yield
+
+
+@pytest.fixture
+def painted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lay out and paint the figures of this test."""
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", LAY_OUT)
+    monkeypatch.setattr(Figure, "savefig", PAINT)
 
 
 @pytest.fixture(scope="session")

@@ -4,8 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.cli.main import main
@@ -53,14 +51,6 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of other files of the output."""
     monkeypatch.setattr(files, "draw_replay", lambda *_: None)
-
-
-@pytest.fixture
-def unpainted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are made in full, but neither laid out nor painted, which takes longer than a replay; `painted` are."""
-    if request.node.get_closest_marker("painted") is None:
-        monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
-        monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
 
 
 @pytest.fixture(scope="session")

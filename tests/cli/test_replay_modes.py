@@ -12,8 +12,6 @@ from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, scene_of, splats_of, write_scene
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 MOVE = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -50,7 +48,7 @@ def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) ->
     assert (desk.folder / "out" / "open_loop.png").is_file()
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -198,7 +198,7 @@ Runs = Callable[..., Path]
 
 
 @pytest.fixture
-def run(desk: Desk, arm: RobotModel, unpainted: None, monkeypatch: pytest.MonkeyPatch) -> Runs:
+def run(desk: Desk, arm: RobotModel, monkeypatch: pytest.MonkeyPatch) -> Runs:
     """A replay in which a ball comes near, as the command leaves it; its scene and robot beside it."""
 
     def made(out: str = "audit", mode: str = "audit", *more: str) -> Path:

@@ -39,6 +39,8 @@ from splatctrl_cli.report.replay_pictures import (
     spans,
 )
 
+pytestmark = pytest.mark.usefixtures("painted")
+
 H, W = 30, 40
 
 

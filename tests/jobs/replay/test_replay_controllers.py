@@ -22,8 +22,6 @@ from tests.cli.test_replay_modes import ball_ahead, events, moving
 from tests.jobs.stage import MOVE, QUARTER, Stage, decisive, passing
 from tests.robot.test_fingers import ARM, FRANKA, robot
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 EXAMPLES = Path(__file__).parents[3] / "docs" / "controllers"
 MODULE = """
     import json

@@ -48,8 +48,6 @@ COVER = '<collision><origin xyz="0.022 0 0.054"/><geometry><box size="0.02 0.02 
 DRIVE = ("--mode", "closed-loop", "--set", "control.solver=daqp", "--set", "control.max_time=4")
 SRDF = '<robot name="folding"><disable_collisions link1="block" link2="drum" reason="Never"/></robot>'
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 
 def desk_of(
     folder: Path, monkeypatch: pytest.MonkeyPatch, spheres: SphereSet, *postures: Float64, urdf: str = URDF
