@@ -8,19 +8,22 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from splatctrl_cli.jobs.replay import files
+
 ROOT = Path(__file__).parent.parent
 
 # As the command line does before numpy is imported; and torch, which only tests use, waits for its threads as much.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-LAY_OUT, PAINT = ConstrainedLayoutEngine.execute, Figure.savefig
+DRAW, LAY_OUT, PAINT = files.draw_replay, ConstrainedLayoutEngine.execute, Figure.savefig
 
 
 @pytest.fixture(scope="session", autouse=True)
 def unpainted() -> Iterator[None]:
-    """Make figures in full, but neither lay out nor paint them, which takes longer than a replay."""
+    """Leave out what takes longer than a replay: its pictures, and layout and paint of all other figures."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "draw_replay", lambda *_: None)
         patch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
         patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
         yield
@@ -28,7 +31,8 @@ def unpainted() -> Iterator[None]:
 
 @pytest.fixture
 def painted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lay out and paint the figures of this test."""
+    """Draw, lay out and paint all pictures of this test."""
+    monkeypatch.setattr(files, "draw_replay", DRAW)
     monkeypatch.setattr(ConstrainedLayoutEngine, "execute", LAY_OUT)
     monkeypatch.setattr(Figure, "savefig", PAINT)
 

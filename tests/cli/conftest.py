@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.jobs.replay import files, inputs, lockstep
+from splatctrl_cli.jobs.replay import inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import Desk, FakeSource, logged
@@ -45,12 +45,6 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size = ["--duration", "1.0", "--width", "96", "--height", "72", "--dtu"]
     assert main(["simulate", "-o", str(folder), *size, "-q"]) == 0
     return folder
-
-
-@pytest.fixture
-def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests of other files of the output."""
-    monkeypatch.setattr(files, "draw_replay", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

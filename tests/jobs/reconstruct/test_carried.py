@@ -34,7 +34,6 @@ from tests.jobs.stage import MOVE, Stage, states_on
 from tests.plain import known, plain_grid
 from tests.recording.folder.make_layout import OPENGL_FROM_OPTICAL
 
-pytestmark = pytest.mark.usefixtures("without_plots")
 CUBE = '<origin xyz="0 0 0.15"/><geometry><box size="0.07 0.07 0.07"/></geometry>'
 HELD = f"<visual>{CUBE}</visual><collision>{CUBE}</collision>"
 BOX = "[-0.045, -0.045, 0.105, 0.045, 0.045, 0.195]"

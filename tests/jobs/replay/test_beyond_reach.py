@@ -24,8 +24,6 @@ from tests.jobs.score.test_score import run as scores
 from tests.jobs.score.wall import FRAMES, FakeScene, FakeSource, set_up, wall, write_scene
 from tests.jobs.stage import Stage, ball_beside, patch_json, voxels
 
-pytestmark = pytest.mark.usefixtures("without_plots")
-
 
 def with_shell(scene: Path, shell: SplatSet) -> Path:
     """The scene, to which a shell of these splats was written, at each of its times."""

@@ -194,7 +194,6 @@ def away(points: Float64) -> Float64:
     return np.full(len(points), 1.0)
 
 
-@pytest.mark.usefixtures("without_plots")
 def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_said_not_to_be(stage: Stage) -> None:
     stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
     code, verdict = stage.judged_by_field(FAR, moment_ns=SECOND)

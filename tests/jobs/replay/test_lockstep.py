@@ -30,7 +30,6 @@ from tests.jobs.running.test_device import cards, run_of
 from tests.kernels.cuda.emulator import EmulatedDevice
 
 SETTINGS = ["scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3"]
-pytestmark = pytest.mark.usefixtures("without_plots")
 FAST = ["--threads", "1", "-q", *(word for setting in SETTINGS for word in ("--set", setting))]
 
 

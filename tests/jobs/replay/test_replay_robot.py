@@ -210,7 +210,6 @@ FILES = ("steps.csv", "events.json", "summary.json", "states.json")
 
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
-@pytest.mark.usefixtures("without_plots")
 def test_blocks_of_any_size_give_the_same_files(
     desk: Desk, monkeypatch: pytest.MonkeyPatch, sample_data: Path, mode: str
 ) -> None:

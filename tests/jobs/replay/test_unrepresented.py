@@ -118,9 +118,6 @@ def test_a_scene_of_an_older_version_has_none(tmp_path: Path, scene: Path) -> No
     assert distances[0] > 0.6
 
 
-pytestmark = pytest.mark.usefixtures("without_plots")
-
-
 @pytest.mark.parametrize(("human_margin", "code"), [(0.055, 0), (0.065, 1)])
 def test_people_are_kept_at_a_margin_of_their_own(stage: Stage, human_margin: float, code: int) -> None:
     stage.people = [stage.ball_at_the_end(0.06)]
