@@ -2,13 +2,18 @@
 
 import os
 from collections.abc import Iterator
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import yaml
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from splatctrl_cli.jobs.replay import files
+from splatctrl_cli.robot import sphere_files
 
 ROOT = Path(__file__).parent.parent
 
@@ -26,6 +31,16 @@ def unpainted() -> Iterator[None]:
         patch.setattr(files, "draw_replay", lambda *_: None)
         patch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
         patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def parsed_once() -> Iterator[None]:
+    """Parse each text of a sphere file once: the arm's takes as long as many a test."""
+    parse = cache(yaml.safe_load)
+    parser = SimpleNamespace(safe_load=lambda text: deepcopy(parse(text)), YAMLError=yaml.YAMLError)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sphere_files, "yaml", parser)
         yield
 
 

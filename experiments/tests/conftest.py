@@ -10,10 +10,10 @@ from experiments.problems import Problem, Views, simulated_arm, views_of
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.primitives import Primitive
 from tests.cli.conftest import arm, desk
-from tests.conftest import painted, plain_arm, unpainted
+from tests.conftest import painted, parsed_once, plain_arm, unpainted
 from tests.jobs.conftest import stage
 
-__all__ = ["arm", "desk", "painted", "plain_arm", "stage", "unpainted"]
+__all__ = ["arm", "desk", "painted", "parsed_once", "plain_arm", "stage", "unpainted"]
 
 HOME = np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
 TURN = np.array([0.8, 0, 0, 0, 0, 0, 0])  # [rad] from either side of the post to the other

@@ -7,6 +7,7 @@ import pytest
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.config import fixed
 from splatctrl_cli.jobs.replay import inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.robot.model import RobotModel
@@ -16,11 +17,12 @@ from tests.recording.log.make_log import messages_of, write_raw
 
 @pytest.fixture(scope="package", autouse=True)
 def few_points() -> Iterator[None]:
-    """Compare fewer points between views than usual, which takes a fifth of a small fit."""
+    """Compare fewer points between views, a fifth of a small fit; look around the arm every 3 cm, not 1."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(limits, "VIEWS_PAIRS", 10)
         patch.setattr(limits, "VIEWS_POINTS", 400)
         patch.setattr(limits, "VIEWS_LANDED", 200)
+        patch.setattr(fixed, "NEAR_MOVED", 0.03)
         yield
 
 
