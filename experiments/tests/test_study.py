@@ -36,6 +36,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Stud
         patch.setattr(
             "experiments.study.ProcessPoolExecutor", lambda max_workers, **_: ThreadPoolExecutor(max_workers)
         )
+        patch.setattr("experiments.drawn_task.TASK_GUESSES", 6)
         patch.setattr("experiments.trial.PLANS", 1)
         patch.setattr("experiments.trial.SEARCH", 300)
         patch.setattr("experiments.trial.CAMERAS", CAMERAS)
@@ -49,7 +50,9 @@ def test_a_study_with_a_shard_missing_is_not_whole_and_says_which_problem_lacks(
     whole: tuple[Path, StudyResult, StudyResult],
 ) -> None:
     _, part, _ = whole
-    assert part.verdict.outcome is Outcome.NOT_EVALUABLE and not part.trials and not part.sections
+    assert part.verdict.outcome is Outcome.NOT_EVALUABLE
+    assert not part.trials
+    assert not part.sections
     assert "1 of 3 problems have no trials yet: cubby-0000" in part.verdict.sentence
 
 
