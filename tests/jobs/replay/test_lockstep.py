@@ -28,6 +28,7 @@ from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_o
 from tests.jobs.bake.baked import Said
 from tests.jobs.running.test_device import cards, run_of
 from tests.kernels.cuda.emulator import EmulatedDevice
+from tests.refused import expect_refusal
 
 SETTINGS = ["scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3"]
 FAST = ["--threads", "1", "-q", *(word for setting in SETTINGS for word in ("--set", setting))]
@@ -94,8 +95,7 @@ def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
     assert len(scene.stamps_ns) == 1
     first = scene.stamps_ns[0]
     assert scene.first_ns == first + SECOND // 4
-    with pytest.raises(NotEvaluableError, match="no scene is known"):
-        scene.at(first)
+    expect_refusal("no scene is known", scene.at, first, error=NotEvaluableError)
     for num, seconds in ((1, 0.44), (2, 0.46), (3, 0.66), (3, 0.5)):
         scene.at(first + round(seconds * SECOND))
         assert len(scene.stamps_ns) == num

@@ -28,6 +28,7 @@ from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.truth import distance_to, load_truth
 from tests.jobs.bake.baked import Said
+from tests.refused import expect_refusal
 from tests.robot.shapes import collada, coverage_deficit, written
 
 OPTIONS = RecordingOptions(duration_s=3.0, fps=1.0, width=64, height=48, noise="none", color_rays=0)
@@ -130,8 +131,7 @@ def test_given_spheres_are_taken_and_the_same_kinematics_move_alike(
     moved = [record.position for record in source.records() if isinstance(record, JointState)]
     expected = [tabletop.arm_motion(OPTIONS.duration_s).at(index / 50)[0] for index in range(len(moved))]
     np.testing.assert_allclose(moved, expected, atol=1e-9)
-    with pytest.raises(UsageError, match="--spheres"):
-        SimulateRequest(out=tmp_path / "none", spheres=spheres)
+    expect_refusal("--spheres", SimulateRequest, out=tmp_path / "none", spheres=spheres, error=UsageError)
 
 
 NAMES = ("visual/seen", "forearm")

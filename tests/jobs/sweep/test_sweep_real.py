@@ -19,6 +19,7 @@ from splatctrl_cli.jobs.runs.run_folder import open_run
 from splatctrl_cli.jobs.sweep.keys import chain_of, key_of
 from splatctrl_cli.jobs.sweep.search import find_flip, find_least
 from splatctrl_cli.jobs.sweep.sweep import Runs, SweepRequest, sweep
+from tests.refused import expect_refusal
 
 PROGRAM = OfThisProgram(threads=1)
 TOLERATED = 0.001  # [m] below the margin, which the criterion allows
@@ -132,8 +133,9 @@ def test_a_key_without_a_map_to_change_is_refused(recorded: Recorded) -> None:
     del run["inputs"]["splats.ply"]
     (lockstep / "run.json").write_text(json.dumps(run | {"arguments": words}))
     assert "--set=scene.max_splats=700" in recorded.words("splats=700", run="lockstep")["replay"]
-    with pytest.raises(UsageError, match="does not say which cameras trained"):
-        recorded.words("cameras-out=1", run="lockstep")
+    expect_refusal(
+        "does not say which cameras trained", recorded.words, "cameras-out=1", run="lockstep", error=UsageError
+    )
 
 
 Span = tuple[float, float]
