@@ -28,14 +28,14 @@ def few_points() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def short_sample(sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The committed recording, 2.6 s of its 7: for commands and examples that are to run, whatever they find."""
+    """The committed recording, 1.8 s of its 7: for commands and examples that are to run, whatever they find."""
     folder = tmp_path_factory.mktemp("short") / "sample_data"
     (folder / "tabletop").mkdir(parents=True)
     for path in (sample_data / "tabletop").iterdir():
         if path.name != "log.mcap":
             (folder / "tabletop" / path.name).symlink_to(path)
     messages = list(messages_of(sample_data / "tabletop" / "log.mcap"))
-    end_ns = min(filter(None, (message.log_time_ns for message in messages))) + 2_600_000_000
+    end_ns = min(filter(None, (message.log_time_ns for message in messages))) + 1_800_000_000
     write_raw(folder / "tabletop" / "log.mcap", (each for each in messages if each.log_time_ns < end_ns))
     return folder
 
