@@ -8,6 +8,7 @@ import pytest
 from splatctrl_cli.checks import limits
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import fixed
+from splatctrl_cli.jobs.recordings import open_recording
 from splatctrl_cli.jobs.replay import inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.robot.model import RobotModel
@@ -24,6 +25,12 @@ def few_points() -> Iterator[None]:
         patch.setattr(limits, "VIEWS_LANDED", 200)
         patch.setattr(fixed, "NEAR_MOVED", 0.03)
         yield
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reconstruct good recordings without the check before, a fifth of a small run."""
+    monkeypatch.setattr(open_recording, "refuse_errors", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

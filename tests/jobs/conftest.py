@@ -3,11 +3,11 @@
 import pytest
 
 from splatctrl_cli.robot.model import RobotModel
-from tests.cli.conftest import arm, desk, few_points, short_sample, small_recording
+from tests.cli.conftest import arm, desk, few_points, short_sample, small_recording, unchecked
 from tests.cli.replay_desk import Desk
 from tests.jobs.stage import Stage, run
 
-__all__ = ["arm", "desk", "few_points", "run", "short_sample", "small_recording"]
+__all__ = ["arm", "desk", "few_points", "run", "short_sample", "small_recording", "unchecked"]
 
 
 @pytest.fixture

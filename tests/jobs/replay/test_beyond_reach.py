@@ -129,6 +129,7 @@ def test_a_score_shows_the_shell_and_keeps_its_depth(tmp_path: Path, monkeypatch
     assert [views[True][name] for name in kept] == [views[False][name] for name in kept]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_recording_with_a_robot_has_a_shell_and_counts_it_apart(small_recording: Path, tmp_path: Path) -> None:
     fast = ["--max-splats", "400", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4", "-q"]
     log = [str(small_recording / "log.mcap"), "--cameras", "cam1,cam2", *fast]

@@ -24,6 +24,8 @@ from splatctrl_cli.scene.fitter import SceneFitter
 from tests.jobs.bake.baked import Said
 from tests.jobs.stage import contents, failing
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 DTU = Path(__file__).parents[3] / "sample_data" / "dtu"
 FAST = [
     *("--max-splats", "600", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4"),
