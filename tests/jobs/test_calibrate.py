@@ -38,7 +38,7 @@ def largest(setup: SetUp, result: CalibrateResult, unknown: str) -> float:
 
 @pytest.fixture(scope="module")
 def setup() -> SetUp:
-    return SetUp(1, SMALL)
+    return SetUp(1, replace(TINY, fps=1.4))
 
 
 @pytest.fixture(scope="module")
