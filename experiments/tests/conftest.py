@@ -10,8 +10,9 @@ from experiments.problems import Problem, Views, simulated_arm, views_of
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.primitives import Primitive
 from tests.cli.conftest import arm, desk, few_points
-from tests.conftest import painted, parsed_once, plain_arm, unpainted
+from tests.conftest import plain_arm
 from tests.jobs.conftest import stage
+from tests.quick import painted, parsed_once, unpainted
 
 __all__ = ["arm", "desk", "few_points", "painted", "parsed_once", "plain_arm", "stage", "unpainted"]
 

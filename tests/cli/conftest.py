@@ -13,7 +13,10 @@ from splatctrl_cli.jobs.replay import inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import Desk, FakeSource, logged
+from tests.quick import painted, parsed_once, unpainted
 from tests.recording.log.make_log import messages_of, write_raw
+
+__all__ = ["painted", "parsed_once", "unpainted"]
 
 
 @pytest.fixture(scope="package", autouse=True)

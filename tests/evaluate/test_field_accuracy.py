@@ -28,7 +28,6 @@ from splatctrl_cli.geometry import back_project, look_at
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, Intrinsics, RgbdFrame
 from tests.evaluate.test_views import wall_frame
 from tests.plain import plain_frame
-from tests.refused import expect_refusal
 from tests.robot.test_mesh_distance import box_distance
 
 TRUTH = np.array([0.01, 0.015, 0.03, 0.07, 0.15, 0.3, -0.01])
@@ -70,7 +69,8 @@ def test_bands_without_cells_have_no_figures_and_nothing_holds() -> None:
     ],
 )
 def test_arrays_that_do_not_fit_are_named(fields: dict[str, Float64], words: str) -> None:
-    expect_refusal(words, field_accuracy, fields, TRUTH, TRUTH > 0, median_radius=0.0)
+    with pytest.raises(InputError, match=words):
+        field_accuracy(fields, TRUTH, TRUTH > 0, median_radius=0.0)
 
 
 def small_grid(header: dict[str, object], **channels: float) -> DistanceGrid:
@@ -89,9 +89,8 @@ def test_hard_comes_back_from_the_bound_of_a_grid() -> None:
 
 @pytest.mark.parametrize("header", [{}, {"bound_margin": "wide"}])
 def test_a_grid_without_its_bounds_margin_is_refused(header: dict[str, object]) -> None:
-    expect_refusal(
-        "expected a channel hard or bound, got sdf, bound", grid_distances, small_grid(header, sdf=0.0, bound=0.083)
-    )
+    with pytest.raises(InputError, match="expected a channel hard or bound, got sdf, bound"):
+        grid_distances(small_grid(header, sdf=0.0, bound=0.083))
 
 
 HIDDEN, SEEN = -0.3, 0.3  # x of cells: a plate at 1 m hides the wall's left half
@@ -141,7 +140,8 @@ def test_cells_without_a_distance_are_blank_and_a_field_of_them_cannot_be_compar
     blank = compared(given)
     assert (blank.num_blank, blank.num_near, blank.num_seen) == (1, 7, 3)
     given.fields["sdf"][:] = np.nan
-    expect_refusal(r"truth\.json: no cell of the grid lies within 0\.2 m", compared, given, error=NotEvaluableError)
+    with pytest.raises(NotEvaluableError, match=r"truth\.json: no cell of the grid lies within 0\.2 m"):
+        compared(given)
 
 
 SIZE = (0.21, 0.21, 0.21)

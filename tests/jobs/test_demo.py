@@ -7,13 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs import demo as module
 from splatctrl_cli.jobs.demo import SAMPLE, DemoRequest, Step, demo
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.simulate.recording import RecordingOptions
-from tests.refused import expect_refusal
 
 
 @pytest.mark.parametrize(("damaged", "label"), [(0, "passed"), (1, "not as expected")])
@@ -45,8 +44,10 @@ def test_the_demo_fails_where_a_step_ends_otherwise_than_it_expects(
 
 
 def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:
-    expect_refusal(r"has no log\.mcap, truth\.json", demo, DemoRequest(data=tmp_path, out=tmp_path / "out"))
-    expect_refusal("is the input folder", demo, DemoRequest(out=SAMPLE), error=UsageError)
+    with pytest.raises(InputError, match=r"has no log\.mcap, truth\.json"):
+        demo(DemoRequest(data=tmp_path, out=tmp_path / "out"))
+    with pytest.raises(UsageError, match="is the input folder"):
+        demo(DemoRequest(out=SAMPLE))
 
 
 def test_without_the_sample_the_demo_simulates_its_recording_first(

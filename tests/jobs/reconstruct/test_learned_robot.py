@@ -23,7 +23,6 @@ from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_model import ALWAYS, SelfModel, surface_digest
 from tests.jobs.bake.baked import Said
-from tests.refused import expect_refusal
 from tests.robot.shapes import held_part
 
 PLATE: Float64 = np.asarray(trimesh.creation.box((0.05, 0.05, 0.05)).triangles)
@@ -159,4 +158,5 @@ def test_a_log_whose_arm_is_as_its_urdf_draws_it_gives_a_self_model_without_part
     model = RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
     assert len(with_self_model(model, out).surface.triangles) == len(model.surface.triangles)
     out.write_bytes(out.read_bytes()[:400])
-    expect_refusal("not a self-model", with_self_model, model, out)
+    with pytest.raises(InputError, match="not a self-model"):
+        with_self_model(model, out)
