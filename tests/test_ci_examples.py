@@ -10,8 +10,9 @@ from junitparser import JUnitXml
 
 from tests.cli.conftest import short_sample
 from tests.cli.here import splatctrl
+from tests.quick import unpainted
 
-__all__ = ["short_sample"]
+__all__ = ["short_sample", "unpainted"]
 ROOT = Path(__file__).parent.parent
 CI = ROOT / "docs" / "ci"
 

@@ -13,6 +13,7 @@ from splatctrl_cli.checks import limits
 from splatctrl_cli.config import Config, fixed, load_config
 from splatctrl_cli.config.load import resolved_settings, template_of, toml_of
 from splatctrl_cli.errors import InputError, UsageError
+from tests.refused import expect_refusal
 
 
 def test_assignments_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
@@ -106,8 +107,9 @@ def test_files_that_are_missing_or_no_toml_are_named(
 def test_a_file_and_an_assignment_are_refused_alike(tmp_path: Path, text: str) -> None:
     (tmp_path / "bad.toml").write_text(f"[control]\nmargin = {text}\n")
     for path, assignments in ((tmp_path / "bad.toml", []), (None, [f"control.margin={text}"])):
-        with pytest.raises(UsageError, match=r"control\.margin: expected (float, )?0 to 1 m, got "):
-            load_config(path, assignments)
+        expect_refusal(
+            r"control\.margin: expected (float, )?0 to 1 m, got ", load_config, path, assignments, error=UsageError
+        )
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from splatctrl_cli.geometry import (
     transform_points,
 )
 from splatctrl_cli.records import Box, Intrinsics, PointCloud, by_stamp
+from tests.refused import expect_refusal
 
 RNG = np.random.default_rng(0)
 CAMERA = Intrinsics(fx=50.0, fy=60.0, cx=20.3, cy=14.8, width=40, height=30)
@@ -76,8 +77,7 @@ def test_a_box_is_read_lower_corner_first() -> None:
     "text", ["0,0,0,1,1", "0,0,0,1,1,0", "0,0,0,1,1,a", "-inf,0,0,1,1,1", "0,0,0,1,1,inf", "0,0,0,1,1,nan"]
 )
 def test_a_box_that_is_not_six_finite_numbers_in_order_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=f"--box {text}: expected finite x0,y0,z0"):
-        Box.from_text(text)
+    expect_refusal(f"--box {text}: expected finite x0,y0,z0", Box.from_text, text, error=UsageError)
 
 
 def test_of_one_stamp_the_items_of_an_earlier_stream_come_first_each_in_its_own_order() -> None:

@@ -9,11 +9,12 @@ from experiments.environments import drawn_texture
 from experiments.problems import Problem, Views, simulated_arm, views_of
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.primitives import Primitive
-from tests.cli.conftest import arm, desk, unpainted, without_plots
+from tests.cli.conftest import arm, desk, few_points
 from tests.conftest import plain_arm
 from tests.jobs.conftest import stage
+from tests.quick import painted, parsed_once, unpainted
 
-__all__ = ["arm", "desk", "plain_arm", "stage", "unpainted", "without_plots"]
+__all__ = ["arm", "desk", "few_points", "painted", "parsed_once", "plain_arm", "stage", "unpainted"]
 
 HOME = np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
 TURN = np.array([0.8, 0, 0, 0, 0, 0, 0])  # [rad] from either side of the post to the other

@@ -76,7 +76,7 @@ def test_the_problems_are_drawn_and_still() -> None:
     assert len(problems(None, archive=None)) == 25
 
 
-@pytest.mark.usefixtures("fast", "without_plots")
+@pytest.mark.usefixtures("fast")
 def test_a_recording_goes_through_the_mechanisms_that_it_can_show(monkeypatch: pytest.MonkeyPatch) -> None:
     def copied(request: SimulateRequest) -> None:
         """The scan that a simulation writes, whatever its size."""
@@ -97,7 +97,7 @@ def test_a_recording_goes_through_the_mechanisms_that_it_can_show(monkeypatch: p
     assert row.error == "no depth" and not row.success and row.cause == "no depth"
 
 
-@pytest.mark.usefixtures("fast", "without_plots")
+@pytest.mark.usefixtures("fast")
 def test_a_map_serves_all_that_changes_the_motion_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         ablation, "RecordingOptions", partial(RecordingOptions, duration_s=2.0, fps=2.0, color_rays=0)

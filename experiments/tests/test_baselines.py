@@ -18,7 +18,6 @@ from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, scene_of
 from tests.cli.test_replay_modes import ball_ahead, moving
 from tests.jobs.stage import FAR, MOVE, Ball, Stage
 
-pytestmark = pytest.mark.usefixtures("unpainted")
 SHORT = ("--set", "control.max_time=4")
 BRIEF = ("--set", "control.max_time=0.2")  # where nothing is asked about the closed loop
 STANDSTILL = ("--methods", "standstill", *BRIEF)
@@ -35,7 +34,7 @@ def asked(desk: Desk, *words: str, out: str = "out") -> int:
     return main(["baselines", str(desk.folder / "fake.mcap"), *desk.robot, "-o", str(desk.folder / out), *words])
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_every_method_has_every_figure(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     moving(desk)
     metrics = compared(desk, *scene_of(desk, BALL))
@@ -75,7 +74,7 @@ def test_a_ball_that_comes_later_is_not_planned_for_but_is_measured(desk: Desk, 
     assert metrics["birrt_min_clearance"] < 0 < metrics["birrt_planned_margin"]
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_a_goal_that_is_in_collision_leaves_a_row_without_a_motion(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -215,7 +214,7 @@ def test_words_that_do_not_parse_are_named(
     assert told in capsys.readouterr().err
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_a_picture_of_gaps_and_of_no_value_is_1200_pixels_wide_and_the_same_each_time(tmp_path: Path) -> None:
     gap = np.linspace(0.1, 0.02, 50)
     gap[10:20] = np.nan

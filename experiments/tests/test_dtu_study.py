@@ -12,6 +12,7 @@ from experiments.problems import ProblemRequest
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Stopwatch
+from tests.refused import expect_refusal
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "dtu"
 GOOD = Fit(environment=GIVEN, number=24, method="5k", psnr=24.0, psnr_seen=25.0, ssim=0.9, depth=0.003, splats=4900)
@@ -47,8 +48,7 @@ def test_the_scans_of_a_tree_are_its_problems(tmp_path: Path, scans: tuple[str, 
 
 def test_without_a_tree_the_simulated_scan_is_fitted_by_several_seeds(tmp_path: Path) -> None:
     assert problems(2, None) == [(SIMULATED, 0), (SIMULATED, 1)]
-    with pytest.raises(InputError, match="expected a DTU folder"):
-        problems(None, tmp_path)
+    expect_refusal("expected a DTU folder", problems, None, tmp_path)
 
 
 @pytest.mark.usefixtures("fast")
@@ -57,13 +57,11 @@ def test_a_scan_of_a_tree_goes_through_budgets_and_baseline() -> None:
     assert [row.method for row in rows] == list(METHODS)
     assert [row.splats for row in rows[:2]] < [row.splats for row in rows[1:3]]
     assert all(row.success and row.psnr is not None and row.psnr > 5 for row in rows)
-    with pytest.raises(InputError, match="has no scan 7"):
-        list(trials_of(asked("dtu-0007", SAMPLE, METHODS), Config(), Stopwatch()))
+    expect_refusal("has no scan 7", list, trials_of(asked("dtu-0007", SAMPLE, METHODS), Config(), Stopwatch()))
 
 
 def test_a_scan_of_a_tree_is_not_the_simulated_one() -> None:
-    with pytest.raises(InputError, match="is of a DTU tree"):
-        list(trials_of(asked("dtu-0024", None, METHODS), Config(), Stopwatch()))
+    expect_refusal("is of a DTU tree", list, trials_of(asked("dtu-0024", None, METHODS), Config(), Stopwatch()))
 
 
 @pytest.mark.usefixtures("fast")

@@ -15,9 +15,9 @@ from experiments.gaussian_fitter import (
     scene_extent,
 )
 from splatctrl_cli.config import Config, SceneConfig
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Box, GaussianSet, RgbdFrame
 from splatctrl_cli.scene.render import parameters_of, render_gaussians
+from tests.refused import expect_refusal
 from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame, looking_down
 
 FAST = GaussianSettings(iterations=300, densify_from=60, densify_every=30, reset_every=0.2)
@@ -119,8 +119,7 @@ def test_the_colour_of_what_has_no_depth_is_the_background() -> None:
 
 def test_a_scene_without_depth_is_refused() -> None:
     away = Box(lower=np.array([5.0, 5.0, 5.0]), upper=np.array([6.0, 6.0, 6.0]))
-    with pytest.raises(InputError, match="no pixel of any view has a depth inside the workspace"):
-        GaussianFitter(CONFIG, away, frames())
+    expect_refusal("no pixel of any view has a depth inside the workspace", GaussianFitter, CONFIG, away, frames())
 
 
 def test_the_extent_is_that_of_the_cameras_or_of_what_they_see() -> None:

@@ -14,6 +14,7 @@ from splatctrl_cli import InputError, ReconstructRequest, RecordingRequest, Usag
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.formats.splat.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from tests.jobs.score.wall import FakeSource
+from tests.refused import expect_refusal
 from tests.scene.wall import frame
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"
@@ -82,8 +83,7 @@ def test_what_needs_distances_is_refused_in_one_line(
 
 def test_what_moves_or_has_no_depth_is_refused(tmp_path: Path) -> None:
     moving = ReconstructRequest(source=FakeSource(frames=[frame()], has_clock=True), out=tmp_path / "scene")
-    with pytest.raises(UsageError, match="has a clock"):
-        reconstruct_gaussians(moving)
+    expect_refusal("has a clock", reconstruct_gaussians, moving, error=UsageError)
     bare = replace(frame(), depth=np.zeros_like(frame().depth))
     with pytest.raises(InputError, match="no frame to train on has depth"):
         reconstruct_gaussians(replace(moving, source=FakeSource(frames=[bare], has_clock=False)))

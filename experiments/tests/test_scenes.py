@@ -12,9 +12,9 @@ from experiments.registry import STUDIES
 from experiments.scenes import ROOM, Scene, _ends, problems, read_scene
 from experiments.scenes_table import NAMES, notes, sections
 from experiments.scenes_trial import BIRRT, HIT_GRASPING, QP_IK, QP_IK_ALONE, Transport, Trial
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.planner.configuration_clearance import Clearance
+from tests.refused import expect_refusal
 
 SETTINGS = STUDIES["scenes"].config
 
@@ -50,8 +50,7 @@ def test_a_scene_in_which_the_carried_cube_would_pass_within_5_cm_has_no_way(sce
 
 def test_a_name_that_is_none_is_refused() -> None:
     for name in ("scattered", "kitchen-0001", "wall-x"):
-        with pytest.raises(InputError, match="expected LAYOUT-NUMBER"):
-            read_scene(name)
+        expect_refusal("expected LAYOUT-NUMBER", read_scene, name)
 
 
 def test_what_the_cube_touches_on_the_way_is_a_collision_of_the_arm_that_carries_it(scene: Scene) -> None:

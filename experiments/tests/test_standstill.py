@@ -19,6 +19,7 @@ from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Box, Float64
 from tests.control.fakes import PlanarArm
+from tests.refused import expect_refusal
 
 START, END = np.array([0.0, 0.2]), np.array([0.8, 0.5])
 ZONE = Zone(stop=0.3, resume=0.4)
@@ -72,8 +73,7 @@ def test_the_zone_is_left_later_than_it_is_entered() -> None:
     ((first, end),) = runs_of(run.is_stopped)
     assert run.distance[first - 1] >= ZONE.stop > run.distance[first]
     assert run.distance[end - 1] < ZONE.resume <= run.distance[end] + 1e-9
-    with pytest.raises(UsageError, match="zone: expected 0 < stop <= resume"):
-        Zone(stop=0.4, resume=0.3)
+    expect_refusal("zone: expected 0 < stop <= resume", Zone, stop=0.4, resume=0.3, error=UsageError)
 
 
 def test_a_known_motion_is_measured_the_same_way() -> None:
@@ -167,8 +167,7 @@ def test_the_box_is_left_later_than_it_is_entered_wherever_the_arm_is() -> None:
     assert run.stamp_ns[first] * 1e-9 == pytest.approx(0.3, abs=0.011)
     assert run.stamp_ns[end] * 1e-9 == pytest.approx(0.5 + 0.06, abs=0.011)
     assert run.is_complete
-    with pytest.raises(UsageError, match="hysteresis of 0 or more"):
-        BoxZone(box=BOX, hysteresis=-0.1)
+    expect_refusal("hysteresis of 0 or more", BoxZone, box=BOX, hysteresis=-0.1, error=UsageError)
 
 
 def test_people_of_the_last_map_hold_the_path_no_longer_than_they_are_remembered() -> None:

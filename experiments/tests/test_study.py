@@ -16,6 +16,7 @@ from experiments.study import StudyRequest, StudyResult, merged_study, run_study
 from experiments.trial import OURS, TRUTH, Trial
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome
+from tests.refused import expect_refusal
 
 CAMERAS = (2,)
 
@@ -36,6 +37,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Stud
         patch.setattr(
             "experiments.study.ProcessPoolExecutor", lambda max_workers, **_: ThreadPoolExecutor(max_workers)
         )
+        patch.setattr("experiments.drawn_task.TASK_GUESSES", 6)
         patch.setattr("experiments.trial.PLANS", 1)
         patch.setattr("experiments.trial.SEARCH", 300)
         patch.setattr("experiments.trial.CAMERAS", CAMERAS)
@@ -49,7 +51,9 @@ def test_a_study_with_a_shard_missing_is_not_whole_and_says_which_problem_lacks(
     whole: tuple[Path, StudyResult, StudyResult],
 ) -> None:
     _, part, _ = whole
-    assert part.verdict.outcome is Outcome.NOT_EVALUABLE and not part.trials and not part.sections
+    assert part.verdict.outcome is Outcome.NOT_EVALUABLE
+    assert not part.trials
+    assert not part.sections
     assert "1 of 3 problems have no trials yet: cubby-0000" in part.verdict.sentence
 
 
@@ -67,20 +71,19 @@ def test_every_cell_has_a_trial_and_those_of_before_are_kept(whole: tuple[Path, 
 
 def test_other_settings_do_not_go_on_in_the_folder(whole: tuple[Path, StudyResult, StudyResult]) -> None:
     out = whole[0]
-    with pytest.raises(UsageError, match="was begun with other settings: width"):
-        run_study(replace(request(out), width=48))
+    expect_refusal(
+        "was begun with other settings: width", run_study, replace(request(out), width=48), error=UsageError
+    )
     with pytest.raises(UsageError, match="was begun with other settings: methods"):
         run_study(replace(request(out), methods=(TRUTH,)))
     (out.parent / "other").mkdir()
     (out.parent / "other" / "run.json").write_text("{}")
-    with pytest.raises(UsageError, match="is no study, but something else"):
-        run_study(request(out.parent / "other"))
+    expect_refusal("is no study, but something else", run_study, request(out.parent / "other"), error=UsageError)
 
 
 def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / TRIALS).write_text("a,b\n1,2\n")
-    with pytest.raises(InputError, match="is not a table of trials: other columns"):
-        read_trials(tmp_path / TRIALS, Trial)
+    expect_refusal("is not a table of trials: other columns", read_trials, tmp_path / TRIALS, Trial)
 
 
 def test_trials_made_elsewhere_come_to_the_same_table(
@@ -101,17 +104,14 @@ def test_trials_made_elsewhere_come_to_the_same_table(
     with pytest.raises(InputError, match=r"csv: tabletop 0, 2 cameras, ours: is there twice"):
         merged_study(replace(request(tmp_path / "twice"), made=(out, files[0])))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=rf"has no {TRIALS}"):
-        merged_study(replace(request(tmp_path / "none"), made=(tmp_path / "empty",)))
-    with pytest.raises(UsageError, match="was begun with other settings"):
-        merged_study(replace(request(out), made=files))
+    expect_refusal(rf"has no {TRIALS}", merged_study, replace(request(tmp_path / "none"), made=(tmp_path / "empty",)))
+    expect_refusal("was begun with other settings", merged_study, replace(request(out), made=files), error=UsageError)
 
 
 def test_a_method_and_an_archive_that_are_none_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--methods luck: expected some of ours, tsdf, truth"):
         run_study(replace(request(tmp_path / "out"), methods=("luck",)))
-    with pytest.raises(InputError, match=r"has no problems\.tar\.bz2"):
-        archive_of(tmp_path)
+    expect_refusal(r"has no problems\.tar\.bz2", archive_of, tmp_path)
     assert not (tmp_path / "out").exists()
 
 

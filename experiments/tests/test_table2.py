@@ -9,7 +9,7 @@ from experiments.environments import ENVIRONMENTS
 from experiments.problem_run import read_trials, write_trials
 from experiments.table2 import NUM_PROBLEMS, PAPER, notes, problems, sections
 from experiments.trial import CAMERAS, OURS, TRUTH, Trial
-from splatctrl_cli.errors import InputError
+from tests.refused import expect_refusal
 
 
 def trials(num: int = 4, failed: int = 1) -> list[Trial]:
@@ -102,8 +102,6 @@ def test_a_table_of_trials_that_is_damaged_is_refused(tmp_path: Path, old: str, 
     text = (tmp_path / "trials.csv").read_text()
     assert old in text
     (tmp_path / "trials.csv").write_text(text.replace(old, new))
-    with pytest.raises(InputError, match="is not a table of trials"):
-        read_trials(tmp_path / "trials.csv", Trial)
+    expect_refusal("is not a table of trials", read_trials, tmp_path / "trials.csv", Trial)
     (tmp_path / "trials.csv").write_text(200_000 * "a" + "\n")  # more than a field of a table may have
-    with pytest.raises(InputError, match="is not a table of trials"):
-        read_trials(tmp_path / "trials.csv", Trial)
+    expect_refusal("is not a table of trials", read_trials, tmp_path / "trials.csv", Trial)

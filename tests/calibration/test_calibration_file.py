@@ -17,8 +17,8 @@ from splatctrl_cli.calibration.calibration_file import (
 from splatctrl_cli.calibration.certainty import Certainty
 from splatctrl_cli.calibration.evidence import POSE, Unknowns
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at
+from tests.refused import expect_refusal
 
 RIG = Calibration(
     recording='a "log".mcap',
@@ -75,8 +75,7 @@ def test_a_calibration_reads_back_as_it_was_written(written: Path) -> None:
 )
 def test_another_or_damaged_file_is_refused(written: Path, old: str, new: str, says: str) -> None:
     written.write_text(written.read_text().replace(old, new, 1))
-    with pytest.raises(InputError, match=says):
-        read_calibration(written)
+    expect_refusal(says, read_calibration, written)
 
 
 @pytest.mark.parametrize("uncertain", ["cam0", "cam1", None])

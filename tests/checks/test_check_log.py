@@ -13,7 +13,6 @@ from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_times import file_findings
 from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.source import open_logs
@@ -31,6 +30,7 @@ from tests.recording.log.make_log import (
     set_stamp,
     stamp_of,
 )
+from tests.refused import expect_refusal
 
 ROOT = Path(__file__).parents[2]
 COLOR, DEPTH, INFO = "/cam0/color/image_raw/compressed", "/cam0/depth/image_raw", "/cam0/color/camera_info"
@@ -399,5 +399,4 @@ def test_only_the_cameras_that_are_asked_for_are_judged(tmp_path: Path) -> None:
     log = broken_log(tmp_path / "log.mcap", without("/cam1/depth/image_raw", first=10, last=20), CAMERAS_2)
     assert [f.code for f in above_note(checked(log))] == ["gap"]
     assert above_note(checked(log, cameras=("cam0",))) == []
-    with pytest.raises(InputError, match="no camera 'cam7'"):
-        checked(log, cameras=("cam7",))
+    expect_refusal("no camera 'cam7'", checked, log, cameras=("cam7",))

@@ -4,38 +4,48 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.jobs.replay import files, inputs, lockstep
+from splatctrl_cli.config import fixed
+from splatctrl_cli.jobs.recordings import open_recording
+from splatctrl_cli.jobs.replay import inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import Desk, FakeSource, logged
+from tests.quick import painted, parsed_once, unpainted
 from tests.recording.log.make_log import messages_of, write_raw
+
+__all__ = ["painted", "parsed_once", "unpainted"]
 
 
 @pytest.fixture(scope="package", autouse=True)
 def few_points() -> Iterator[None]:
-    """Compare fewer points between views than usual, which takes a fifth of a small fit."""
+    """Compare fewer points between views, a fifth of a small fit; look around the arm every 3 cm, not 1."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(limits, "VIEWS_PAIRS", 10)
         patch.setattr(limits, "VIEWS_POINTS", 400)
         patch.setattr(limits, "VIEWS_LANDED", 200)
+        patch.setattr(fixed, "NEAR_MOVED", 0.03)
         yield
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reconstruct good recordings without the check before, a fifth of a small run."""
+    monkeypatch.setattr(open_recording, "refuse_errors", lambda *_: None)
 
 
 @pytest.fixture(scope="session")
 def short_sample(sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The committed recording, 2.6 s of its 7: for commands and examples that are to run, whatever they find."""
+    """The committed recording, 1.8 s of its 7: for commands and examples that are to run, whatever they find."""
     folder = tmp_path_factory.mktemp("short") / "sample_data"
     (folder / "tabletop").mkdir(parents=True)
     for path in (sample_data / "tabletop").iterdir():
         if path.name != "log.mcap":
             (folder / "tabletop" / path.name).symlink_to(path)
     messages = list(messages_of(sample_data / "tabletop" / "log.mcap"))
-    end_ns = min(filter(None, (message.log_time_ns for message in messages))) + 2_600_000_000
+    end_ns = min(filter(None, (message.log_time_ns for message in messages))) + 1_800_000_000
     write_raw(folder / "tabletop" / "log.mcap", (each for each in messages if each.log_time_ns < end_ns))
     return folder
 
@@ -47,20 +57,6 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size = ["--duration", "1.0", "--width", "96", "--height", "72", "--dtu"]
     assert main(["simulate", "-o", str(folder), *size, "-q"]) == 0
     return folder
-
-
-@pytest.fixture
-def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests of other files of the output."""
-    monkeypatch.setattr(files, "draw_replay", lambda *_: None)
-
-
-@pytest.fixture
-def unpainted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are made in full, but neither laid out nor painted, which takes longer than a replay; `painted` are."""
-    if request.node.get_closest_marker("painted") is None:
-        monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
-        monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
 
 
 @pytest.fixture(scope="session")

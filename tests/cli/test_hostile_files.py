@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import npy_of
 from splatctrl_cli.formats.splat.splats import FORMATS
 from splatctrl_cli.robot.link_meshes import mesh_path
@@ -27,6 +26,7 @@ from tests.formats.make_npz import write_zeros
 from tests.formats.splat.test_gaussian_ply import gaussian_set
 from tests.recording.folder.make_layout import make_tum
 from tests.recording.log.make_log import LogRecipe, make_log
+from tests.refused import expect_refusal
 
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
 LAUGHS = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
@@ -178,8 +178,7 @@ def test_a_package_path_that_leaves_its_package_is_refused(tmp_path: Path) -> No
     mesh = MeshShape(link="a", filename="package://arm/own.stl", scale=(1.0, 1.0, 1.0), T_link_mesh=np.eye(4))
     assert mesh_path(package / "x.urdf", mesh) == tmp_path / "arm" / "own.stl"
     for name in ("package://arm/../secret.stl", "package://../secret.stl", "package:///etc/passwd"):
-        with pytest.raises(InputError, match="lies outside its package"):
-            mesh_path(package / "x.urdf", replace(mesh, filename=name))
+        expect_refusal("lies outside its package", mesh_path, package / "x.urdf", replace(mesh, filename=name))
 
 
 def test_a_npy_file_is_read_as_numpy_reads_it_and_no_further() -> None:

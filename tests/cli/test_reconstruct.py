@@ -34,6 +34,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_one_thread_and_two_give_the_same_bytes(small_recording: Path, tmp_path: Path) -> None:
     for name, threads in (("one", "1"), ("two", "2")):
         assert reconstruct(small_recording, tmp_path / name, "--threads", threads) == 0

@@ -29,10 +29,8 @@ from tests.evaluate.test_worst_frames import frame
 from tests.recording.log.make_states import START_NS, states_of, write_mcap
 from tests.recording.state.test_state_tables import stamped
 
-pytestmark = pytest.mark.usefixtures("unpainted")
 
-
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_an_audit_measures_every_logged_state(desk: Desk, arm: RobotModel) -> None:
     desk.source.states = logged(START + 0.3)
     assert desk.replay(*scene_of(desk, BALL), "-q") == 0
@@ -77,7 +75,7 @@ def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pyt
     assert "the field has no distance there" in capsys.readouterr().err
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_a_closed_loop_reaches_the_logged_end_and_gates_on_it(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     end = START + np.array([0.5, 0.1, 0, 0, 0, 0, 0])
     desk.source.states = logged(end)

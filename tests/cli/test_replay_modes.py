@@ -12,8 +12,6 @@ from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, scene_of, splats_of, write_scene
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 MOVE = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -40,6 +38,7 @@ def events(desk: Desk) -> Any:
     return desk.json("events.json")["events"]
 
 
+@pytest.mark.usefixtures("painted")
 def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) -> None:
     moving(desk)
     assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "open-loop") == 0
@@ -50,7 +49,7 @@ def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) ->
     assert (desk.folder / "out" / "open_loop.png").is_file()
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -128,6 +127,7 @@ def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
     assert f"required <= 0, first at {float(second['time_s']):.3f} s" in message and "required >= 2" in message
 
 
+@pytest.mark.usefixtures("painted")
 def test_a_driven_arm_follows_the_log_and_its_divergence_is_measured(desk: Desk) -> None:
     moving(desk)
     assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "closed-loop", "--follow") == 0

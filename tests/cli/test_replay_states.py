@@ -29,8 +29,6 @@ from tests.recording.log.make_states import (
     write_mcap,
 )
 
-pytestmark = pytest.mark.usefixtures("without_plots")
-
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 
 

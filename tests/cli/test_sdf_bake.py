@@ -25,7 +25,6 @@ from tests.field.scenes import cloud, splat_set
 from tests.jobs.stage import interrupt
 from tests.plain import known, plain_grid
 
-pytestmark = pytest.mark.usefixtures("unpainted")
 COARSE = ("--set", "field.max_loss=1")  # cells that are baked in no time
 
 
@@ -61,7 +60,7 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
     assert (tmp_path / "field" / "field.npz").exists()
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path: Path, sample_data: Path) -> None:
     folder = sample_data / "tabletop"
     truth = load_truth(folder / "truth.json")
@@ -132,7 +131,7 @@ def test_a_scene_is_baked_as_it_was_known_then(
     assert list(digests)[-1] == names[at]
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) -> None:
     result = splatctrl(
         "sdf-bake", scene, "-o", tmp_path / "field", "--box=7,7,7,8,8,8", "--voxel", 0.5, *COARSE, "--json"

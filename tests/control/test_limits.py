@@ -19,6 +19,7 @@ from splatctrl_cli.records import Float64, Index, Stamps
 from tests.control.fakes import PlanarArm, far_away
 from tests.reference.control import braking_room, fr3_velocity_range
 from tests.reference.intervals import velocity_shares
+from tests.refused import expect_refusal
 
 NAMES = tuple(f"fr3_joint{number}" for number in range(1, 8))
 CONFIG = ControlConfig()
@@ -136,8 +137,7 @@ def test_the_fr3_limits_are_merged_with_those_of_the_urdf() -> None:
 
 @pytest.mark.parametrize("names", [("elbow",), ("fr3_joint1", "fr3_finger_joint1")])
 def test_joints_that_the_fr3_does_not_have_are_named(names: tuple[str, ...]) -> None:
-    with pytest.raises(UsageError, match="got " + ", ".join(names)):
-        fr3_limits(names)
+    expect_refusal("got " + ", ".join(names), fr3_limits, names, error=UsageError)
 
 
 def steady(num: int, every_ns: int) -> LoggedMotion:

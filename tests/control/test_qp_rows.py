@@ -16,11 +16,11 @@ from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.qp_rows import RowBuilder, Rows, assemble_printed
 from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.control.terms import RowKind, State, stray_cost
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away, sample_arm
 from tests.reference.control import braking_room
+from tests.refused import expect_refusal
 
 CONFIG = ControlConfig()
 STEP = 1e-6
@@ -160,8 +160,9 @@ def test_the_margin_of_a_row_grows_by_what_its_body_leaves_uncovered_where_that_
     np.testing.assert_allclose(plain.external.h - wider.external.h, [0.1, 0.1, 0.3, 0.0], atol=1e-12)
     np.testing.assert_array_equal(plain.own.h, wider.own.h)
     arm.sphere_deficit[3] = np.nan
-    with pytest.raises(InputError, match=r"sphere fore\[0\]: expected a measured coverage"):
-        QpIkController(arm, wanted, far_away(), frame="tip")
+    expect_refusal(
+        r"sphere fore\[0\]: expected a measured coverage", QpIkController, arm, wanted, far_away(), frame="tip"
+    )
 
 
 REDUCED = ControlConfig(barrier_gain=1.0)

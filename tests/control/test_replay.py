@@ -15,11 +15,11 @@ from splatctrl_cli.control.goals import Detour
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, Waypoint, _Course, closed_loop
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.planned import time_path
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm, far_away, num_on_rung, sample_arm
+from tests.refused import expect_refusal
 
 CONFIG = ControlConfig(goal_position=0.002, goal_rotation=0.002)
 NOTHING_NEAR = far_away()
@@ -91,8 +91,7 @@ def test_the_seven_joint_arm_passes_a_sphere_and_keeps_its_distance(plain_arm: P
     ],
 )
 def test_a_task_that_cannot_be_is_refused(changes: dict[str, Float64], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        closed_loop(PlanarArm(), CONFIG, task(**changes), lambda _: NOTHING_NEAR)
+    expect_refusal(words, closed_loop, PlanarArm(), CONFIG, task(**changes), lambda _: NOTHING_NEAR)
 
 
 ARM = PlanarArm()

@@ -16,6 +16,7 @@ from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, Float64, SphereSet
 from tests.control.fakes import Balls, Nowhere, PlanarArm, Plane, ThinArm, scene_of, steps_towards
+from tests.refused import expect_refusal
 
 THING, PERSON = (0.6, 0.5, 0.0), (0.9, -0.4, 0.0)
 POINTS = np.array([[0.0, 0.0, 0.0], [0.5, 0.2, 0.0]])
@@ -112,8 +113,7 @@ def test_the_deepest_sphere_is_named_and_a_free_start_passes() -> None:
         return np.where(points[:, 0] < 0.3, np.nan, distance), gradient
 
     for field in (deep, SimpleNamespace(query=partly_blank)):
-        with pytest.raises(NotEvaluableError, match=r"got sphere fore\[1\] 0\.1400 m deep"):
-            check_free(arm, field, Q)
+        expect_refusal(r"got sphere fore\[1\] 0\.1400 m deep", check_free, arm, field, Q, error=NotEvaluableError)
     for center in ([0.9, 0.2, 0.0], [0.0, 0.0, 0.0]):
         check_free(arm, Balls([center], [0.1]), Q)
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.protocols import cloud_of_scan, read_observed, score_protocol
 from splatctrl_cli.records import Bool, Float64
+from tests.refused import expect_refusal
 
 DTU = range(49)
 
@@ -80,8 +81,7 @@ def test_published_means_are_over_so_many_scans() -> None:
     ],
 )
 def test_a_name_that_is_none_is_refused_with_the_choices(name: str, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        score_protocol(name)
+    expect_refusal(message, score_protocol, name, error=UsageError)
 
 
 @pytest.mark.parametrize(
@@ -98,8 +98,7 @@ def test_a_name_that_is_none_is_refused_with_the_choices(name: str, message: str
     ],
 )
 def test_a_scan_without_the_views_is_refused(name: str, num: int, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        score_protocol(name).split(range(num), "scan1")
+    expect_refusal(message, score_protocol(name).split, range(num), "scan1")
 
 
 LOW, HIGH = np.array([-30.0, -20.0, 500.0]), np.array([30.0, 20.0, 560.0])
@@ -137,16 +136,16 @@ def test_files_are_named_by_the_scan_and_damage_is_named(tmp_path: Path, scan: s
     write_observed(tmp_path, 24, LOW, HIGH)
     if damaged:
         (tmp_path / damaged).write_bytes((tmp_path / damaged).read_bytes()[: 200 if "Obs" in damaged else 2])
-    with pytest.raises(InputError, match=words):
-        read_observed(tmp_path, scan)
+    expect_refusal(words, read_observed, tmp_path, scan)
 
 
 def test_points_of_a_scan_are_found_by_either_name(tmp_path: Path) -> None:
     for scan, name in (("scan24", "stl024_total.ply"), ("bird", "bird.ply")):
         (tmp_path / name).touch()
         assert cloud_of_scan(tmp_path, scan).name == name
-    with pytest.raises(InputError, match=r"the points of scan8, scan8.ply or stl008_total.ply, got neither"):
-        cloud_of_scan(tmp_path, "scan8")
+    expect_refusal(
+        r"the points of scan8, scan8.ply or stl008_total.ply, got neither", cloud_of_scan, tmp_path, "scan8"
+    )
 
 
 RESOLUTION = 5.0  # [mm]

@@ -24,6 +24,7 @@ from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, Label, RgbdFrame
 from tests.plain import plain_frame, plain_grid, plain_splats
+from tests.refused import expect_refusal
 
 H, W = 20, 30
 NONE = np.zeros((H, W), dtype=bool)
@@ -116,8 +117,7 @@ def test_totals_are_means_over_views() -> None:
     totals = total_score([score(perfect(off), ONES + np.float32(off / 10), ~NONE) for off in (0.1, 0.01)])
     assert totals["psnr_all"] == pytest.approx((20.0 + 40.0) / 2, abs=1e-2)
     assert totals["depth_median_all"] == pytest.approx((0.01 + 0.001) / 2, abs=1e-6)
-    with pytest.raises(NotEvaluableError, match="no view was scored"):
-        total_score([])
+    expect_refusal("no view was scored", total_score, [], error=NotEvaluableError)
 
 
 def test_the_names_of_the_totals_are_known_beforehand() -> None:

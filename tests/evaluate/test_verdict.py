@@ -17,6 +17,7 @@ from splatctrl_cli.evaluate.verdict import (
     parse_gate,
     verdict_of,
 )
+from tests.refused import expect_refusal
 
 
 def reason(outcome: Outcome, criterion: str = "clearance", label: str = "", **more: object) -> Reason:
@@ -178,5 +179,4 @@ def test_a_name_that_is_not_known_is_refused_with_the_nearest(name: str, words: 
 )
 def test_what_is_no_gate_is_refused(gate: str) -> None:
     assert parse_gate(" a.b <= 1e-3 ") == ("a.b", "<=", 1e-3)
-    with pytest.raises(UsageError, match="expected METRIC>=NUMBER"):
-        parse_gate(gate)
+    expect_refusal("expected METRIC>=NUMBER", parse_gate, gate, error=UsageError)

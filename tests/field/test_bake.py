@@ -24,6 +24,7 @@ from tests.field.scenes import cloud, splat_set
 from tests.plain import plain_grid
 from tests.reference import field as reference
 from tests.reference.unknown import apply_unknown
+from tests.refused import expect_refusal
 
 BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]))
 CONFIG = FieldConfig(voxel=0.03)
@@ -139,8 +140,7 @@ def test_robot_splats_are_left_out_unless_asked_for() -> None:
     assert with_robot.channels["hard"][1, 1, 1] == pytest.approx(-0.01, abs=1e-6)
     assert with_robot.channels["label"][1, 1, 1] == Label.ROBOT
     assert with_robot.header["splats_used"] == {"object": 0, "robot": 1, "human": 1}
-    with pytest.raises(NotEvaluableError, match="none of 1 is labelled object, human"):
-        bake(robot, box, CONFIG)
+    expect_refusal("none of 1 is labelled object, human", bake, robot, box, CONFIG, error=NotEvaluableError)
 
 
 def test_observed_comes_from_the_occupancy_voxel_of_the_cell() -> None:
@@ -174,8 +174,7 @@ def test_free_memory_is_what_the_machine_and_the_container_leave(
     (tmp_path / "memory.max").write_text("max\n")
     assert layout_module.available_memory() == 5000 * 1024
     (tmp_path / "meminfo").write_text("MemTotal: 9 kB\n")
-    with pytest.raises(UsageError, match="no MemAvailable line"):
-        layout_module.available_memory()
+    expect_refusal("no MemAvailable line", layout_module.available_memory, error=UsageError)
 
 
 @pytest.mark.parametrize(
@@ -189,8 +188,7 @@ def test_bad_boxes_and_voxels_and_grids_beyond_the_memory_are_refused(
     box: Box, voxel: float, memory: int, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(layout_module, "available_memory", lambda: memory)
-    with pytest.raises(UsageError, match=words):
-        bake(splat_set(*cloud(10)), box, FieldConfig(voxel=voxel))
+    expect_refusal(words, bake, splat_set(*cloud(10)), box, FieldConfig(voxel=voxel), error=UsageError)
 
 
 def test_cells_are_counted_where_a_kernel_field_alone_over_estimates_or_has_no_value() -> None:
@@ -227,8 +225,9 @@ def test_slabs_are_whole_blocks_that_cover_every_plane(monkeypatch: pytest.Monke
 def test_a_slab_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     check_slab_memory(LAYOUT, ["sdf"])
     monkeypatch.setattr(layout_module, "available_memory", lambda: 8 * 40 * 21 * 68 - 1)
-    with pytest.raises(UsageError, match=r"slab of 8 x 40 x 21 cells: needs .* larger --voxel"):
-        check_slab_memory(LAYOUT, ["sdf"])
+    expect_refusal(
+        r"slab of 8 x 40 x 21 cells: needs .* larger --voxel", check_slab_memory, LAYOUT, ["sdf"], error=UsageError
+    )
     monkeypatch.setattr(layout_module, "available_memory", lambda: 8 * 40 * 21 * 68)
     check_slab_memory(LAYOUT, ["sdf"])
 

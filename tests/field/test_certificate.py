@@ -26,6 +26,7 @@ from splatctrl_cli.field.grid_cells import LOSS, GridField, check_loss
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid, Float64
 from tests.field.scenes import plane, splat_set
+from tests.refused import expect_refusal
 
 NUM = 4000
 
@@ -106,11 +107,9 @@ def test_cells_lose_at_most_a_diagonal_and_all_of_it_between_eight_balls() -> No
 
 def test_cells_that_lose_more_than_allowed_are_refused_with_the_largest_that_do_not() -> None:
     check_loss(0.02, 0.04)
-    with pytest.raises(UsageError, match=r"at most 0\.023 m, .* got 0\.3 m, .* 0\.5196 m"):
-        check_loss(0.3, 0.04)
+    expect_refusal(r"at most 0\.023 m, .* got 0\.3 m, .* 0\.5196 m", check_loss, 0.3, 0.04, error=UsageError)
     check_loss(0.023, 0.04)
-    with pytest.raises(UsageError, match=r"field\.max_loss = 0.04 m"):
-        check_loss(0.0231, 0.04)
+    expect_refusal(r"field\.max_loss = 0.04 m", check_loss, 0.0231, 0.04, error=UsageError)
 
 
 @pytest.mark.parametrize("distance", ["safe", "safe_gpdf"])

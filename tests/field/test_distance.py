@@ -23,6 +23,7 @@ from splatctrl_cli.field.slabs import planar_zero_level
 from splatctrl_cli.records import DistanceField
 from tests.field.scenes import cloud, plane, queries
 from tests.reference import field as reference
+from tests.refused import expect_refusal
 
 LENGTH, NOISE = 0.02, 1e-6
 TRUNCATION_BOUND = FieldConfig.truncation + 1e-6  # [m], and float32
@@ -301,5 +302,4 @@ def test_points_behind_the_level_set_or_without_a_slope_stay_where_they_are() ->
     )
     np.testing.assert_allclose(found.hit, 0.0, atol=1e-9)
     assert found.distance[0] == pytest.approx(found.rest[0])
-    with pytest.raises(UsageError, match="expected at least 1 step, got 0"):
-        march(exact, exact, points, steps=0)
+    expect_refusal("expected at least 1 step, got 0", march, exact, exact, points, steps=0, error=UsageError)

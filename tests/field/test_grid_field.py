@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid
 from tests.field.scenes import cloud, queries, splat_set
+from tests.refused import expect_refusal
 
 BOX = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.4))
 
@@ -56,8 +56,8 @@ def test_certified_distance_never_exceeds_the_exact_one(grid: DistanceGrid) -> N
 
 
 def test_bad_grids_and_channels_are_named(grid: DistanceGrid) -> None:
-    with pytest.raises(InputError, match="no channel 'se'; it has: sdf, bound, hard"):
-        GridField(grid, "se")
+    expect_refusal("no channel 'se'; it has: sdf, bound, hard", GridField, grid, "se")
     flat = {name: values[:1] for name, values in grid.channels.items()}
-    with pytest.raises(InputError, match="at least 2 cells"):
-        GridField(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=flat, header={}))
+    expect_refusal(
+        "at least 2 cells", GridField, DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=flat, header={})
+    )

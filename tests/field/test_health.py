@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.slabs import field_health, median_spacing
 from splatctrl_cli.field.unknown import NO_SPLAT, obstacle_spheres
 from splatctrl_cli.records import Label
 from splatctrl_cli.voxels import Balls
 from tests.field.scenes import splat_set
+from tests.refused import expect_refusal
 
 KERNELS = ("se", "gpdf")
 
@@ -76,9 +77,7 @@ def test_balls_follow_the_splats_and_say_that_they_are_none() -> None:
 
 def test_a_scene_of_nothing_at_all_has_no_field_and_a_wrong_label_is_named() -> None:
     robot = splat_set(CENTERS, np.array([0.01, 0.02]), Label.ROBOT)
-    with pytest.raises(NotEvaluableError, match="none of 2"):
-        obstacle_spheres(robot, balls())
+    expect_refusal("none of 2", obstacle_spheres, robot, balls(), error=NotEvaluableError)
     assert len(obstacle_spheres(robot, balls(Label.OBJECT)).splats) == 1
     robot.labels[1] = 7
-    with pytest.raises(InputError, match="splat 1: expected a label"):
-        obstacle_spheres(robot, balls(Label.OBJECT))
+    expect_refusal("splat 1: expected a label", obstacle_spheres, robot, balls(Label.OBJECT))

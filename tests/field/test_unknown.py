@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.grid_cells import GridField
@@ -14,6 +14,7 @@ from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 from tests.field.scenes import cloud, queries, splat_set
 from tests.reference.unknown import apply_unknown
+from tests.refused import expect_refusal
 
 BOX = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.4))
 CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label")
@@ -132,11 +133,11 @@ def test_a_grid_with_blank_cells_says_so_at_every_point_beside_one(grid: Distanc
 
 
 def test_what_cannot_be_applied_is_refused_in_words(grid: DistanceGrid) -> None:
-    with pytest.raises(UsageError, match=r"field.unknown: expected free, obstacle or nan, got 'air'"):
-        apply_unknown(grid, "air")
+    expect_refusal(
+        r"field.unknown: expected free, obstacle or nan, got 'air'", apply_unknown, grid, "air", error=UsageError
+    )
     bare = replace(grid, channels={"sdf": grid.channels["sdf"]})
-    with pytest.raises(InputError, match="no channel 'observed'"):
-        apply_unknown(bare, "nan")
+    expect_refusal("no channel 'observed'", apply_unknown, bare, "nan")
     never = {**grid.channels, "observed": np.zeros_like(grid.channels["observed"])}
     with pytest.raises(NotEvaluableError, match="expected a cell that some camera saw, got none of 9261"):
         apply_unknown(replace(grid, channels=never), "obstacle")

@@ -3,11 +3,23 @@
 import pytest
 
 from splatctrl_cli.robot.model import RobotModel
-from tests.cli.conftest import arm, desk, few_points, short_sample, small_recording, unpainted, without_plots
+from tests.cli.conftest import arm, desk, few_points, short_sample, small_recording, unchecked
 from tests.cli.replay_desk import Desk
 from tests.jobs.stage import Stage, run
+from tests.quick import painted, parsed_once, unpainted
 
-__all__ = ["arm", "desk", "few_points", "run", "short_sample", "small_recording", "unpainted", "without_plots"]
+__all__ = [
+    "arm",
+    "desk",
+    "few_points",
+    "painted",
+    "parsed_once",
+    "run",
+    "short_sample",
+    "small_recording",
+    "unchecked",
+    "unpainted",
+]
 
 
 @pytest.fixture

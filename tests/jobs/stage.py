@@ -198,7 +198,7 @@ Runs = Callable[..., Path]
 
 
 @pytest.fixture
-def run(desk: Desk, arm: RobotModel, unpainted: None, monkeypatch: pytest.MonkeyPatch) -> Runs:
+def run(desk: Desk, arm: RobotModel, monkeypatch: pytest.MonkeyPatch) -> Runs:
     """A replay in which a ball comes near, as the command leaves it; its scene and robot beside it."""
 
     def made(out: str = "audit", mode: str = "audit", *more: str) -> Path:
@@ -214,11 +214,6 @@ def run(desk: Desk, arm: RobotModel, unpainted: None, monkeypatch: pytest.Monkey
         monkeypatch.chdir(desk.folder)
         desk.replay(*words[:2], "--mode", mode, "-q", *more, out=out)
         cv2.imwrite(str(desk.folder / out / "worst_1.png"), np.full((90, 1200, 3), 200, np.uint8))
-        for name in ("clearance", "evidence"):
-            (desk.folder / out / f"{name}.png").unlink()
-        if mode != "audit":
-            for name in ("commands", "divergence"):
-                (desk.folder / out / f"{name}.png").unlink(missing_ok=True)
         folder = desk.folder / out
         patch_json(folder / "run.json", lambda found: found | {"parts": part_digests(folder)})
         return folder

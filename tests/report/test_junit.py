@@ -30,6 +30,7 @@ from splatctrl_cli.report.junit import (
     worst_first,
     write_junit,
 )
+from tests.refused import expect_refusal
 
 FAR = Reason(criterion="clearance", outcome=Outcome.PASSED, sentence="hand[3] is 60 mm away", value=0.06, unit="m")
 NEAR = Reason(
@@ -135,8 +136,7 @@ def test_a_file_that_is_no_report_is_never_replaced(tmp_path: Path) -> None:
     ):
         write_junit(file, [suite_of()])
     assert file.read_bytes() == b"\x89MCAP"
-    with pytest.raises(UsageError, match="is a folder, expected a file"):
-        write_junit(tmp_path, [suite_of()])
+    expect_refusal("is a folder, expected a file", write_junit, tmp_path, [suite_of()], error=UsageError)
     write_junit(tmp_path / "new" / "j.xml", [suite_of()])
     check_replaceable(tmp_path / "new" / "j.xml")
     write_junit(tmp_path / "new" / "j.xml", [suite_of(*cases_of(VERDICT, GROUP))])

@@ -38,6 +38,11 @@ from splatctrl_cli.report.replay_pictures import (
     open_loop_picture,
     spans,
 )
+from tests.quick import painted
+
+__all__ = ["painted"]
+
+pytestmark = pytest.mark.usefixtures("painted")
 
 H, W = 30, 40
 

@@ -18,6 +18,7 @@ from splatctrl_cli.report.timeline import HEIGHT, LEFT, RIGHT, TOP, WIDTH, legen
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from tests.plain import plain_splats
+from tests.refused import expect_refusal
 
 SECONDS = np.linspace(0.0, 2.0, 5)
 
@@ -120,5 +121,4 @@ def test_splats_are_packed_to_a_hundredth_of_a_per_cent_of_their_box() -> None:
 def test_without_the_three_js_of_trimesh_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     assert b"THREE" in zlib.decompress(base64.b64decode(three_js()))
     monkeypatch.setattr(trimesh.resources, "get_bytes", lambda name: Path(name).read_bytes())
-    with pytest.raises(UsageError, match=r"three.js: not found in trimesh.*pip install 'trimesh"):
-        three_js()
+    expect_refusal(r"three.js: not found in trimesh.*pip install 'trimesh", three_js, error=UsageError)

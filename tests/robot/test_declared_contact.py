@@ -7,6 +7,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.robot.declared_contact import Declarations, read_declarations
+from tests.refused import expect_refusal
 
 GOOD = """
 [[carried]]
@@ -61,8 +62,7 @@ def test_what_nothing_used_is_known(tmp_path: Path) -> None:
         entries.is_carried("hand", np.array([carried]), 2.0)
         assert entries.unused() == left
     assert Declarations().unused() == []
-    with pytest.raises(InputError, match="cannot be read"):
-        read_declarations(tmp_path / "none.toml")
+    expect_refusal("cannot be read", read_declarations, tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf
+from tests.refused import expect_refusal
 from tests.robot.shapes import written
 
 ARM = (("shoulder", "revolute", "base", "upper", ""), ("wrist", "revolute", "upper", "hand", ""))
@@ -79,5 +79,4 @@ def test_fingers_are_locked_in_their_middle_and_what_mimics_them_follows(tmp_pat
 def test_a_joint_of_the_arm_that_the_log_lacks_is_not_locked(tmp_path: Path) -> None:
     spheres = SphereSet(links=("l",), centers=np.zeros((1, 3)), radii=np.full(1, 0.01))
     model = RobotModel.from_urdf(robot(tmp_path, *ARM, *FRANKA), spheres).moved_by(["shoulder"])
-    with pytest.raises(InputError, match="joints not in the log: wrist; the log has: shoulder"):
-        model.joint_columns(["shoulder"])
+    expect_refusal("joints not in the log: wrist; the log has: shoulder", model.joint_columns, ["shoulder"])

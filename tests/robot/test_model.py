@@ -12,6 +12,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import arm_urdf
+from tests.refused import expect_refusal
 from tests.robot.shapes import written
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
@@ -128,8 +129,7 @@ def test_unusable_urdfs_are_refused_by_name(tmp_path: Path, text: str, message: 
 def test_postures_of_the_wrong_length_and_what_is_not_there_are_refused(
     arm: RobotModel, asked: Callable[[RobotModel], object], words: str
 ) -> None:
-    with pytest.raises(InputError, match=words):
-        asked(arm)
+    expect_refusal(words, asked, arm)
 
 
 def test_a_real_spherized_urdf_brings_its_own_spheres(real_data: Path) -> None:

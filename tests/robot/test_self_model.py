@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.geometry import look_at, pose_at, turn_about_z
 from splatctrl_cli.kernels.surface_image import TriangleTree
@@ -17,6 +16,7 @@ from splatctrl_cli.robot.self_fusion import VOXEL, choose_moments, learn
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
+from tests.refused import expect_refusal
 
 LENS = Intrinsics(fx=300.0, fy=300.0, cx=159.5, cy=119.5, width=320, height=240)
 EYES = ((1.1, 0.1, 0.6), (-0.2, -1.1, 0.5), (0.2, 1.0, 0.9))
@@ -149,8 +149,7 @@ def test_what_two_fingers_hold_between_them_is_robot() -> None:
 def test_links_that_do_not_move_are_named() -> None:
     assert [*learned().unknown] == ["base"] and "moves too little" in learned().unknown["base"]
     frames, at = recorded([(0.1, 0.0)] * 6, RobotSurface.from_parts(shapes()))
-    with pytest.raises(InputError, match=r"base, arm.* moves? too little \(1 of 5 configurations\)"):
-        learn(ROBOT, LINKS, frames, at)
+    expect_refusal(r"base, arm.* moves? too little \(1 of 5 configurations\)", learn, ROBOT, LINKS, frames, at)
 
 
 PLATE = Shape(link="world", kind="box", size=(1.2, 1.2, 0.02), T_link_shape=pose_at((0.0, 0.0, 0.285)))
@@ -197,10 +196,10 @@ def test_a_self_model_is_read_as_it_was_written_and_refused_for_another_robot(tm
     assert np.array_equal(found.pieces()[0][1], learned().pieces()[0][1])
     assert found.unknown == learned().unknown and found.learned[0].since == learned().learned[0].since
     found.check_robot(ROBOT, LINKS, path)
-    with pytest.raises(InputError, match="another robot: one of the two lacks gripper"):
-        found.check_robot(ROBOT, (*LINKS, "gripper"), path)
-    with pytest.raises(InputError, match="its visual geometry differs"):
-        found.check_robot(replace(ROBOT, sizes=1.1 * ROBOT.sizes), LINKS, path)
+    expect_refusal("another robot: one of the two lacks gripper", found.check_robot, ROBOT, (*LINKS, "gripper"), path)
+    expect_refusal(
+        "its visual geometry differs", found.check_robot, replace(ROBOT, sizes=1.1 * ROBOT.sizes), LINKS, path
+    )
 
 
 def test_moments_are_those_between_which_the_arm_moved_farthest() -> None:

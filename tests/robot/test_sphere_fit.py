@@ -14,6 +14,7 @@ from splatctrl_cli.robot.link_meshes import Solid, read_solids
 from splatctrl_cli.robot.sphere_files import read_spheres, spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from tests.refused import expect_refusal
 from tests.robot.shapes import BOX, ROD, arm_of, l_shape, written
 
 Solids = Mapping[str, tuple[Solid, ...]]
@@ -133,5 +134,4 @@ def test_thin_and_open_shapes_are_covered_too(tmp_path: Path) -> None:
     ],
 )
 def test_options_that_make_no_sense_are_refused(solids: Solids, options: FitOptions, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        fit_spheres(solids, options)
+    expect_refusal(message, fit_spheres, solids, options, error=UsageError)

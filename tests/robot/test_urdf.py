@@ -9,6 +9,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
+from tests.refused import expect_refusal
 from tests.robot.shapes import BALL, BOX, ROD, arm_of, written
 
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
@@ -30,8 +31,7 @@ NO_SPHERES = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
 )
 def test_joints_without_proper_limits_are_refused(tmp_path: Path, limit: str, message: str) -> None:
     path = written(tmp_path, arm_of(BALL, BALL).replace(LIMIT, limit))
-    with pytest.raises(InputError, match=f"robot.urdf: joint 'hinge': {message}"):
-        read_urdf(path)
+    expect_refusal(f"robot.urdf: joint 'hinge': {message}", read_urdf, path)
 
 
 def test_a_joint_that_mimics_is_locked_with_its_leader(tmp_path: Path) -> None:

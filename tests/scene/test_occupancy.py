@@ -14,6 +14,7 @@ from splatctrl_cli.scene.occupancy import MAX_STEPS, OccupancyMap
 from splatctrl_cli.voxels import NO_EDGES, SWEPT, Balls, EvidenceClass
 from tests.plain import plain_frame
 from tests.reference.occupancy import ray_walk
+from tests.refused import expect_refusal
 from tests.scene.wall import WORKSPACE, frame
 
 CONFIG = OccupancyConfig(voxel=0.05)
@@ -198,5 +199,6 @@ def test_behind_an_object_that_stands_still_earlier_views_count() -> None:
 
 
 def test_a_workspace_too_large_for_its_voxels_is_refused() -> None:
-    with pytest.raises(UsageError, match="too large"):
-        OccupancyMap(Box(lower=np.zeros(3), upper=np.full(3, 100.0)), CONFIG, 1)
+    expect_refusal(
+        "too large", OccupancyMap, Box(lower=np.zeros(3), upper=np.full(3, 100.0)), CONFIG, 1, error=UsageError
+    )

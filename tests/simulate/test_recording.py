@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, pose_at, transform_points
 from splatctrl_cli.records import JointState, RgbdFrame
@@ -20,6 +20,7 @@ from splatctrl_cli.simulate.primitives import Primitive, Texture, luminance_std
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.render import Renderer
 from splatctrl_cli.simulate.truth import Truth, closest_of, distance_to, load_truth, truth_document
+from tests.refused import expect_refusal
 from tests.simulate.limits import DURATIONS, assert_keeps_limits
 
 SMALL = {"duration_s": 3.0, "fps": 1.0, "width": 80, "height": 60}
@@ -238,8 +239,7 @@ def test_closest_surface_points_are_at_the_distance(exact: Recording) -> None:
 def test_what_is_no_truth_file_is_refused(tmp_path: Path, text: str | None, message: str) -> None:
     if text is not None:
         (tmp_path / "truth.json").write_text(text)
-    with pytest.raises(InputError, match=message):
-        load_truth(tmp_path / "truth.json")
+    expect_refusal(message, load_truth, tmp_path / "truth.json")
 
 
 def test_the_sample_keeps_its_promises(sample_data: Path) -> None:

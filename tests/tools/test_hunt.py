@@ -348,7 +348,7 @@ def test_the_same_seed_records_the_same_bytes(model: RobotModel, tmp_path: Path)
 
 
 def test_drawn_targets_are_in_contact_or_clear_as_wished(model: RobotModel) -> None:
-    trials: list[Trial] = [draw(11, index, model) for index in range(1, 9)]
+    trials: list[Trial] = [draw(11, index, model) for index in range(1, 6)]
     stamps = np.linspace(at_s(0), at_s(DURATION_S), 60).astype(np.int64)
     clearance = [
         TrueArm(model, t.world.tool).clearances(t.world.targets, stamps, positions_of(t.world.motion, stamps)).min()
@@ -390,32 +390,55 @@ def emptied(*names: str, frames: slice = slice(None), value: int = 0) -> Edit:
 
 
 @pytest.mark.parametrize(
-    ("fault", "world", "edit", "expected"),
+    ("fault", "world", "edits"),
     [
-        (BIASED, {"num_cameras": 1}, emptied(), (True, "")),
-        (BIASED, {"num_cameras": 1}, emptied("arm"), (False, "a camera alone that never sees the arm")),
-        (BIASED, {}, emptied("arm"), (True, "")),
-        (BIASED, {}, emptied("arm", "overlap"), (False, "")),
-        (LATE, {}, emptied(), (True, "")),
-        (LATE, {}, emptied("arm", frames=WHILE_MOVING), (False, "no image of the arm while it moves")),
-        (Fault(), {"body": Body(parts=("bracket",))}, emptied(), (True, "")),
-        (Fault(), {"body": Body(parts=("bracket",))}, emptied("arm"), (False, "no image of the arm")),
-        (DARK, {"radius": 0.01}, emptied("target_outline", "target_hole"), (False, "no depth from it")),
-        (DARK, {}, emptied("target_outline", "target_hole"), (True, "space never seen")),
-        (DARK, {}, emptied(), (True, "a hole")),
-        (DARK, {}, emptied("target_hole"), (True, "dark, in space never seen")),
-        (Fault(), {"radius": 0.002}, emptied("target", value=10), (False, "")),
-        (Fault(), {"radius": 0.006}, emptied("target", value=10), (True, "")),
+        (
+            BIASED,
+            {"num_cameras": 1},
+            [(emptied(), (True, "")), (emptied("arm"), (False, "a camera alone that never sees the arm"))],
+        ),
+        (BIASED, {}, [(emptied("arm"), (True, "")), (emptied("arm", "overlap"), (False, ""))]),
+        (
+            LATE,
+            {},
+            [
+                (emptied(), (True, "")),
+                (emptied("arm", frames=WHILE_MOVING), (False, "no image of the arm while it moves")),
+            ],
+        ),
+        (
+            Fault(),
+            {"body": Body(parts=("bracket",))},
+            [(emptied(), (True, "")), (emptied("arm"), (False, "no image of the arm"))],
+        ),
+        (DARK, {"radius": 0.01}, [(emptied("target_outline", "target_hole"), (False, "no depth from it"))]),
+        (
+            DARK,
+            {},
+            [
+                (emptied("target_outline", "target_hole"), (True, "space never seen")),
+                (emptied(), (True, "a hole")),
+                (emptied("target_hole"), (True, "dark, in space never seen")),
+            ],
+        ),
+        (Fault(), {"radius": 0.002}, [(emptied("target", value=10), (False, ""))]),
+        (Fault(), {"radius": 0.006}, [(emptied("target", value=10), (True, ""))]),
     ],
 )
 def test_a_fault_or_target_is_observable_where_images_show_it(
-    model: RobotModel, tmp_path: Path, fault: Fault, world: dict[str, Any], edit: Edit, expected: tuple[bool, str]
+    model: RobotModel,
+    tmp_path: Path,
+    fault: Fault,
+    world: dict[str, Any],
+    edits: list[tuple[Edit, tuple[bool, str]]],
 ) -> None:
     """A target narrower than half a pixel is disclaimed; where no rule is given, it is not judged."""
     made = world_of(ball(np.array([0.55, 0.1, 0.05]), world.get("radius", 0.05)))
     made = replace(made, cameras=made.cameras[: world.get("num_cameras", 3)], body=world.get("body", Body()))
-    holds, rule = judged(draft_of(drawn_as(fault)), made, edit(shown_of(made, fault, model, tmp_path)), model)
-    assert (holds, rule if expected[1] else "") == expected
+    shown = shown_of(made, fault, model, tmp_path)
+    for edit, expected in edits:
+        holds, rule = judged(draft_of(drawn_as(fault)), made, edit(shown), model)
+        assert (holds, rule if expected[1] else "") == expected
 
 
 def drawn_as(fault: Fault) -> Fault:

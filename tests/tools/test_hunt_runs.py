@@ -82,10 +82,8 @@ FOUND = {  # runs that were once called safe, by what was wrong with that
     "an-arm-that-comes-to-a-side-that-two-long-lenses-never-saw": (7, 57),
     "a-thing-that-returns-no-depth": (0, 21),
     "a-thing-that-came-before-the-last-frame-set": (0, 575),
-    "a-thing-in-space-that-a-lone-camera-never-saw": (0, 2157),
     "a-hidden-side-of-a-thing-that-a-lone-camera-saw": (31, 202),
     "a-thing-that-came-while-no-camera-gave-depth": (47, 280),
-    "the-far-side-of-a-ball-that-a-lone-camera-saw": (73, 470),
     "edges-behind-which-the-arm-passes": (0, 936),
     "a-dark-ball-of-which-patches-alone-return-depth": (89, 36),
     "depth-of-its-own-time-that-a-late-map-did-not-have": (101, 219),
@@ -117,9 +115,11 @@ def test_a_run_with_stereo_depth_is_the_same_twice_and_its_truth_is_that_of_what
     found = run(STEREO_SEED, trial.index)
     assert found == run(STEREO_SEED, trial.index)
     world = trial.world
-    assert found.robot == f"slim {world.body.parts[0]}" and found.spread > 0
+    assert found.robot == f"slim {world.body.parts[0]}"
+    assert found.spread > 0
     arms = (TrueArm(model, world.tool, body) for body in (world.body, Body()))
     seen, collides = (
         least_clearance(arm, world.primitives, world.positions, at_s(0), at_s(DURATION_S))[0] for arm in arms
     )
-    assert found.clearance == pytest.approx(seen, abs=TOLERANCE) and seen != pytest.approx(collides, abs=1e-3)
+    assert found.clearance == pytest.approx(seen, abs=TOLERANCE)
+    assert seen != pytest.approx(collides, abs=1e-3)

@@ -245,7 +245,7 @@ def test_a_recording_is_whole_and_the_same_twice(
     monkeypatch.setattr(recording, "TF_RATE", 10.0)
     digests = []
     for name in ("one", "other"):
-        recording.record(3, 5, tmp_path / name)  # a shelf
+        recording.record(3, 7, tmp_path / name)  # where a solid arrives
         digests.append([hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted((tmp_path / name).rglob("*.*"))])
     assert digests[0] == digests[1]
     folder = tmp_path / "one"

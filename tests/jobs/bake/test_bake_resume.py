@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError, UsageError, WriteError
+from splatctrl_cli.errors import UsageError, WriteError
 from splatctrl_cli.field import grid_cells, slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import GridLayout
@@ -27,6 +27,7 @@ from splatctrl_cli.records import Label
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bake.baked import Said, baked
 from tests.jobs.stage import contents, failing
+from tests.refused import expect_refusal
 
 ROOT = Path(__file__).parents[3]
 CHANNELS = ("gradient", "bound", "observed", "label", "se")
@@ -154,8 +155,7 @@ def test_other_splats_are_not_gone_on_with(splats: Path, tmp_path: Path) -> None
     centers, radii = cloud()
     radii[3] *= 1.5
     write_ply(mine, splat_set(centers, radii + 0.001), {})
-    with pytest.raises(UsageError, match=r"sha256 of splats\.ply was"):
-        bake(mine, tmp_path / "field", resume=True)
+    expect_refusal(r"sha256 of splats\.ply was", bake, mine, tmp_path / "field", resume=True, error=UsageError)
 
 
 @pytest.mark.usefixtures("small_slabs")
@@ -165,8 +165,7 @@ def test_progress_without_counts_is_not_gone_on_with(splats: Path, tmp_path: Pat
     file.write_text(
         json.dumps({name: value for name, value in json.loads(file.read_text()).items() if name != "counts"})
     )
-    with pytest.raises(InputError, match=r"not readable.*counts.*bake without --resume"):
-        bake(splats, tmp_path / "field", resume=True)
+    expect_refusal(r"not readable.*counts.*bake without --resume", bake, splats, tmp_path / "field", resume=True)
 
 
 def test_without_resume_an_interrupted_bake_is_replaced_with_a_warning(
@@ -185,8 +184,7 @@ def test_a_full_disk_is_told_before_anything_is_baked(
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(bake_slabs.shutil, "disk_usage", lambda path: usage(0, 0, 3 * 2**20))
     said = r"of disk.*0\.0 GiB \(3145728 bytes\) is free at.*fewer --channels"
-    with pytest.raises(UsageError, match=said):
-        bake(splats, tmp_path / "field")
+    expect_refusal(said, bake, splats, tmp_path / "field", error=UsageError)
     assert not list(tmp_path.iterdir())
 
 

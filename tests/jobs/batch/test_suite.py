@@ -12,6 +12,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.batch.graph import COMMANDS, Node, columns_of, nodes_of, select_shard
 from splatctrl_cli.jobs.batch.ledger import NAME, VERSION, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batch.suite import Limits, read_suite
+from tests.refused import expect_refusal
 
 RECORDINGS = '[[recordings]]\npaths = ["*.mcap"]\n'
 ROBOT = 'urdf = "arm.urdf"\n'
@@ -285,16 +286,14 @@ def test_a_digest_follows_the_content(tmp_path: Path) -> None:
 
 def test_what_is_no_ledger_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / NAME).write_bytes(b"not a database, but long enough to look at" * 40)
-    with pytest.raises(InputError, match="is no ledger"):
-        Ledger(tmp_path)
+    expect_refusal("is no ledger", Ledger, tmp_path)
     newer = tmp_path / "newer"
     with Ledger(newer):
         pass
     with sqlite3.connect(newer / NAME) as base:
         base.execute(f"PRAGMA user_version = {VERSION + 1}")
     base.close()
-    with pytest.raises(InputError, match=f"is of version {VERSION + 1}, expected {VERSION}; use a newer"):
-        Ledger(newer)
+    expect_refusal(f"is of version {VERSION + 1}, expected {VERSION}; use a newer", Ledger, newer)
 
 
 class Refusing(sqlite3.Connection):
@@ -316,5 +315,4 @@ def test_ledgers_that_open_at_one_moment_wait_for_each_other(tmp_path: Path, mon
     with sqlite3.connect(tmp_path / NAME) as base:
         assert base.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
     monkeypatch.setattr("splatctrl_cli.jobs.batch.ledger.BUSY_S", 0.0)
-    with pytest.raises(InputError, match="database is locked"):
-        Ledger(tmp_path / "busy")
+    expect_refusal("database is locked", Ledger, tmp_path / "busy")

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.geometry import transform_from
@@ -25,6 +25,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import VoxelState
 from tests.jobs.stage import QUARTER, Runs, passing, patch_json
 from tests.plain import plain_splats
+from tests.refused import expect_refusal
 
 Messages = dict[str, list[tuple[int, Any]]]
 
@@ -165,16 +166,16 @@ def test_rerun_reads_it_without_an_issue(run: Runs) -> None:
 def test_without_its_libraries_the_remedy_is_said(run: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = run()
     monkeypatch.setitem(sys.modules, "mcap_protobuf.schema", None)
-    with pytest.raises(UsageError, match=r"pip install 'splatctrl-cli\[mcap\]'"):
-        export_run(ExportRunRequest(path=folder))
+    expect_refusal(
+        r"pip install 'splatctrl-cli\[mcap\]'", export_run, ExportRunRequest(path=folder), error=UsageError
+    )
     assert not list(folder.parent.glob("*.mcap*"))
 
 
 def test_a_run_of_another_kind_is_refused(run: Runs) -> None:
     folder = run()
     patch_json(folder / "run.json", lambda found: found | {"command": "score"})
-    with pytest.raises(InputError, match="score leaves nothing to log"):
-        export_run(ExportRunRequest(path=folder))
+    expect_refusal("score leaves nothing to log", export_run, ExportRunRequest(path=folder))
 
 
 def test_the_command_writes_beside_the_run_and_takes_no_option_of_splats(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config, FieldConfig
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField, field_over, march
 from splatctrl_cli.field.grid_cells import GridField
@@ -22,6 +22,7 @@ from splatctrl_cli.records import Float64, Label
 from tests.cli.replay_desk import splats_of, write_scene
 from tests.jobs.bake.baked import baked
 from tests.recording.log.make_states import START_NS
+from tests.refused import expect_refusal
 
 BALLS = (((0.0, 0.0, 0.0), 0.10), ((0.5, 0.0, 0.0), 0.05))
 POINTS = np.array([[0.0, 0.0, 0.25], [0.5, 0.0, 0.2], [0.0, 0.0, 0.02], [0.25, 0.3, -0.2], [9.0, 0.0, 0.0]])
@@ -144,8 +145,9 @@ def test_a_wrong_line_after_many_right_ones_leaves_no_file(scene: Path, monkeypa
     monkeypatch.setattr(ply, "POINTS_PER_BLOCK", 2)
     out = scene.parent / "none.csv"
     table = io.StringIO("1,2,3\n" * 5 + "1,2\n")
-    with pytest.raises(InputError, match="standard input: line 6: expected 3 columns, got 2"):
-        query(QueryRequest(source=scene, points=table, out=out))
+    expect_refusal(
+        "standard input: line 6: expected 3 columns, got 2", query, QueryRequest(source=scene, points=table, out=out)
+    )
     assert [path.name for path in scene.parent.iterdir()] == ["scene"]
 
 

@@ -33,8 +33,8 @@ from tests.jobs.bake.baked import Said
 from tests.jobs.stage import MOVE, Stage, states_on
 from tests.plain import known, plain_grid
 from tests.recording.folder.make_layout import OPENGL_FROM_OPTICAL
+from tests.refused import expect_refusal
 
-pytestmark = pytest.mark.usefixtures("without_plots")
 CUBE = '<origin xyz="0 0 0.15"/><geometry><box size="0.07 0.07 0.07"/></geometry>'
 HELD = f"<visual>{CUBE}</visual><collision>{CUBE}</collision>"
 BOX = "[-0.045, -0.045, 0.105, 0.045, 0.045, 0.195]"
@@ -291,5 +291,4 @@ def test_what_has_a_clock_is_in_metres(tmp_path: Path, views: list[RgbdFrame]) -
     path = tmp_path / "set.toml"
     path.write_text(description + "[stamps]\nrate = 10.0\n")
     assert folder.is_dir()
-    with pytest.raises(InputError, match="is implausible"):
-        list(open_source(path).records())
+    expect_refusal("is implausible", list, open_source(path).records())

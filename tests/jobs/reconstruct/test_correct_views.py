@@ -14,7 +14,7 @@ from splatctrl_cli.calibration.gray_views import exposed
 from splatctrl_cli.calibration.pose_refinement import unbent
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import load_config
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, ViewCorrection
 from splatctrl_cli.jobs.reconstruct.correct_views import Corrections, corrected, corrected_among
@@ -30,6 +30,7 @@ from splatctrl_cli.records import RgbdFrame
 from tests.calibration.scan import a_bend, bent, disturbed, gains_of, robot_in, shrink_refinement, views_of
 from tests.jobs.replay.test_criteria import judged
 from tests.jobs.score.wall import FakeSource
+from tests.refused import expect_refusal
 
 SMALL = ["scene.max_splats=1000", "scene.first_iterations=40", "scene.refine_iterations=80"]
 HELD_OUT = 3
@@ -155,11 +156,11 @@ def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_pa
 
 
 def test_what_nothing_tells_is_refused(views: list[RgbdFrame], tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="recorded over time"):
-        reconstruct(request(views, tmp_path / "scene", has_clock=True))
+    expect_refusal(
+        "recorded over time", reconstruct, request(views, tmp_path / "scene", has_clock=True), error=UsageError
+    )
     bare = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
-    with pytest.raises(InputError, match="depth"):
-        reconstruct(request(bare, tmp_path / "scene"))
+    expect_refusal("depth", reconstruct, request(bare, tmp_path / "scene"))
 
 
 SETTINGS = ("scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3")

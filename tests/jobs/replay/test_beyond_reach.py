@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.formats.splat.splats import SHELL, read_ply, write_ply
@@ -23,8 +22,7 @@ from tests.jobs.bake.baked import baked
 from tests.jobs.score.test_score import run as scores
 from tests.jobs.score.wall import FRAMES, FakeScene, FakeSource, set_up, wall, write_scene
 from tests.jobs.stage import Stage, ball_beside, patch_json, voxels
-
-pytestmark = pytest.mark.usefixtures("without_plots")
+from tests.refused import expect_refusal
 
 
 def with_shell(scene: Path, shell: SplatSet) -> Path:
@@ -104,11 +102,9 @@ def test_other_splats_in_the_place_of_a_shell_are_refused(stage: Stage) -> None:
     with_shell(scene, in_the_way(stage))
     assert open_scene(scene).shell_at(None) is not None and open_scene(scene).shell_at(stamp_ns) is not None
     (scene / "shell.ply").write_bytes((scene / "splats.ply").read_bytes())
-    with pytest.raises(InputError, match=r"shell.ply: was changed after it was written"):
-        open_scene(scene).shell_at(None)
+    expect_refusal(r"shell.ply: was changed after it was written", open_scene(scene).shell_at, None)
     patch_json(scene / "run.json", lambda run: run | {"parts": part_digests(scene)})
-    with pytest.raises(InputError, match="expected a shell, got other splats"):
-        open_scene(scene).shell_at(None)
+    expect_refusal("expected a shell, got other splats", open_scene(scene).shell_at, None)
     assert len(open_scene(scene).splats()) == 1
 
 
@@ -133,6 +129,7 @@ def test_a_score_shows_the_shell_and_keeps_its_depth(tmp_path: Path, monkeypatch
     assert [views[True][name] for name in kept] == [views[False][name] for name in kept]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_recording_with_a_robot_has_a_shell_and_counts_it_apart(small_recording: Path, tmp_path: Path) -> None:
     fast = ["--max-splats", "400", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4", "-q"]
     log = [str(small_recording / "log.mcap"), "--cameras", "cam1,cam2", *fast]

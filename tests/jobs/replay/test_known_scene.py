@@ -26,6 +26,7 @@ from tests.cli.replay_desk import SECOND
 from tests.jobs.replay.broken import beside_the_mount
 from tests.jobs.stage import FAR, Stage, decisive, passing
 from tests.plain import plain_grid, plain_splats
+from tests.refused import expect_refusal
 from tests.robot.shapes import held_part
 
 
@@ -37,8 +38,7 @@ def look_free(points: Float64) -> tuple[Index, UInt8]:
 def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
     at = fields_at((100, 200), 50, lambda index: index, lambda index: index)  # type: ignore[arg-type, return-value]
     assert [at(stamp) for stamp in (150, 249, 250, 10_000)] == [0, 0, 1, 1]
-    with pytest.raises(NotEvaluableError, match="no scene is known at stamp 149 ns"):
-        at(149)
+    expect_refusal("no scene is known at stamp 149 ns", at, 149, error=NotEvaluableError)
 
 
 @pytest.mark.parametrize(("stamp_ns", "age_s"), [(1 * SECOND, 2.0), (3 * SECOND, 0.0), (7 * SECOND, 4.0)])
@@ -194,7 +194,6 @@ def away(points: Float64) -> Float64:
     return np.full(len(points), 1.0)
 
 
-@pytest.mark.usefixtures("without_plots")
 def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_said_not_to_be(stage: Stage) -> None:
     stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
     code, verdict = stage.judged_by_field(FAR, moment_ns=SECOND)

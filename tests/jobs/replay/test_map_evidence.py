@@ -26,7 +26,6 @@ from splatctrl_cli.scene.time_steps import time_steps
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, FakeSource, clearance, logged, splats_of, write_scene
 from tests.plain import plain_frame
 
-pytestmark = pytest.mark.usefixtures("without_plots")
 SIZE = (8, 6)
 LENS = Intrinsics(fx=2000.0, fy=2000.0, cx=3.5, cy=2.5, width=8, height=6)  # all pixels hit the same millimetres
 FROM = np.array([*BALL[0][:2], BALL[0][2] + 1.0])  # above the ball

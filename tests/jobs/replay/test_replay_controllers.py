@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.jobs.replay.goal import goal_waypoints
 from splatctrl_cli.jobs.replay.known_scene import certified_distance, splat_fields
 from splatctrl_cli.jobs.replay.metrics import metric_scales
@@ -20,9 +19,8 @@ from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, Desk, splats_of, write_scene
 from tests.cli.test_replay_modes import ball_ahead, events, moving
 from tests.jobs.stage import MOVE, QUARTER, Stage, decisive, passing
+from tests.refused import expect_refusal
 from tests.robot.test_fingers import ARM, FRANKA, robot
-
-pytestmark = pytest.mark.usefixtures("unpainted")
 
 EXAMPLES = Path(__file__).parents[3] / "docs" / "controllers"
 MODULE = """
@@ -222,8 +220,9 @@ def test_fingers_take_no_value_or_the_logged_one_or_their_own(
 ) -> None:
     arm = ["shoulder", "wrist"]
     assert goal(tmp_path, arm, 0.03, 0.04).tolist() == [0.03, 0.04]
-    with pytest.raises(InputError, match=r"--goal-joints: expected 2 joints \(shoulder, wrist\), got shape \(4,\)"):
-        goal(tmp_path, arm, 0, 0, 0, 0)
+    expect_refusal(
+        r"--goal-joints: expected 2 joints \(shoulder, wrist\), got shape \(4,\)", goal, tmp_path, arm, 0, 0, 0, 0
+    )
     moved = [*arm, "left", "right"]
     assert goal(tmp_path, moved, 0.03, 0.04).tolist() == [0.03, 0.04, 0.03, 0.04]
     assert goal(tmp_path, moved, 0.03, 0.04, 0.0, 0.01).tolist() == [0.03, 0.04, 0.0, 0.01]

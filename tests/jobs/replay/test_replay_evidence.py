@@ -20,8 +20,6 @@ from tests.jobs.stage import FAR, Stage, decisive, states_on
 from tests.plain import known
 from tests.recording.log.make_states import states_of, write_mcap
 
-pytestmark = pytest.mark.usefixtures("without_plots")
-
 
 @pytest.fixture
 def stage(desk: Desk, arm: RobotModel) -> Stage:

@@ -29,8 +29,6 @@ from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, scene_of, s
 from tests.control.fakes import Balls
 from tests.robot.shapes import arm_of, coverage_deficit, l_shape, written
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 SHORT = 0.012  # [m] taken off every radius
 
 
@@ -161,7 +159,7 @@ def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) ->
     assert srdf.name in json.loads((desk.folder / "out" / "run.json").read_text())["inputs"]
 
 
-@pytest.mark.painted
+@pytest.mark.usefixtures("painted")
 def test_an_fr3_is_reminded_of_its_limits_by_position(plain_arm: Path, tmp_path: Path) -> None:
     tabletop, urdf = plain_arm / "tabletop", tmp_path / "fr3.urdf"
     urdf.write_text((tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint'))
@@ -212,7 +210,6 @@ FILES = ("steps.csv", "events.json", "summary.json", "states.json")
 
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
-@pytest.mark.usefixtures("without_plots")
 def test_blocks_of_any_size_give_the_same_files(
     desk: Desk, monkeypatch: pytest.MonkeyPatch, sample_data: Path, mode: str
 ) -> None:

@@ -39,8 +39,6 @@ from tests.jobs.stage import (
     voxels,
 )
 
-pytestmark = pytest.mark.usefixtures("without_plots")
-
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
 def test_a_run_with_nothing_broken_is_safe(stage: Stage, mode: str) -> None:

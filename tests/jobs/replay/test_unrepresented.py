@@ -72,6 +72,7 @@ def test_a_baked_field_holds_them_and_says_how_many(scene: Path, tmp_path: Path,
     assert json.loads((tmp_path / "field" / "field.json").read_text())["splats_used"]["object"] == 1
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_starved_budget_hides_nothing_that_arrives(sample_data: Path, tmp_path: Path) -> None:
     # The sample's cylinder is there from 2.3 to 4.7 s; 3,000 splats are fewer than the room takes.
     sample, log = sample_data / "tabletop", tmp_path / "log.mcap"
@@ -116,9 +117,6 @@ def test_a_scene_of_an_older_version_has_none(tmp_path: Path, scene: Path) -> No
     (old / "snapshots" / "000000.npz").unlink()
     distances = from_splats(old, Config(), 1).at(0).distances["exact"](POINTS)
     assert distances[0] > 0.6
-
-
-pytestmark = pytest.mark.usefixtures("without_plots")
 
 
 @pytest.mark.parametrize(("human_margin", "code"), [(0.055, 0), (0.065, 1)])

@@ -14,7 +14,7 @@ import pytest
 
 from splatctrl_cli.cli import report as command
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
@@ -23,6 +23,7 @@ from splatctrl_cli.jobs.report.spaces import space_of
 from splatctrl_cli.jobs.runs.run_folder import open_run
 from splatctrl_cli.robot.model import RobotModel
 from tests.jobs.stage import Runs, passing, patch_json
+from tests.refused import expect_refusal
 from tests.report.browser import found_on
 
 ARM = "const arm = () => viewer.links.map((link) => link.position.toArray().concat(link.quaternion.toArray()));"
@@ -138,8 +139,7 @@ def test_texts_of_a_run_are_no_markup(run: Runs) -> None:
 def test_what_is_no_whole_run_is_refused(run: Runs, break_it: Callable[[Path], None], words: str) -> None:
     folder = run()
     break_it(folder)
-    with pytest.raises(InputError, match=words):
-        write_report(WriteReportRequest(path=folder))
+    expect_refusal(words, write_report, WriteReportRequest(path=folder))
     assert not folder.with_name("audit.html").exists()
 
 
@@ -147,11 +147,9 @@ def test_a_report_is_not_replaced_without_force_and_a_run_without_anything_to_se
     folder = run()
     made = write_report(WriteReportRequest(path=folder))
     assert made.file == folder.with_name("audit.html")
-    with pytest.raises(UsageError, match="already exists"):
-        write_report(WriteReportRequest(path=folder))
+    expect_refusal("already exists", write_report, WriteReportRequest(path=folder), error=UsageError)
     patch_json(folder / "run.json", lambda found: found | {"command": "score"})
-    with pytest.raises(InputError, match="score leaves nothing to see"):
-        view(ViewRequest(path=folder))
+    expect_refusal("score leaves nothing to see", view, ViewRequest(path=folder))
 
 
 @pytest.fixture
@@ -227,8 +225,7 @@ def test_a_scene_of_a_batch_opens_when_it_is_asked_for_and_closes_the_other(batc
 )
 def test_a_batch_of_another_form_is_refused(batch: Path, change: dict[str, Any], words: str) -> None:
     patch_json(batch / "batch.json", lambda found: found | change)
-    with pytest.raises(InputError, match=words):
-        write_report(WriteReportRequest(path=batch))
+    expect_refusal(words, write_report, WriteReportRequest(path=batch))
 
 
 def test_a_job_that_leads_out_of_its_batch_is_not_read(batch: Path) -> None:
@@ -309,8 +306,7 @@ def test_a_report_against_what_cannot_be_compared_is_refused(run: Runs, batch: P
     (tmp_path / "other.toml").write_text("a = 1")
     audit = run(out="audit_2")
     for before in (batch, tmp_path / "other.toml", tmp_path / "missing.toml"):
-        with pytest.raises(InputError, match=r"expected a|cannot be read"):
-            write_report(WriteReportRequest(path=audit, against=before))
+        expect_refusal(r"expected a|cannot be read", write_report, WriteReportRequest(path=audit, against=before))
 
 
 def test_a_page_without_webgl_says_so(run: Runs) -> None:

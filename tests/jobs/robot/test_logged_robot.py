@@ -37,6 +37,7 @@ from tests.recording.log.make_log import (
 )
 from tests.recording.log.make_states import joint_state
 from tests.recording.state.test_state_files import lerobot
+from tests.refused import expect_refusal
 from tests.robot.shapes import written
 
 BALL = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
@@ -244,5 +245,4 @@ def test_a_capture_keeps_the_description(tmp_path: Path) -> None:
     found = logged_urdf([capture])
     assert found is not None and found.text == robot()
     (capture / "robot_description.urdf").write_text(robot(shift=0.3))
-    with pytest.raises(InputError, match="its checksum differs from SHA256SUMS"):
-        logged_urdf([capture])
+    expect_refusal("its checksum differs from SHA256SUMS", logged_urdf, [capture])

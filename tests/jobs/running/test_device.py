@@ -28,6 +28,8 @@ from tests.kernels.cuda.emulator import EmulatedDevice
 from tests.kernels.cuda.test_driver import FakeDriver
 from tests.scene.wall import frame
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 FAST = [
     *("--box=-0.45,-0.35,-0.05,0.45,0.35,0.6", "--max-splats", "400", "--set", "scene.first_iterations=6"),
     *("--set", "scene.iterations_per_step=2", "--set", "scene.checkpoint_period=0"),

@@ -45,6 +45,7 @@ from tests.jobs.score.wall import (
     write_scene,
 )
 from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, make_log, messages_of, write_raw
+from tests.refused import expect_refusal
 
 
 @pytest.fixture
@@ -130,8 +131,7 @@ def test_a_view_whose_psnr_is_infinite_lets_no_gate_pass(scored: Path) -> None:
 
 
 def test_a_training_camera_is_scored_only_when_allowed(scored: Path) -> None:
-    with pytest.raises(UsageError, match="--cameras cam0: cam0 trained the scene"):
-        run(scored, cameras=("cam0",))
+    expect_refusal("--cameras cam0: cam0 trained the scene", run, scored, cameras=("cam0",), error=UsageError)
     (view,) = run(scored, cameras=("cam0",), allow_training=True).report["views"]
     assert view["seen_share"] == view["valid_share"]
 
@@ -152,8 +152,7 @@ def test_views_before_the_first_snapshot_or_that_no_training_camera_saw_cannot_b
     scored: Path, monkeypatch: pytest.MonkeyPatch, frames: list[RgbdFrame], words: str
 ) -> None:
     set_up(monkeypatch, FakeScene(), FakeSource(frames=frames))
-    with pytest.raises(NotEvaluableError, match=words):
-        run(scored, out=scored / "score")
+    expect_refusal(words, run, scored, out=scored / "score", error=NotEvaluableError)
     assert not (scored / "score").exists()
 
 
@@ -255,8 +254,7 @@ def test_the_other_log_alone_asks_for_the_one_that_trained(session: Path) -> Non
 
 def test_a_camera_that_no_transform_joins_to_the_world_is_refused_by_name(session: Path) -> None:
     alone = make_log(session / "apart.mcap", LogRecipe(cameras=("cam2",), has_tf=False))
-    with pytest.raises(InputError, match=r"camera cam2: no tf for frame 'cam2_optical'"):
-        run_session(session, "a.mcap", alone.name)
+    expect_refusal(r"camera cam2: no tf for frame 'cam2_optical'", run_session, session, "a.mcap", alone.name)
 
 
 def test_a_camera_of_another_time_is_refused_by_name(session: Path) -> None:
@@ -335,15 +333,15 @@ def test_colour_by_side_costs_no_distance_and_stretch_is_refused(tmp_path: Path,
     FORMATS[suffix].write(file, coloured, {})
     assert len(read_bake_source(file, None).splats) == len(coloured)
     FORMATS[suffix].write(file, wall_with_harmonics(), {})
-    with pytest.raises(InputError, match=r"whose scales differ.*'splatctrl export --isotropic' writes the nearest"):
-        read_bake_source(file, None)
+    expect_refusal(
+        r"whose scales differ.*'splatctrl export --isotropic' writes the nearest", read_bake_source, file, None
+    )
 
 
 def test_splats_in_another_unit_are_refused(one_view: Path) -> None:
     file = one_view / "other.ply"
     write_gaussian_ply(file, wall_with_harmonics(), {"units": "millimetre"})
-    with pytest.raises(InputError, match="comment 'units: millimetre': expected m"):
-        run_file(file)
+    expect_refusal("comment 'units: millimetre': expected m", run_file, file)
 
 
 def test_a_surface_cannot_be_looked_at_without_training_views(one_view: Path) -> None:

@@ -27,6 +27,7 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 from tests.evaluate.test_protocols import write_observed
 from tests.recording.folder.make_layout import half_size
+from tests.refused import expect_refusal
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")
 HOLDOUT = "holdout:every4"
@@ -126,12 +127,12 @@ def test_a_scene_of_another_split_is_refused_with_the_views(place: Path) -> None
 
 
 def test_a_protocol_that_is_none_or_holds_out_twice_is_refused(place: Path) -> None:
-    with pytest.raises(UsageError, match="did you mean regnerf-"):
-        scored(place, "mvsnet", "regnerf")
+    expect_refusal("did you mean regnerf-", scored, place, "mvsnet", "regnerf", error=UsageError)
     held_out = SourceOptions(holdout=("1",))
     twice = RecordingRequest(path=place / "mvsnet", is_dtu=True, protocol=HOLDOUT, options=held_out)
-    with pytest.raises(UsageError, match="--holdout: the protocol says what is held out"):
-        scored(place, "mvsnet", recording=twice)
+    expect_refusal(
+        "--holdout: the protocol says what is held out", scored, place, "mvsnet", recording=twice, error=UsageError
+    )
 
 
 def test_images_in_a_folder_are_told_from_logs_and_captures(tmp_path: Path) -> None:
@@ -181,8 +182,9 @@ def test_figures_are_compared_with_those_of_an_earlier_score(place: Path, tmp_pa
     with pytest.raises(InputError, match="not comparable: mask_rule: expected object mask, got none; score the base"):
         scored(place, "mvsnet", masks=place / "masks", baseline=path)
     path.write_text("{}")
-    with pytest.raises(InputError, match=r"score\.json: expected the score\.json of an earlier score"):
-        scored(place, "mvsnet", baseline=path)
+    expect_refusal(
+        r"score\.json: expected the score\.json of an earlier score", scored, place, "mvsnet", baseline=path
+    )
 
 
 def test_views_that_are_missing_are_named(place: Path, views: list[DtuView], tmp_path: Path) -> None:
@@ -190,8 +192,7 @@ def test_views_that_are_missing_are_named(place: Path, views: list[DtuView], tmp
     (tmp_path / "dtu/Depths_raw/scan1/depth_map_0004.pfm").unlink()
     with pytest.raises(UsageError, match="of which 0 did not train the scene, and 1 others did"):
         scored(place, tmp_path / "dtu", "holdout:every5")
-    with pytest.raises(InputError, match="got no view 4; the scan has views 0-3, 5-7"):
-        scored(place, tmp_path / "dtu", "holdout:0,4")
+    expect_refusal("got no view 4; the scan has views 0-3, 5-7", scored, place, tmp_path / "dtu", "holdout:0,4")
     reference = DtuSource(tmp_path / "dtu", protocol=score_protocol("holdout:every5"))
     first, second = missing_views(reference, score_protocol("holdout:every5"))
     assert first.startswith("dtu/scan1: views 4 are not there: 'holdout:every5' counts those that are, and scores")
@@ -295,8 +296,7 @@ def test_another_scan_of_the_same_camera_names_is_refused_with_figures(
 def test_another_recording_may_be_scored_and_is_named(place: Path, views: list[DtuView], tmp_path: Path) -> None:
     dark = [replace(view, color=view.color // 2) for view in views]
     write_dtu(tmp_path / "other", "scan1", dark)
-    with pytest.raises(InputError, match="camera: the picture differs by up to "):
-        scored(place, tmp_path / "other")
+    expect_refusal("camera: the picture differs by up to ", scored, place, tmp_path / "other")
     result = scored(place, tmp_path / "other", allow_other_recording=True)
     assert any(note.startswith("another recording: camera: the picture differs by up to") for note in result.notes)
 
@@ -313,5 +313,4 @@ def test_a_scene_without_first_frames_is_told_by_the_digests_of_its_files(
     assert result.report["recording"]["basis"] == ["digests of 32 files of the same names"]
     write_dtu(tmp_path / "other", "scan1", [replace(view, color=view.color // 2) for view in views])
     changed = "8 of 32 files have other contents, such as Rectified/scan1_train/rect_001_3_r5000.png"
-    with pytest.raises(InputError, match=changed):
-        scored(place, tmp_path / "other", scene=tmp_path / "scene")
+    expect_refusal(changed, scored, place, tmp_path / "other", scene=tmp_path / "scene")

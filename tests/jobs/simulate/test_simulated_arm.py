@@ -2,27 +2,33 @@
 
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.jobs.simulate import simulate as job
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.link_meshes import MeshDistance
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_fit import FitOptions
 from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.truth import distance_to, load_truth
 from tests.jobs.bake.baked import Said
+from tests.refused import expect_refusal
 from tests.robot.shapes import collada, coverage_deficit, written
 
 OPTIONS = RecordingOptions(duration_s=3.0, fps=1.0, width=64, height=48, noise="none", color_rays=0)
@@ -31,6 +37,15 @@ FINGERS = "".join(
     '<axis xyz="0 1 0"/><limit lower="0" upper="0.04" velocity="1" effort="1"/></joint>'
     for side in ("left", "right")
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_turns() -> Iterator[None]:
+    """Try few turns of the tip, and few patches for spheres, for speed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fixed, "SIMULATED_TURNS", 2)
+        patch.setattr(job, "FitOptions", partial(FitOptions, restarts=1, num_patches=500, num_candidates=600))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +131,7 @@ def test_given_spheres_are_taken_and_the_same_kinematics_move_alike(
     moved = [record.position for record in source.records() if isinstance(record, JointState)]
     expected = [tabletop.arm_motion(OPTIONS.duration_s).at(index / 50)[0] for index in range(len(moved))]
     np.testing.assert_allclose(moved, expected, atol=1e-9)
-    with pytest.raises(UsageError, match="--spheres"):
-        SimulateRequest(out=tmp_path / "none", spheres=spheres)
+    expect_refusal("--spheres", SimulateRequest, out=tmp_path / "none", spheres=spheres, error=UsageError)
 
 
 NAMES = ("visual/seen", "forearm")

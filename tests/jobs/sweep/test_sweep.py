@@ -14,6 +14,7 @@ from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.jobs.compare.judged_runs import read_judged
 from splatctrl_cli.jobs.sweep.sweep import SweepRequest, SweepResult, sweep
 from tests.jobs.sweep.entry import Told, config_of, document_of
+from tests.refused import expect_refusal
 
 
 def run_of(folder: Path, outcome: str = "passed", words: tuple[str, ...] = (), **told: Any) -> Path:
@@ -149,18 +150,15 @@ def test_a_run_that_is_not_evaluable_has_nothing_to_flip(tmp_path: Path) -> None
     with pytest.raises(NotEvaluableError, match="there is no verdict to flip"):
         swept(run_of(tmp_path / "a", outcome="not evaluable"), "margin=0.02:0.1")
     lacking = run_of(tmp_path / "b", lacking={"latency": [[0, 1]]})
-    with pytest.raises(NotEvaluableError, match=r"latency=0\.5: there is no verdict"):
-        swept(lacking, "latency=0.5:2")
+    expect_refusal(r"latency=0\.5: there is no verdict", swept, lacking, "latency=0.5:2", error=NotEvaluableError)
 
 
 def test_a_recording_that_changed_or_moved_is_refused(tmp_path: Path) -> None:
     run = run_of(tmp_path)
     (tmp_path / "log").write_text("{} ")
-    with pytest.raises(InputError, match="log: has changed since"):
-        swept(run, "margin=0.02:0.1")
+    expect_refusal("log: has changed since", swept, run, "margin=0.02:0.1")
     (tmp_path / "log").rename(tmp_path / "elsewhere")
-    with pytest.raises(InputError, match="log: is not there any more"):
-        swept(run, "margin=0.02:0.1")
+    expect_refusal("log: is not there any more", swept, run, "margin=0.02:0.1")
 
 
 def test_a_run_that_has_other_settings_when_it_is_made_again_is_refused(tmp_path: Path) -> None:
@@ -171,10 +169,10 @@ def test_a_run_that_has_other_settings_when_it_is_made_again_is_refused(tmp_path
 def test_a_sweep_with_other_settings_does_not_go_on_in_the_folder(tmp_path: Path) -> None:
     run = run_of(tmp_path)
     swept(run, "latency=0:0.5")
-    with pytest.raises(UsageError, match="begun with other settings: over, tolerance"):
-        swept(run, "latency=0:1", tolerance=0.1)
-    with pytest.raises(UsageError, match="is no sweep"):
-        swept(run, "latency=0:1", out="audit")
+    expect_refusal(
+        "begun with other settings: over, tolerance", swept, run, "latency=0:1", tolerance=0.1, error=UsageError
+    )
+    expect_refusal("is no sweep", swept, run, "latency=0:1", out="audit", error=UsageError)
 
 
 def test_a_value_that_a_command_refuses_is_a_flip_of_its_own(tmp_path: Path) -> None:
@@ -182,8 +180,7 @@ def test_a_value_that_a_command_refuses_is_a_flip_of_its_own(tmp_path: Path) -> 
     flip = swept(run, "latency=0:1").flips[0]
     assert flip.first is not None and (flip.first.label, flip.first.folder) == ("refused", "")
     assert "SAFE up to 0.59375 s, REFUSED at 0.609375" in flip.sentence and "not so" in flip.first.sentence
-    with pytest.raises(InputError, match=r"latency=0\.7: is refused: replay: not so; begin at"):
-        swept(run, "latency=0.7:0", out="other")
+    expect_refusal(r"latency=0\.7: is refused: replay: not so; begin at", swept, run, "latency=0.7:0", out="other")
 
 
 def test_a_run_that_ends_for_another_reason_ends_the_sweep_by_name(tmp_path: Path) -> None:

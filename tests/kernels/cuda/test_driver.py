@@ -8,6 +8,7 @@ import pytest
 from splatctrl_cli.kernels.cuda import driver
 from splatctrl_cli.kernels.cuda.driver import usable_card
 from splatctrl_cli.kernels.cuda.memory import DeviceError
+from tests.refused import expect_refusal
 
 
 class FakeDriver:
@@ -83,5 +84,4 @@ def test_a_card_is_named_with_its_capability_and_driver(monkeypatch: pytest.Monk
 
 def test_without_a_driver_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "LIBRARY", "libcuda_of_no_machine.so.1")
-    with pytest.raises(DeviceError, match=r"no NVIDIA driver \(libcuda_of_no_machine"):
-        usable_card()
+    expect_refusal(r"no NVIDIA driver \(libcuda_of_no_machine", usable_card, error=DeviceError)

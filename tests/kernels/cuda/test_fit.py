@@ -15,6 +15,7 @@ from tests.kernels.cuda.emulator import EmulatedDevice
 from tests.kernels.cuda.scenes import SETTINGS, WEIGHTS, OnProcessor, camera, moments, parameters, target
 from tests.reference import loss as loss_reference
 from tests.reference import raster as raster_reference
+from tests.refused import expect_refusal
 
 FORWARD, BACKWARD = 1e-5, 1e-4  # largest error allowed, relative to the whole
 
@@ -217,8 +218,7 @@ def test_splats_out_of_view_keep_their_bytes(device: Memory) -> None:
 
 
 def test_more_splats_than_an_entry_can_number_are_refused() -> None:
-    with pytest.raises(DeviceError, match="num_splats: expected less than 16777216"):
-        DeviceFit(EmulatedDevice(), 1 << 24)
+    expect_refusal("num_splats: expected less than 16777216", DeviceFit, EmulatedDevice(), 1 << 24, error=DeviceError)
 
 
 def test_memory_needed_is_what_a_run_holds() -> None:

@@ -10,8 +10,10 @@ from splatctrl_cli.kernels.cuda.memory import FIELD, FIT
 
 
 @pytest.mark.parametrize("source", [FIT, FIELD])
-@pytest.mark.parametrize("capability", [(7, 5), (8, 0), (9, 0), (12, 0)])
-def test_kernels_compile_for_every_generation(capability: tuple[int, int], source: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("capability", [(7, 5), (12, 0)])
+def test_kernels_compile_for_the_oldest_and_the_newest_generation(
+    capability: tuple[int, int], source: str, tmp_path: Path
+) -> None:
     code = card.compiled(capability, tmp_path, source=source).code
     assert code[:4] == b"\x7fELF"
     assert b".text.bake_hard" in code or source == FIT  # by its name, as it is launched
