@@ -222,7 +222,7 @@ COMMANDS = {
             "query out/scene points.csv -o out/near.csv",
             "query out/field points.csv --scene out/scene",
         ),
-        run="sdf_bake:run_query",
+        run="query:run",
         options=scene_options.QUERY,
     ),
     "score": Command(
@@ -258,7 +258,7 @@ COMMANDS = {
             "sweep out/audit --over margin=0.02:0.08 -o out/margin",
             "sweep out/audit --over latency=0:1 --over depth-noise=0:0.02 -o out/both",
         ),
-        run="compare:run_sweep",
+        run="sweep:run",
         options=run_options.SWEEP,
     ),
     "compare": Command(

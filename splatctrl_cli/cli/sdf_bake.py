@@ -1,21 +1,17 @@
-"""``splatctrl sdf-bake`` and ``query``: a distance grid with its accuracy, and answers at points."""
+"""``splatctrl sdf-bake``: splats as a distance grid, with its accuracy."""
 
 import argparse
-import shutil
-import sys
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.cli.common import Console, format_cell, names_of, remarks, request_of, table
+from splatctrl_cli.cli.common import Console, format_cell, names_of, request_of, table
 from splatctrl_cli.config import fixed, load_config
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.formats.grid.grid_formats import FORMATS
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
-from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 from splatctrl_cli.records import Box, Label
 
 SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options
@@ -131,46 +127,3 @@ def labels_of(text: str) -> frozenset[Label]:
     """Labels in a field: objects and those of ``--include``. Raises UsageError for others."""
     names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
     return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})
-
-
-def run_query(args: argparse.Namespace, console: Console) -> int:
-    """Run; without an output answers go to stdout, figures to stderr."""
-    request = request_of(
-        QueryRequest,
-        args,
-        points=sys.stdin if str(args.points) == "-" else args.points,
-        config=load_config(args.config, args.set),
-        labels=labels_of(args.include),
-    )
-    if args.out is not None or console.is_json:
-        result = query(request, console)
-        out = None if result.out is None else str(result.out)
-        found = {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}
-        return console.result(found, _query_lines(result))
-    with tempfile.TemporaryDirectory() as folder:  # a table with a wrong line is refused before anything is printed
-        answers = Path(folder) / "answers.csv"
-        result = query(replace(request, out=answers), console)
-        with answers.open(encoding="utf-8", newline="") as stream:
-            shutil.copyfileobj(stream, sys.stdout)
-    for line in _query_lines(replace(result, out=None)):
-        console.log(line)
-    return 0
-
-
-def _query_lines(result: QueryResult) -> list[str]:
-    num = result.metrics["num_points"] or 0
-    rate = f"{num / max(result.seconds['answer'], 1e-9):,.0f} points/s"  # of fewer points it says nothing
-    return [
-        *table(
-            (result.kind, ""),
-            [(name.replace("_", " "), _format_figure(name, v)) for name, v in result.metrics.items()],
-        ),
-        *(f"note: {note}" for note in result.notes),
-        *remarks((rate, num >= 1000), (f"wrote {result.out}", result.out)),
-    ]
-
-
-def _format_figure(name: str, value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.0f}" if name.startswith("num_") else f"{value * 1e3:.1f} mm"
