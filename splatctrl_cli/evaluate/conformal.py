@@ -5,8 +5,7 @@ time, that long apart; a stretch's score is its largest miss. If n scores and a 
 smallest bounds the new one with probability at least `confidence`, for ``k = ceil((n + 1) * confidence)`` (Vovk,
 Gammerman and Shafer 2005; Lei et al. 2018, section 2).
 
-The bound is for a further stretch, not each state. It excludes surface without depth return, changes of scene or
-camera, and unprecedented moments.
+The bound is for a further stretch, not each state, and not for surface without depth, or another scene or camera.
 """
 
 import math

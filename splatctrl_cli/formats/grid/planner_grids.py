@@ -1,13 +1,13 @@
 """Baked grids for other planners: NVIDIA's cuRobo and MoveIt.
 
-cuRobo's voxel grid is ``field.curobo.npz``. It follows the source (NVlabs/curobo, 0.7.5 to 0.7.7: geom/types.py
-`VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested on it. (x, y, z) is flattened with z
-fastest; the grid is placed by its middle's pose, ``x y z qw qx qy qz``. Values are positive inside;
-``1 + floor(dims / voxel)`` cells a side.
+cuRobo's voxel grid is ``field.curobo.npz``, by its source (NVlabs/curobo, 0.7.5 to 0.7.7, not 0.7.0 to 0.7.4:
+geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested. (x, y, z) is flattened
+with z fastest; the middle's pose is ``x y z qw qx qy qz``. Values are positive inside; ``1 + floor(dims / voxel)``
+cells a side.
 
 The kernel truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the
 pose is half a voxel below our cells' middle. A sphere takes its centre's cell. The first three and last two cells of
-an axis, and the outside, are free. (0.7.0 to 0.7.4 differ.)
+an axis, and the outside, are free.
 
 MoveIt's distance field reads occupied cells: moveit_core, distance_field/src/propagation_distance_field.cpp
 (`readFromStream`; the same in MoveIt 1 and 2) and voxel_grid.h. Seven lines of text precede a zlib stream of bits: x

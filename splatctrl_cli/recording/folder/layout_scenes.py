@@ -11,9 +11,8 @@ Depth in millimetres, 65535 for none; poses camera to world. Three calibrations:
 
 Open3D and Redwood: a colour folder, ``depth/``, ``trajectory.log``, ``camera_intrinsic.json``, named as in
 open3d.data (RedwoodIndoorLivingRoom1 with ``colors/``, LoungeRGBDImages, BedroomRGBDImages). Poses are camera to
-world: Open3D integrates with their inverse (examples/python/reconstruction_system/integrate_scene.py). Images match
-poses in natural order (open3d_example.py there, get_rgbd_file_lists), or by number if there
-are more poses or fewer.
+world (examples/python/reconstruction_system/integrate_scene.py). Images match them in natural order
+(open3d_example.py, get_rgbd_file_lists), or by number if their counts differ.
 
 Described by hand (docs/input.md): Replica of NICE-SLAM and Semantic-NeRF, ICL-NUIM in TUM's form, ScanNet of
 SensReader.
