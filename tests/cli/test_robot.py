@@ -28,6 +28,7 @@ def result(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, 
     return loaded
 
 
+@pytest.mark.usefixtures("painted")
 def test_a_fit_writes_spheres_that_a_check_finds_complete(
     capsys: pytest.CaptureFixture[str], urdf: Path, tmp_path: Path
 ) -> None:
