@@ -32,12 +32,12 @@ def unanswered_points(
 
     Some repeat. Rays about a voxel apart end at the depth of the nearest pixel with depth. Holes up to `NARROW_HOLE`
     voxels wide do not count, nor those that a still camera did not show before. robot_depth (H, W) [m]: rendered,
-    0 = none; before: the camera's last frame and its mask.
+    0 = none; before: the camera's last frame and its mask, whose kinds alone a resumed run still knows.
     """
-    holes = _holes(frame, robot_depth)
+    holes = _holes(frame, robot_depth > 0)
     if before is not None and holes.any() and np.array_equal(before[0].T_world_camera, frame.T_world_camera):
         _, groups = cv2.connectedComponents(holes.view(np.uint8), connectivity=8)
-        holes &= np.isin(groups, groups[holes & _holes(before[0], before[1].robot_depth)])
+        holes &= np.isin(groups, groups[holes & _holes(before[0], before[1].kinds == PixelKind.ROBOT)])
     if not holes.any():
         return iter(())
     behind = _nearest_depth(frame.depth)
@@ -47,14 +47,14 @@ def unanswered_points(
     return points_on_rays(frame, v * apart, u * apart, behind[v * apart, u * apart], config)
 
 
-def _holes(frame: RgbdFrame, robot_depth: Float32) -> Bool:
+def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
     """Pixels (H, W) without depth, in groups that meet neither the border, nor the robot, nor its stereo shadow."""
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return np.zeros_like(is_blank)
     is_shadow = is_blank & find_shadows(frame.depth, frame.intrinsics.fx)
     is_blank &= ~is_shadow
-    is_end = _with_shadow(cv2.dilate(robot_depth, BESIDE_ROBOT) > 0, is_shadow) | ~frame.in_view
+    is_end = _with_shadow(cv2.dilate(is_robot.view(np.uint8), BESIDE_ROBOT) > 0, is_shadow) | ~frame.in_view
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
@@ -111,7 +111,7 @@ def lost_edges(
     surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
     found = dict[str, LostEdges]()
     for frame, mask in seen:
-        edges = _of_frame(frame, mask, config)
+        edges = _edges_of(frame, mask, config)
         edges = edges.select(~points.seen_through(edges.centers, cameras, surely, config.see_through))
         if robot is not None and len(edges.radii):
             edges = edges.select(robot.distance(edges.centers) > config.see_through)
@@ -119,7 +119,7 @@ def lost_edges(
     return found
 
 
-def _of_frame(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> LostEdges:
+def _edges_of(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> LostEdges:
     is_object = mask.kinds == PixelKind.OBJECT
     is_object &= ~is_mixed(frame.depth, is_object, tolerance_at(frame.depth, config), 2, frame.intrinsics.fx)
     is_object = cv2.morphologyEx(is_object.view(np.uint8), cv2.MORPH_OPEN, BESIDE) > 0

@@ -219,7 +219,7 @@ def gap_seeds(
     sources = [source for source in each(lambda view: bare(*view), views) if len(source)]
     forgotten = occupied[spheres.are_further(occupied, config.max_gap + 0.5 * voxel)]
     if len(forgotten):
-        sources.append(_of_voxels(forgotten, splats))
+        sources.append(_voxel_seeds(forgotten, splats))
     if not sources:
         return NO_SEEDS
     found = sources[0].joined(*sources[1:])
@@ -234,7 +234,7 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
     return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
 
 
-def _of_voxels(centers: Float32, splats: SplatSet) -> Seeds:
+def _voxel_seeds(centers: Float32, splats: SplatSet) -> Seeds:
     colors = np.full((len(centers), 3), 0.5, np.float32)
     if len(splats):
         colors = splats.colors[cKDTree(splats.centers).query(centers)[1]]

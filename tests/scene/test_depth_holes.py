@@ -120,6 +120,15 @@ def test_a_hole_counts_where_the_camera_showed_it_before(before: RgbdFrame, coun
     assert sum(map(len, found)) == (len(points_of(dark())) if counts else 0)
 
 
+def test_a_hole_at_the_robot_before_does_not_count_either_after_a_resumed_run() -> None:
+    """A restored mask has its kinds, and nothing rendered."""
+    before = dark()
+    kinds = np.where(ROBOT_BESIDE > 0, np.uint8(PixelKind.ROBOT), object_mask(before).kinds)
+    restored = replace(object_mask(before), kinds=kinds)
+    assert not restored.robot_depth.any() and len(points_of(dark()))
+    assert not list(unanswered_points(dark(), NOBODY, CONFIG, (before, restored)))
+
+
 def test_a_dark_block_is_where_all_cameras_look_in_vain() -> None:
     """The others see through the space above it."""
     one, three = unanswered(dark_block(0.0)), unanswered(dark_block(0.0), dark_block(-0.15), dark_block(0.15))

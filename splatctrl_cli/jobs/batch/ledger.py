@@ -245,7 +245,7 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
         named[str(node.out)] = "out"
         inputs = [digests[path] for path in node.inputs] + [keys[need] for need in node.needs]
         keys[node.name] = hashlib.sha256(
-            json.dumps([entry, code, node.command, *inputs, *_said(node.words, named)]).encode()
+            json.dumps([entry, code, node.command, *inputs, *_deciding_words(node.words, named)]).encode()
         ).hexdigest()
     return keys
 
@@ -261,14 +261,14 @@ def code_version() -> str:
     return found.hexdigest()
 
 
-def _said(words: Sequence[str], named: Mapping[str, str]) -> list[str]:
+def _deciding_words(words: Sequence[str], named: Mapping[str, str]) -> list[str]:
     """Words that change results, with paths replaced by digests."""
     left_out = ("--force", "--resume", "--quiet", "-q", "--json")
     pairs = zip(words, ("", *words), strict=False)
-    said = [w for w, before in pairs if w not in left_out and before != THREADS and not w.startswith(THREADS)]
+    kept = [w for w, before in pairs if w not in left_out and before != THREADS and not w.startswith(THREADS)]
     for path in sorted(named, key=len, reverse=True):
-        said = [word.replace(path, f"<{named[path]}>") for word in said]
-    return said
+        kept = [word.replace(path, f"<{named[path]}>") for word in kept]
+    return kept
 
 
 def _digest(path: Path, ledger: Ledger) -> str:

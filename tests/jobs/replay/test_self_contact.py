@@ -213,7 +213,7 @@ class Table:
 
 @pytest.fixture(scope="module")
 def fr3(real_data: Path) -> MeasuredRobot:
-    """With 64 spheres, as many as `robot spheres` fits by default, of a quick fit."""
+    """A robot with 64 spheres, the default of `robot spheres`, from a quicker fit."""
     folder = real_data / "franka_description"
     urdf = folder / "expanded" / "fr3_hand.urdf"
     quick = FitOptions(max_spheres=64, restarts=1, num_patches=1000, num_candidates=1200)
