@@ -241,7 +241,7 @@ def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) 
     findings: list[Finding] = []
     for topic in found.of_type(*STATE_TYPES):
         if options.joint_topic in (None, topic.topic.name):
-            for stream in topic.joints.streams:
+            for stream in topic.joints.streams.values():
                 findings += stream_findings(topic.topic.name, stream)
     loss = LossReport()
     wanted = None if model is None else model.joint_names

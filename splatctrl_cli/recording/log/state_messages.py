@@ -44,18 +44,40 @@ class RawJoints:
     note: str = ""
 
 
+_Read = tuple[str, Any, Any, Any, Any, Float64 | None]
+"""What it is, joint names, positions, velocities, commanded velocities, and T_base_ee."""
+
+
 def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:
     """States of a `STATE_TYPES` message, log time [ns]. Raises UndecodableMessageError."""
-    if type_name == JOINT_STATE:
-        names, position = tuple(str(name) for name in message.name), _array(message.position)
-        return [
-            _checked("a JointState", message, names, position, _array(message.velocity), _NONE, log_time_ns, None)
-        ]
-    if type_name in FRANKA_STATES:
-        return [_franka(message, log_time_ns)]
-    if type_name == CONTROLLER_STATE:
-        return [_controller(message, log_time_ns)]
-    return _trajectory(message, log_time_ns)
+    if type_name == TRAJECTORY:
+        return _trajectory(message, log_time_ns)
+    read = _franka if type_name in FRANKA_STATES else _controller if type_name == CONTROLLER_STATE else _joint_state
+    what, joints, *columns, T_base_ee = read(message)
+    names = tuple(str(name) for name in joints)
+    position, velocity, commanded = (np.asarray(values, dtype=np.float64) for values in columns)
+    refuse_if(
+        len(position) != len(names),
+        f"{what} with {len(names)} names and {len(position)} positions",
+        error=UndecodableMessageError,
+    )
+    is_odd = len(velocity) not in {0, len(names)}
+    return [
+        RawJoints(
+            stamp_ns=stamp_ns(message.header),
+            names=names,
+            position=position,
+            velocity=velocity if len(velocity) == len(names) else _NONE,
+            log_time_ns=log_time_ns,
+            commanded_velocity=commanded if len(commanded) == len(names) else _NONE,
+            T_base_ee=T_base_ee,
+            note=f"{len(names)} names with {len(velocity)} velocities, which are not used" if is_odd else "",
+        )
+    ]
+
+
+def _joint_state(message: Any) -> _Read:
+    return "a JointState", message.name, message.position, message.velocity, _NONE, None
 
 
 def rigid_or_none(T: Float64) -> Float64 | None:
@@ -77,70 +99,38 @@ def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
     return transform_from(position, quat_xyzw)
 
 
-def _franka(message: Any, log_time_ns: int) -> RawJoints:
+def _franka(message: Any) -> _Read:
     """franka_ros2's FrankaRobotState (named states, PoseStamped), or the older bare arrays."""
     fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
     if "measured_joint_state" in fields:
         measured, desired, pose = fields["measured_joint_state"], fields["desired_joint_state"], fields["o_t_ee"].pose
         p, r = pose.position, pose.orientation
-        position, velocity = _array(measured.position), _array(measured.velocity)
-        names = tuple(str(name) for name in measured.name)
-        commanded = _array(desired.velocity)
+        names, position, velocity, commanded = measured.name, measured.position, measured.velocity, desired.velocity
         T = pose_of_quat(np.array([p.x, p.y, p.z]), np.array([r.x, r.y, r.z, r.w]))
     else:
-        position, velocity, commanded = (_array(fields[name]) for name in ("q", "dq", "dq_d"))
-        names, T = (), pose_of_columns(_array(fields["o_t_ee"]))
-    if not names and len(position) == len(NAMELESS):
-        names = NAMELESS
-    return _checked("a Franka state", message, names, position, velocity, commanded, log_time_ns, T)
+        names, (position, velocity, commanded) = (), (fields[name] for name in ("q", "dq", "dq_d"))
+        T = pose_of_columns(np.asarray(fields["o_t_ee"], dtype=np.float64))
+    names = NAMELESS if not names and len(position) == len(NAMELESS) else names
+    return "a Franka state", names, position, velocity, commanded, T
 
 
-def _controller(message: Any, log_time_ns: int) -> RawJoints:
+def _controller(message: Any) -> _Read:
     """Filled `feedback` and `reference`, else the older `actual` and `desired` (control_msgs)."""
-    names = tuple(str(name) for name in message.joint_names)
+    names = message.joint_names
     actual, wanted = (
         _find_filled(message, fields, len(names)) for fields in (("feedback", "actual"), ("reference", "desired"))
     )
-    actual = require(
-        actual, f"a controller state of {len(names)} joints without positions", error=UndecodableMessageError
+    what = f"a controller state of {len(names)} joints without positions"
+    actual, commanded = (
+        require(actual, what, error=UndecodableMessageError),
+        _NONE if wanted is None else wanted.velocities,
     )
-    commanded = _NONE if wanted is None else _array(wanted.velocities)
-    position, velocity = _array(actual.positions), _array(actual.velocities)
-    return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
+    return "a controller state", names, actual.positions, actual.velocities, commanded, None
 
 
 def _find_filled(message: Any, fields: tuple[str, ...], num_joints: int) -> Any:
     there = [getattr(message, name) for name in fields if name in message.__dataclass_fields__]
     return next((point for point in there if len(point.positions) == num_joints), None)
-
-
-def _checked(
-    what: str,
-    message: Any,
-    names: tuple[str, ...],
-    position: Float64,
-    velocity: Float64,
-    commanded: Float64,
-    log_time_ns: int,
-    T_base_ee: Float64 | None,
-) -> RawJoints:
-    refuse_if(
-        len(position) != len(names),
-        f"{what} with {len(names)} names and {len(position)} positions",
-        error=UndecodableMessageError,
-    )
-    return RawJoints(
-        stamp_ns=stamp_ns(message.header),
-        names=names,
-        position=position,
-        velocity=velocity if len(velocity) == len(names) else _NONE,
-        log_time_ns=log_time_ns,
-        commanded_velocity=commanded if len(commanded) == len(names) else _NONE,
-        T_base_ee=T_base_ee,
-        note=""
-        if len(velocity) in {0, len(names)}
-        else f"{len(names)} names with {len(velocity)} velocities, which are not used",
-    )
 
 
 def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
@@ -149,7 +139,8 @@ def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
     start_ns = stamp_ns(message.header) or log_time_ns
     states = []
     for point in message.points:
-        since, position, velocity = point.time_from_start, _array(point.positions), _array(point.velocities)
+        since = point.time_from_start
+        position, velocity = (np.asarray(v, dtype=np.float64) for v in (point.positions, point.velocities))
         refuse_if(
             len(position) != len(names),
             f"a trajectory of {len(names)} joints with {len(position)} positions",
@@ -167,10 +158,6 @@ def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
             )
         )
     return states
-
-
-def _array(values: Any) -> Float64:
-    return np.asarray(values, dtype=np.float64)
 
 
 COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
@@ -193,8 +180,8 @@ class JointStream(ColumnWriter):
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
         super().__init__({name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}, columns or {})
         refuse_if(
-            columns and len(self) != len(self._stamps),
-            f"columns of other lengths than {len(self._stamps)}",
+            columns and (len(self) != len(self._stamps) or "position" not in columns),
+            f"no positions, or columns of other lengths than {len(self._stamps)}",
             error=ValueError,
         )
 
@@ -223,31 +210,21 @@ class JointStream(ColumnWriter):
 
 
 class JointLog:
-    """States in file order; first_names: the first one's, or None; notes: counted."""
+    """`num` states; streams by their joints; first_names: the first state's, or None; notes: counted."""
 
     def __init__(self, streams: Sequence[JointStream] = (), num: int = 0) -> None:
         self.first_names = streams[0].names if streams else None
         self.notes: Counter[str] = Counter()
-        self._num = num
-        self._streams = {frozenset(stream.names): stream for stream in streams}
-
-    def __len__(self) -> int:
-        return self._num
-
-    @property
-    def streams(self) -> list[JointStream]:
-        """Streams by joints, without nameless states."""
-        return list(self._streams.values())
+        self.num = num
+        self.streams = {frozenset(stream.names): stream for stream in streams}
 
     def extend(self, states: Iterable[RawJoints]) -> None:
         """Add states. Raises OverflowError for a time beyond 64 bits."""
         for state in states:
             self.notes.update(filter(None, [state.note]))
-            if state.names:
-                key = frozenset(state.names)
-                stream = self._streams[key] if key in self._streams else JointStream(state.names)
+            if state.names:  # without names, nothing says which joints these are
+                stream = self.streams.get(frozenset(state.names)) or JointStream(state.names)
                 stream.add_state(state)
-                self._streams[key] = stream
-            if self.first_names is None:
-                self.first_names = state.names
-            self._num += 1
+                self.streams[frozenset(state.names)] = stream
+            self.first_names = state.names if self.first_names is None else self.first_names
+            self.num += 1

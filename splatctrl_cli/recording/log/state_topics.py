@@ -1,7 +1,7 @@
 """Joint states of a log's topics: chosen, merged, renamed, clocks checked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,20 +24,13 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, 
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, ranges
 from splatctrl_cli.recording.log.decoder import JOINT_STATE
 from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
-from splatctrl_cli.recording.log.state_messages import STANDARD_TYPES, STATE_TYPES, TRAJECTORY, JointStream
+from splatctrl_cli.recording.log.state_messages import STANDARD_TYPES, STATE_TYPES, TRAJECTORY
 from splatctrl_cli.recording.log.state_track import RawTrack, clean_states, unwrap
 from splatctrl_cli.recording.log.survey import Survey, TopicSurvey
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, Index, LossReport, Stamps
 
 _COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")  # in topics of what is wished
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Stream:
-    where: str
-    names: tuple[str, ...]
-    states: JointStream
 
 
 def joint_records(
@@ -104,11 +97,11 @@ def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
 
 def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
     """States with the most joints; others (a gripper that publishes alone) are noted."""
-    chosen = max(_streams([topic]), key=lambda s: (len(s.names), len(s.states), sorted(s.names)))
-    others = len(topic.joints) - len(chosen.states)
+    chosen = max(_tracks([topic]), key=lambda track: (len(track.names), len(track), sorted(track.names)))
+    others = topic.joints.num - len(chosen)
     if others:
-        loss.notes.append(f"{chosen.where}: {others} of {len(topic.joints)} states name other joints: left out")
-    return _raw(chosen, chosen.names, loss)
+        loss.notes.append(f"{chosen.where}: {others} of {topic.joints.num} states name other joints: left out")
+    return _with_clock(chosen, loss)
 
 
 def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: LossReport) -> RawTrack:
@@ -117,17 +110,17 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Other joints are
     interpolated. States outside their times, or in gaps over `STATES_BRIDGED` with motion, are left out with a note.
     """
-    streams = _rename_joints(_streams(topics), wanted, loss)
-    base = _base(streams, wanted)
-    track = _raw(base, base.names, loss)
+    tracks = _rename_joints(_tracks(topics), wanted, loss)
+    base = _base(tracks, wanted)
+    track = _with_clock(base, loss)
     missing = [name for name in wanted if name not in base.names]
     used = [base.where]
     while missing:
-        best = max(streams, key=lambda s: (len(set(s.names) & set(missing)), len(s.states), s.where))
+        best = max(tracks, key=lambda t: (len(set(t.names) & set(missing)), len(t), t.where))
         added = tuple(name for name in missing if name in best.names)
         if not added:
             break
-        track = _fill_joints(track, _raw(best, added, loss), loss)
+        track = _fill_joints(track, _with_clock(best, loss).of_names(added), loss)
         missing = [name for name in missing if name not in added]
         used.append(best.where)
     others = sorted({t.topic.name for t in topics} - set(used))
@@ -138,25 +131,29 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     return track if missing else track.of_names(wanted)
 
 
-def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
-    return [
-        _Stream(where=topic.topic.name, names=stream.names, states=stream)
-        for topic in topics
-        for stream in topic.joints.streams
-    ]
+def _tracks(topics: Sequence[TopicSurvey]) -> list[RawTrack]:
+    """A topic's states by their joints, in file order, at the headers' stamps."""
+    found = []
+    for topic in topics:
+        for stream in topic.joints.streams.values():
+            columns, times = stream.columns(), {"stamp_ns": stream.stamp_ns, "log_ns": stream.log_time_ns}
+            if "velocity" not in columns:
+                columns["velocity"] = absent(len(stream), len(stream.names))
+            found.append(RawTrack(where=topic.topic.name, names=stream.names, **times, **columns))
+    return found
 
 
-def _base(streams: Sequence[_Stream], wanted: Sequence[str]) -> _Stream:
-    """The stream with most `wanted`; ties prefer end-effector poses, then /joint_states."""
+def _base(tracks: Sequence[RawTrack], wanted: Sequence[str]) -> RawTrack:
+    """The track with most `wanted`; ties prefer end-effector poses, then /joint_states."""
     return max(
-        streams,
-        key=lambda stream: (
-            len(set(stream.names) & set(wanted)),
-            "T_base_ee" in stream.states.columns(),
-            stream.where == "/joint_states",
-            not _is_command(stream.where),
-            len(stream.states),
-            stream.where,
+        tracks,
+        key=lambda track: (
+            len(set(track.names) & set(wanted)),
+            track.T_base_ee is not None,
+            track.where == "/joint_states",
+            not _is_command(track.where),
+            len(track),
+            track.where,
         ),
     )
 
@@ -171,14 +168,14 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
     InputError if another topic, not of commands, has them over `STATES_RIVAL` apart; NotEvaluableError if two
     publishers take turns on one topic.
     """
-    streams = _streams(topics)
+    tracks = _tracks(topics)
     if wanted is None:
-        base = max(streams, key=lambda s: (s.where == main_topic(topics, LossReport()).topic.name, len(s.names)))
+        base = max(tracks, key=lambda t: (t.where == main_topic(topics, LossReport()).topic.name, len(t.names)))
     else:
-        streams = _rename_joints(streams, wanted, LossReport())
-        base = _base(streams, wanted)
+        tracks = _rename_joints(tracks, wanted, LossReport())
+        base = _base(tracks, wanted)
     names = base.names if wanted is None else tuple(name for name in base.names if name in wanted)
-    for other in streams:
+    for other in tracks:
         shared = [name for name in names if name in other.names]
         if other.where == base.where or not shared or _is_command(other.where):
             continue
@@ -191,16 +188,16 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
             )
     num = _num_turns(base, names)
     refuse_if(
-        num >= max(TURNS_FEWEST, TURNS_SHARE * len(base.states)),
-        f"{base.where}: two publishers take turns: {num} of {len(base.states)} states jump away and back at once",
+        num >= max(TURNS_FEWEST, TURNS_SHARE * len(base)),
+        f"{base.where}: two publishers take turns: {num} of {len(base)} states jump away and back at once",
         remedy="let one node publish the topic (ros2 topic info -v names them), and record again",
         error=NotEvaluableError,
     )
 
 
-def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
+def _apart(base: RawTrack, other: RawTrack, shared: Sequence[str]) -> float:
     """Median distance [rad or m] of shared joints; 0 without overlap."""
-    stamps, its = base.states.stamp_ns, other.states.stamp_ns
+    stamps, its = base.stamp_ns, other.stamp_ns
     at, at_other = np.argsort(stamps, kind="stable"), np.argsort(its, kind="stable")
     its = its[at_other]
     some = np.unique(np.linspace(0, len(its) - 1, min(len(its), STATES_COMPARED // 10)).astype(np.int64))
@@ -208,22 +205,19 @@ def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
     is_near = np.abs(stamps[at][near] - its[some]) <= STATES_BRIDGED * 1e9
     if not is_near.any():
         return 0.0
-    one = base.states.columns()["position"][at[near[is_near]]][:, [base.names.index(name) for name in shared]]
-    two = other.states.columns()["position"][at_other[some[is_near]]][:, [other.names.index(name) for name in shared]]
+    one = base.position[at[near[is_near]]][:, [base.names.index(name) for name in shared]]
+    two = other.position[at_other[some[is_near]]][:, [other.names.index(name) for name in shared]]
     turned = np.abs(one - two)
     return float(np.median(np.minimum(turned, np.abs(turned - 2 * np.pi)).max(axis=1)))
 
 
-def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
+def _num_turns(track: RawTrack, names: Sequence[str]) -> int:
     """Count states far from both neighbours, which are close: no joint returns so fast."""
-    position = stream.states.columns().get("position")
-    columns = [stream.names.index(name) for name in names]
-    if position is None or not columns:
-        return 0
-    num, order = 0, np.argsort(stream.states.stamp_ns, kind="stable")
-    seconds = stream.states.stamp_ns[order] * 1e-9
-    for first, last in ranges(max(len(order) - 2, 0)):
-        q, gaps = position[order[first : last + 2]][:, columns], np.diff(seconds[first : last + 2])
+    columns = [track.names.index(name) for name in names]
+    num, order = 0, np.argsort(track.stamp_ns, kind="stable")
+    seconds = track.stamp_ns[order] * 1e-9
+    for first, last in ranges(max(len(order) - 2, 0)) if columns else ():
+        q, gaps = track.position[order[first : last + 2]][:, columns], np.diff(seconds[first : last + 2])
         steps = np.abs(np.diff(q, axis=0))
         jump = np.minimum(steps[1:], steps[:-1])
         fastest = np.maximum(TURNS_ACCELERATION * gaps[1:] * gaps[:-1], TURNS_LEAST)[:, None]
@@ -232,15 +226,15 @@ def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
     return num
 
 
-def _rename_joints(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
-    found = dict.fromkeys(name for stream in streams for name in stream.names)
+def _rename_joints(tracks: list[RawTrack], wanted: Sequence[str], loss: LossReport) -> list[RawTrack]:
+    found = dict.fromkeys(name for track in tracks for name in track.names)
     unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
     names = match_prefix(unknown, missing)
     if not names:
-        return streams
+        return tracks
     name, meant = next(iter(names.items()))
     loss.notes.append(f"joint names differ by a prefix: {name} is {meant}, and so on")
-    return [replace(s, names=tuple(names.get(name, name) for name in s.names)) for s in streams]
+    return [replace(t, names=tuple(names.get(name, name) for name in t.names)) for t in tracks]
 
 
 def match_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
@@ -257,14 +251,8 @@ def match_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
     return fitting[-1] if is_sure else {}
 
 
-def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
-    states, columns = stream.states, stream.states.columns()
-    return RawTrack(
-        where=stream.where,
-        names=stream.names,
-        stamp_ns=checked_stamps(states.stamp_ns, states.log_time_ns, stream.where, loss),
-        **{"velocity": absent(len(states), len(stream.names)), **columns},
-    ).of_names(names)
+def _with_clock(track: RawTrack, loss: LossReport) -> RawTrack:
+    return replace(track, stamp_ns=checked_stamps(track.stamp_ns, track.log_ns, track.where, loss))
 
 
 def _fill_joints(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:

@@ -4,7 +4,7 @@ Missing velocities come from positions, without the stamps' jitter; faults are c
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -40,43 +40,22 @@ def smoothed_seconds(stamp_ns: Stamps) -> Float64:
     period = float(np.median(seconds[lag:] - seconds[:-lag])) / lag
     number = _numbers(seconds, period)
     smooth = np.empty_like(seconds)
-    sums = _Sums()
+    sums, start = np.zeros((4, 1)), 0  # of k, r, k^2 and k r, up to but not with state `start` and those after it
     for begin, end in ranges(len(seconds)):
         index = np.arange(begin, end)
         first = np.maximum(index - fixed.STATES_CLOCK_SAMPLES, 0)
         last = np.minimum(index + fixed.STATES_CLOCK_SAMPLES, len(seconds) - 1) + 1
-        k, residual = number[: last[-1]], seconds[sums.num : last[-1]] - period * number[sums.num : last[-1]]
-        sums.add(k[sums.num :], residual)  # small numbers: the sums below keep their digits
-        mean_k, mean_r, mean_kk, mean_kr = sums.means(first, last)
+        fresh = slice(start + sums.shape[1] - 1, last[-1])
+        k, r = number[fresh], seconds[fresh] - period * number[fresh]  # small numbers: their sums keep their digits
+        grown = np.cumsum(np.hstack([sums[:, -1:], [k, r, k**2, k * r]]), axis=1)
+        sums = np.hstack([sums, grown[:, 1:]])
+        mean_k, mean_r, mean_kk, mean_kr = (sums[:, last - start] - sums[:, first - start]) / (last - first)
         slope = (mean_kr - mean_k * mean_r) / np.maximum(mean_kk - mean_k**2, 1e-12)
         smooth[begin:end] = period * number[begin:end] + mean_r + slope * (number[begin:end] - mean_k)
-        sums.forget(end - fixed.STATES_CLOCK_SAMPLES)
+        done = max(end - fixed.STATES_CLOCK_SAMPLES - start, 0)  # no later state needs these
+        sums, start = sums[:, done:], start + done
     is_regular = float(np.sqrt(np.mean((smooth - seconds) ** 2))) < 0.25 * period
     return smooth if is_regular and bool(np.all(np.diff(smooth) > 0)) else seconds
-
-
-class _Sums:
-    """Running sums of k, r, k^2 and k r; only recent ones are kept."""
-
-    def __init__(self) -> None:
-        self._sums = np.zeros((4, 1))  # up to but not with state `_start` and those after it
-        self._start = 0
-
-    @property
-    def num(self) -> int:
-        return self._start + self._sums.shape[1] - 1
-
-    def add(self, k: Float64, r: Float64) -> None:
-        rows = [np.cumsum(np.concatenate([s[-1:], v])) for s, v in zip(self._sums, (k, r, k**2, k * r), strict=True)]
-        self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
-
-    def means(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> Float64:
-        """Means (4, T) over the states from each first to before its last."""
-        return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
-
-    def forget(self, before: int) -> None:
-        if before > self._start:
-            self._sums, self._start = self._sums[:, before - self._start :].copy(), before
 
 
 def _numbers(seconds: Float64, period: float) -> Float64:
@@ -135,10 +114,14 @@ def _slopes(seconds: Float64, position: Float64) -> Float64:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawTrack(StateColumns):
-    """States as recorded, in file order; absent velocity is NaN. where: its name in messages."""
+    """States as recorded, in file order; absent velocity is NaN.
+
+    where: its name in messages. log_ns (T,): times of logging [ns], of a log.
+    """
 
     where: str
     names: tuple[str, ...]
+    log_ns: Stamps = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def of_names(self, names: Sequence[str]) -> "RawTrack":
         order = np.array([self.names.index(name) for name in names], dtype=np.int64)

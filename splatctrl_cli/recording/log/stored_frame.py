@@ -67,7 +67,7 @@ def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) 
     described, number = [], 0
     for topic in kept.topics:
         streams = []
-        for stream in topic.joints.streams:
+        for stream in topic.joints.streams.values():
             place = f"{FOLDER}/{number}"
             (folder / place).mkdir(parents=True)
             number += 1
@@ -87,7 +87,7 @@ def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) 
                 "type": topic.topic.type_name,
                 "messages": topic.count,
                 "has_definition": bool(topic.topic.definition),
-                "states": len(topic.joints),
+                "states": topic.joints.num,
                 "streams": streams,
             }
         )
