@@ -13,11 +13,10 @@ from benchmarks.scenes import sample_fitter, sample_robot, sample_states
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import audit
 from splatctrl_cli.control.step import QpIkController
-from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.clusters import Spheres, field_splats
 from splatctrl_cli.field.distance import field_over
 from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.field.unknown import field_splats
 from splatctrl_cli.records import DistanceField, Float64, SplatSet
 
 NUM_STEPS = 200

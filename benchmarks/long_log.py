@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks.measure import ROBOT, Limit, Options, Result, measured
 from benchmarks.scenes import sample_fitter, sample_robot
 from splatctrl_cli.config import Config
+from splatctrl_cli.field.clusters import field_splats
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.field.unknown import field_splats
 from splatctrl_cli.formats.grid.npz_grid import write_npz
 from splatctrl_cli.records import Float64
 

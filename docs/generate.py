@@ -10,7 +10,7 @@ from splatctrl_cli.evaluate.metrics import Better, Scale
 from splatctrl_cli.evaluate.verdict import Criterion
 from splatctrl_cli.formats.grid.grid_format import GridFormat
 from splatctrl_cli.formats.grid.grid_formats import FORMATS as GRID_FORMATS
-from splatctrl_cli.formats.splat.splat_format import SplatFormat
+from splatctrl_cli.formats.splat.gaussian_ply import SplatFormat
 from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.jobs.compare.judged_runs import scales
 from splatctrl_cli.jobs.replay.criteria import Judged

@@ -17,10 +17,9 @@ from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.evaluate.protocols import SURFACE_SCANS
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.field.baker import Baker, Planes
-from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.clusters import Spheres, field_splats, obstacle_spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridField, GridLayout
-from splatctrl_cli.field.unknown import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import (
     Stopwatch,
     output_path,

@@ -179,7 +179,7 @@ def points(device: CudaDevice) -> list[str]:
 def row_of_points(device: CudaDevice, asked: Float64, what: str, count: int, distance: str) -> str:
     splats, config = surface_splats(count), FieldConfig(distance=distance)
     theirs = field_over(Spheres.of(splats.centers, splats.radii), config, threads=0)
-    mine = OnDevice.of(splats.centers, splats.radii, config, device)
+    mine = OnDevice(Spheres.of(splats.centers, splats.radii), config, device)
     query = mine.query if len(asked) == POINTS else mine.distance  # an audit needs no gradient
     found = mine.query(asked)[0]
     query(asked)
@@ -211,7 +211,7 @@ def small(device: CudaDevice, distances: Sequence[str] = DISTANCES) -> None:
         mine.bake(0, 20, mine.allocate(20))
         mine.close()
         splats = surface_splats(400)
-        field = OnDevice.of(splats.centers, splats.radii, FieldConfig(distance=distance), device)
+        field = OnDevice(Spheres.of(splats.centers, splats.radii), FieldConfig(distance=distance), device)
         field.query(arms(100))
         field.close()
 

@@ -90,8 +90,7 @@ class Adjustment:
     def _step(self, normal: Normal, estimate: Estimate, start: Estimate, hold: float) -> Float64:
         """The Gauss-Newton step; unobserved directions stay near the start.
 
-        All others stay near it, too, by a share `hold` of the residuals' weight, because wrong surfaces pull while
-        the reach is large.
+        So do all others, by a share `hold` of the residuals' weight, while wrong surfaces pull.
         """
         weight, offset = self._prior(estimate, start)
         weight = weight + hold * float(np.trace(normal.H)) / len(weight)

@@ -344,7 +344,7 @@ def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
 
 
 def _step(frame: RgbdFrame, num_averaged: int) -> int:
-    """Baseline of normals [pixels], long against depth noise."""
+    """Baseline of normals [pixels]."""
     depth = frame.depth[frame.depth > 0]
     if not len(depth):
         return 1

@@ -260,7 +260,6 @@ def exposed(frame: RgbdFrame, gain: Float64) -> RgbdFrame:
 
 
 def _small(frame: RgbdFrame, rows: int) -> Float64:
-    """Smoothed levels (h, w, 3) at a `GrayView`'s pixels."""
     stride = -(-frame.color.shape[0] // rows)
     smooth = cv2.GaussianBlur(frame.color, (0, 0), fixed.EXPOSURE_BLUR * stride)
     return np.asarray(smooth[::stride, ::stride], np.float64)

@@ -79,7 +79,7 @@ def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution
 
 
 def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution:
-    """The solution near a rough one, with supported clock and depth corrections."""
+    """The solution near a rough one."""
     near = adjustment.solved(rough, [WIDE[-1]], rounds=2)
     solution = _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
     unknowns = adjustment.unknowns
@@ -91,7 +91,7 @@ def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution
 
 
 def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]:
-    """Misfits; inf with few comparable points, where a good fit means little."""
+    """Misfits; inf with few comparable points."""
     fits = [adjustment.cost(one, WIDE[-1][0]) for one in estimates]
     most = max(num for _, num in fits)
     return [cost if 2 * num >= most else np.inf for cost, num in fits]

@@ -148,8 +148,7 @@ def overlap_rows(
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
     """A stationary camera's frame: the mean of inverse depths near their median.
 
-    Sensors err in disparity, proportional to inverse depth. Half of the frames must agree within three `depth_sigma`,
-    else depth is 0.
+    Half of the frames must agree within three `depth_sigma`, else depth is 0.
     """
     if len(frames) == 1:
         return frames[0]

@@ -131,11 +131,7 @@ def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Post
 def _exchanged(posture: Posture, i: int, j: int) -> Posture:
     def exchanged(stamp_ns: int) -> Float64 | None:
         q = posture(stamp_ns)
-        if q is None:
-            return None
-        q = q.copy()
-        q[[i, j]] = q[[j, i]]
-        return q
+        return None if q is None else q[[{i: j, j: i}.get(joint, joint) for joint in range(len(q))]]
 
     return exchanged
 
@@ -151,10 +147,7 @@ def motion_findings(
 
     frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescale_remedy`.
     """
-    found: list[Finding] = []
-    offsets: dict[str, float] = {}
-    if model is not None:
-        offsets, found = _arm_findings(model, frames, states, units)
+    offsets, found = ({}, []) if model is None else _arm_findings(model, frames, states, units)
     if offsets:
         return [*_timing_findings(offsets), *found]
     if not motion.cameras:
@@ -169,7 +162,6 @@ def motion_findings(
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
 ) -> tuple[dict[str, float], list[Finding]]:
-    """Clock offsets [s] of cameras that then show the arm better, and findings."""
     posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
     timings: dict[str, tuple[float, float]] = {}
@@ -232,7 +224,7 @@ def _arm_findings(
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
-    """Offsets that fit much better than the median's; others have other causes."""
+    """Offsets that fit much better than the median's."""
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():

@@ -119,7 +119,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
     """Log brightness (N, B) by bands of rows, less a parabola, or 0.
 
-    Shadows and pose errors do not follow rows; gloss and vignetting vary slowly, lamps on mains within 10 or 8 ms.
+    Gloss and vignetting vary slowly, lamps on mains within 10 or 8 ms.
     """
     found = bands.gains(np.ones(bands.num_images, np.bool_))
     logs = np.log(found).mean(axis=2)
@@ -222,19 +222,14 @@ def check_folder(
     except InputError as wrong:
         findings.append(error("refused", path.name, wrong.message, wrong.remedy))
     findings += _losses(source, path.name)
-    cameras = dict(sorted(cameras.items()))
+    cameras, logged = dict(sorted(cameras.items())), states.columns()
     if not cameras and not any(finding.code == "refused" for finding in findings):
         findings.append(error("missing", path.name, "no frame could be read", "copy or record it again"))
     for camera in cameras.values():
         findings += _camera_findings(camera, has_clock=source.has_clock)
     findings += sample_findings([camera.images for camera in cameras.values()])
-    logged = states.columns()
-    of_states = RobotStates(
-        model=model, lack="" if len(logged) else "no joint states; give them apart (splatctrl help replay, Logs)"
-    )
-    if len(logged) and source.has_clock:
-        of_states = robot_states(model, source.joint_names, logged)
-        findings += of_states.findings
+    of_states = _states(source, logged, model)
+    most = max((len(camera.stamps) for camera in cameras.values()), default=0)
     stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
     return judge_frames(
         CheckReport(
@@ -243,13 +238,9 @@ def check_folder(
             duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
             num_messages=len(stamps) + len(logged),
             start_ns=min(stamps, default=None) if source.has_clock else None,
-            findings=findings,
+            findings=[*findings, *of_states.findings],
             rates=[camera.times.rate(is_read=True) for camera in cameras.values()] if source.has_clock else [],
-            lacks=find_lacks(
-                num_cameras=len(cameras),
-                num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
-                states_lack=of_states.lack,
-            ),
+            lacks=find_lacks(num_cameras=len(cameras), num_frames=most, states_lack=of_states.lack),
         ),
         of_states.model,
         frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
@@ -262,12 +253,17 @@ def check_folder(
     )
 
 
+def _states(source: FrameSource, logged: StateColumns, model: RobotModel | None) -> RobotStates:
+    if len(logged) and source.has_clock:
+        return robot_states(model, source.joint_names, logged)
+    lack = "" if len(logged) else "no joint states; give them apart (splatctrl help replay, Logs)"
+    return RobotStates(model=model, lack=lack)
+
+
 def _losses(source: FrameSource, where: str) -> Iterator[Finding]:
     loss = source.loss
-    if loss.damaged:
-        yield from damage_findings(where, loss.notes[:50])
-    else:
-        yield from (note("loss", where, text) for text in loss.notes[:50])
+    notes = loss.notes[:50]
+    yield from damage_findings(where, notes) if loss.damaged else (note("loss", where, text) for text in notes)
     for name, (code, words) in _LOST.items():
         count = getattr(loss, name)
         yield from judge(

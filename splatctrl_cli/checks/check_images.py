@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import Any
 
 import cv2
@@ -304,21 +303,17 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
                 )
         elif (other := _other(camera, edges, _at_zero(surface))) is not None:
             others[camera] = other
-    exchanged = (_judge_exchange(camera, other, is_mutual=other[0] in others) for camera, other in others.items())
-    return [*found, *chain.from_iterable(exchanged)]
-
-
-def _judge_exchange(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> list[Finding]:
-    """An error only if mutual: an exchange has two sides."""
-    name, own, peak = other
-    return judge(
-        ERROR if is_mutual else WARNING,
-        "alignment",
-        f"camera {camera}",
-        f"its colour edges meet the depth edges of camera {name} (correlation {peak:.2f}), not its own ({own:.2f})",
-        "exchange the depth topics, with --camera NAME=COLOR,DEPTH",
-        value=own,
-    )
+    for camera, (name, own, peak) in others.items():
+        found += judge(
+            ERROR if name in others else WARNING,  # an exchange has two sides
+            "alignment",
+            f"camera {camera}",
+            f"its colour edges meet the depth edges of camera {name} (correlation {peak:.2f}), not its own"
+            f" ({own:.2f})",
+            "exchange the depth topics, with --camera NAME=COLOR,DEPTH",
+            value=own,
+        )
+    return found
 
 
 def _other(
@@ -358,7 +353,7 @@ def _transform(image: Float32) -> Float64:
 
 
 def _correlate(edges: Sequence[tuple[Float64, Float64]]) -> Float64:
-    """(h, w) mean by shift of colour against depth edges, zero in the middle."""
+    """(h, w) mean by shift of colour against depth edges."""
     surfaces = [np.fft.fftshift(np.fft.irfft2(color * np.conj(depth))) for color, depth in edges]
     return np.asarray(np.mean(surfaces, axis=0))
 

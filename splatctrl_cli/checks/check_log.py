@@ -291,28 +291,15 @@ def check_log(
     options.refuse(("root", "holdout"), "a log", log.path)
     watch = LogWatch(log, options, num_images)
     found = survey(watch, by_log_time=options.stamps == "log")
-    findings = damage_findings(log.path.name, found.damage.notes)
-    findings += [note("remark", log.path.name, text, value=num) for text, num in found.damage.remarks.items()]
-    findings += file_findings(watch.spans)
     cameras = _chosen(log, found, options)
     rig = [(topics, ready(log, found, topics, options)) for topics in cameras]
-    for topics, camera in rig:
-        if camera is not None and camera.depth_scale is not None and topics.depth in watch.images:
-            watch.images[topics.depth].rescale(camera.depth_scale)
-    used = {name for camera in cameras for name in (camera.color, camera.depth)}
-    unused = watch.images.keys() - used if cameras else set()
-    findings += _time_findings(watch, found, cameras, unused)
-    findings += _image_findings(watch, unused, {t.topic.name for t in image_topics(found, "unlike")})
-    findings += calibration_findings(found, cameras, watch.changed_infos)
-    findings += tf_findings(found, cameras, options)
-    for topics, camera in rig:
-        findings += camera_findings(found, topics, camera, options)
-    if any(finding.code == "pose-missing" for finding in findings):
-        findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
-    findings += [error("missing", log.path.name, *_split_remedy(lack)) for lack in _lacks(log, found, options)]
-    correction = read_correction(options, log.path.name)
-    late_ns = {c.name: correction.late_ns(c.name) for _, c in rig if correction is not None and c is not None}
     whole = [(topics, camera) for topics, camera in rig if camera is not None]
+    for topics, camera in whole:
+        if camera.depth_scale is not None and topics.depth in watch.images:
+            watch.images[topics.depth].rescale(camera.depth_scale)
+    findings = _findings(log, options, watch, found, rig)
+    correction = read_correction(options, log.path.name)
+    late_ns = {c.name: correction.late_ns(c.name) for _, c in whole if correction is not None}
     frames = {c.name: reduced_frames(t, c, watch.images, found.tf, options, late_ns) for t, c in whole}
     of_states = log_states(found, options, model)
     if correction is not None:
@@ -359,16 +346,35 @@ def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraT
     return tuple(c for c in cameras if options.cameras is None or c.name in options.cameras)
 
 
-def _lacks(log: RawLog, found: Survey, options: SourceOptions) -> list[str]:
-    if not found.num_messages:
+def _findings(
+    log: RawLog,
+    options: SourceOptions,
+    watch: LogWatch,
+    found: Survey,
+    rig: Sequence[tuple[CameraTopics, Camera | None]],
+) -> list[Finding]:
+    where, cameras = log.path.name, [topics for topics, _ in rig]
+    used = {name for camera in cameras for name in (camera.color, camera.depth)}
+    unused = watch.images.keys() - used if cameras else set()
+    findings = [
+        *damage_findings(where, found.damage.notes),
+        *(note("remark", where, text, value=num) for text, num in found.damage.remarks.items()),
+        *file_findings(watch.spans),
+        *_time_findings(watch, found, cameras, unused),
+        *_image_findings(watch, unused, {t.topic.name for t in image_topics(found, "unlike")}),
+        *calibration_findings(found, cameras, watch.changed_infos),
+        *tf_findings(found, cameras, options),
+        *chain.from_iterable(camera_findings(found, topics, camera, options) for topics, camera in rig),
+    ]
+    if any(finding.code == "pose-missing" for finding in findings):
+        findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
+    if found.num_messages:
+        lacks = [lack for lack in missing(log, found, options) if not any(words in lack for words in SAID)]
+    else:
         damage = "nothing usable before the damage" if found.damage.count else "the log holds no messages"
-        return [f"{damage}; record it again, or give another file"]
-    return [lack for lack in missing(log, found, options) if not any(words in lack for words in SAID)]
-
-
-def _split_remedy(lack: str) -> tuple[str, str]:
-    what, _, remedy = lack.rpartition("; ")
-    return (what, remedy) if what else (remedy, "")
+        lacks = [f"{damage}; record it again, or give another file"]
+    parts = (lack.rpartition("; ") for lack in lacks)
+    return [*findings, *(error("missing", where, what or last, last if what else "") for what, _, last in parts)]
 
 
 def _span(found: Survey) -> tuple[int, int]:

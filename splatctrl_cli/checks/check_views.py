@@ -55,13 +55,14 @@ def check_views(
     scaled = [replace(f, depth=f.depth * np.float32(scales.get(f.camera, 1.0))) for f in frames]
     if scales:
         fitted = [_view(frame) for frame in _chosen(scaled)]
-        if _cost(fitted, pairs)[1] > _cost(_move_all(views, moves), pairs)[1]:
+        moved = _moved(views, {move.camera: move.T_camera_corrected for move in moves})
+        if _cost(fitted, pairs)[1] > _cost(moved, pairs)[1]:
             moves = wrong_poses(fitted, pairs)
         else:  # moves explain more
             scales, scaled = {}, list(frames)
     findings = _scale_findings(scales, used) if scales else _overlap_findings(views, pairs, used, is_sure=is_sure)
     findings += [_pose_finding(move, sorted(used)) for move in moves]
-    return findings, scaled, _move_all(scaled, moves)
+    return findings, scaled, _moved(scaled, {move.camera: move.T_camera_corrected for move in moves})
 
 
 def are_far(frames: Sequence[RgbdFrame]) -> bool:
@@ -103,11 +104,11 @@ def wrong_poses(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) ->
         if not found:
             break
         before = _cost(views, pairs)
-        costs = [_cost(_moved(views, camera, T), pairs) for camera, T in found]
+        costs = [_cost(_moved(views, {camera: T}), pairs) for camera, T in found]
         best = int(np.argmin([cost for cost, _ in costs]))
         camera, T = found[best]
         its = _with(views, pairs, camera)
-        own_before, own_after = _cost(views, its)[0], _cost(_moved(views, camera, T), its)
+        own_before, own_after = _cost(views, its)[0], _cost(_moved(views, {camera: T}), its)
         move = Move(
             camera=camera,
             T_camera_corrected=T,
@@ -118,12 +119,10 @@ def wrong_poses(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) ->
         )
         is_large = move.distance > limits.MOVE_METRES or move.angle > limits.MOVE_DEGREES
         is_dear = move.after > (1 - limits.MOVE_CHEAPER) * move.before
-        if not is_large or is_dear or own_after[1] < limits.MOVE_GOOD_SHARE:
-            break
-        if costs[best][0] >= before[0]:
+        if not is_large or is_dear or own_after[1] < limits.MOVE_GOOD_SHARE or costs[best][0] >= before[0]:
             break
         moves.append(move)
-        views = _moved(views, camera, T)
+        views = _moved(views, {camera: T})
     return moves
 
 
@@ -316,7 +315,7 @@ def _fitted(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera
     is_far = _cost(views, _with(views, pairs, camera))[1] < limits.MOVE_GOOD_SHARE
     starts = [limits.MOVE_WIDTHS, (*limits.MOVE_WIDE, *limits.MOVE_WIDTHS)] if is_far else [limits.MOVE_WIDTHS]
     found = [T for widths in starts if (T := _descend(views, pairs, camera, widths)) is not None]
-    return min(found, key=lambda T: _cost(_moved(views, camera, T), pairs)[0], default=None)
+    return min(found, key=lambda T: _cost(_moved(views, {camera: T}), pairs)[0], default=None)
 
 
 def _descend(
@@ -326,7 +325,7 @@ def _descend(
     its = _with(views, pairs, camera)
     T = np.eye(4)
     for width in widths:
-        moved = _moved(views, camera, T)
+        moved = _moved(views, {camera: T})
         H, g, total = np.zeros((6, 6)), np.zeros(6), 0.0
         for i, j in its:
             rows, residual = _rows(moved[i], moved[j], camera)
@@ -364,12 +363,6 @@ def _cost(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> tuple
     return (total / num, num_good / num) if num >= limits.VIEWS_LANDED else (limits.MOVE_CUT, 0.0)
 
 
-def _moved(views: Sequence[DepthView], camera: str, T: Float64) -> list[DepthView]:
-    return [
-        replace(view, T_world_camera=view.T_world_camera @ T) if view.camera == camera else view for view in views
-    ]
-
-
-def _move_all(frames: Sequence[_Posed], moves: Sequence[Move]) -> list[_Posed]:
-    by_camera = {move.camera: move.T_camera_corrected for move in moves}
-    return [replace(f, T_world_camera=f.T_world_camera @ by_camera.get(f.camera, np.eye(4))) for f in frames]
+def _moved(frames: Sequence[_Posed], moves: Mapping[str, Float64]) -> list[_Posed]:
+    """Frames of some cameras moved, by T_camera_corrected of each."""
+    return [replace(f, T_world_camera=f.T_world_camera @ moves.get(f.camera, np.eye(4))) for f in frames]

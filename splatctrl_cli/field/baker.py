@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import KERNEL_OF, KERNELS, SphereField, device_field
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
@@ -50,8 +50,11 @@ class Baker:
         Raises as `Spheres.of`; UsageError for unknown channels, or without sdf.
         """
         unknown = [name for name in channels if name not in CHANNELS]
-        if unknown or "sdf" not in channels:
-            raise UsageError(f"channels: expected sdf and some of {', '.join(CHANNELS)}, got {', '.join(channels)}")
+        refuse_if(
+            unknown or "sdf" not in channels,
+            f"channels: expected sdf and some of {', '.join(CHANNELS)}, got {', '.join(channels)}",
+            error=UsageError,
+        )
         self.layout, self.config, self.threads = layout, config, threads
         self.channels = tuple(name for name in CHANNELS if name in channels)
         self.labels = splats.labels

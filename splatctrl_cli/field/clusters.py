@@ -1,16 +1,18 @@
-"""Splats of a field as spheres, checked and clustered once.
+"""Spheres of a scene's field: chosen by label, checked and clustered once.
 
 A space-filling curve sorts points into clusters of 16, and these into groups of 16, with boxes.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_if
 from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Offsets
-from splatctrl_cli.records import Box, Float32, Float64, Floats, Index, UInt8
+from splatctrl_cli.records import Box, Float32, Float64, Floats, Index, Label, SplatSet, UInt8
+from splatctrl_cli.voxels import Balls
 
 _BITS = 10  # per coordinate of a Hilbert code
 _GROUPS = 8  # their number is a multiple of this
@@ -150,12 +152,15 @@ def not_finite(points: Float64) -> InputError:
 
 def _check(centers: ArrayLike, radii: ArrayLike) -> tuple[Float64, Float64]:
     center_array, radius_array = np.asarray(centers, dtype=np.float64), np.asarray(radii, dtype=np.float64)
-    if center_array.ndim != 2 or center_array.shape[1] != 3 or radius_array.shape != center_array.shape[:1]:
-        raise InputError(
-            f"splats: expected centres (N, 3) and radii (N,), got {center_array.shape}, {radius_array.shape}"
-        )
-    if not len(center_array):
-        raise NotEvaluableError("splats: expected at least one to measure distances to, got none")
+    refuse_if(
+        center_array.ndim != 2 or center_array.shape[1] != 3 or radius_array.shape != center_array.shape[:1],
+        f"splats: expected centres (N, 3) and radii (N,), got {center_array.shape}, {radius_array.shape}",
+    )
+    refuse_if(
+        not len(center_array),
+        "splats: expected at least one to measure distances to, got none",
+        error=NotEvaluableError,
+    )
     for name, is_bad in (
         ("a finite centre", ~np.isfinite(center_array).all(axis=1)),
         ("a finite radius of 0 m or more", ~(np.isfinite(radius_array) & (radius_array >= 0))),
@@ -167,3 +172,71 @@ def _check(centers: ArrayLike, radii: ArrayLike) -> tuple[Float64, Float64]:
                 f"splat {i}: expected {name}, got {got}", remedy=f"{int(is_bad.sum())} such splats in all"
             )
     return center_array, radius_array
+
+
+DEFAULT_LABELS = frozenset({Label.OBJECT, Label.HUMAN})
+NO_SPLAT = -1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObstacleSpheres:
+    """N spheres of a field, balls last; index (N,) of splats, NO_SPLAT for balls."""
+
+    splats: SplatSet
+    index: Index
+
+    @property
+    def num_unrepresented(self) -> int:
+        return int(np.count_nonzero(self.index == NO_SPLAT))
+
+
+def obstacle_spheres(
+    splats: SplatSet, balls: Balls | None, labels: Collection[Label] = DEFAULT_LABELS
+) -> ObstacleSpheres:
+    """Splats and balls with one of `labels`. Raises as `field_splats` without such balls."""
+    values = [int(label) for label in labels]
+    is_chosen = np.isin(splats.labels, values)
+    kept = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)
+    if balls is None or not kept.any():
+        return ObstacleSpheres(splats=field_splats(splats, labels), index=np.flatnonzero(is_chosen))
+    check_labels(splats)
+    count, chosen = int(kept.sum()), splats.select(is_chosen)
+    added = SplatSet(
+        centers=balls.centers[kept],
+        radii=np.full(count, balls.radius, np.float32),
+        colors=np.full((count, 3), 0.5, np.float32),
+        opacities=np.ones(count, np.float32),
+        labels=balls.labels[kept],
+        density=np.zeros(count, np.float32),
+    )
+    return ObstacleSpheres(
+        splats=chosen.joined(added), index=np.concatenate([np.flatnonzero(is_chosen), np.full(count, NO_SPLAT)])
+    )
+
+
+def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -> SplatSet:
+    """Splats with one of `labels`, in order; by default without the robot.
+
+    Raises NotEvaluableError without any, InputError for an unknown label.
+    """
+    check_labels(splats)
+    kept = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
+    if not len(kept):
+        names = ", ".join(label.name.lower() for label in sorted(labels))
+        raise NotEvaluableError(
+            f"splats: none of {len(splats)} is labelled {names}",
+            remedy="give a scene that has some; --include takes other labels",
+        )
+    return kept
+
+
+def check_labels(splats: SplatSet) -> None:
+    """Raise InputError for an unknown label."""
+    unknown = ~np.isin(splats.labels, [int(label) for label in Label])
+    if unknown.any():
+        i = int(np.argmax(unknown))
+        raise InputError(f"splat {i}: expected a label of 0, 1 or 2, got {splats.labels[i]}")
+
+
+def label_counts(splats: SplatSet) -> dict[str, int]:
+    return {label.name.lower(): int(np.count_nonzero(splats.labels == label)) for label in Label}

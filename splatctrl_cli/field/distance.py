@@ -3,13 +3,12 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import FieldConfig, fixed
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.grid_cells import RESOLUTION
 from splatctrl_cli.field.weights import METHODS, Kernel, share_of_loss
@@ -250,8 +249,7 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
     crosses no sphere. Points at or behind the zero level, which Matern's field has before the spheres
     (`slabs.planar_zero_level`), stay. Raises UsageError for less than one step.
     """
-    if steps < 1:
-        raise UsageError(f"marching: expected at least 1 step, got {steps}")
+    refuse_if(steps < 1, f"marching: expected at least 1 step, got {steps}", error=UsageError)
     hit = np.array(points, dtype=np.float64)
     walked = np.zeros(len(hit))
     rest, gradient = field.query(hit)
@@ -272,11 +270,6 @@ class OnDevice:
         self.spheres, kernel = spheres, KERNEL_OF[config.distance]
         kernels = {} if kernel is None else {kernel: KERNELS[kernel](spheres, config, threads=threads)}
         self.field = device_field(spheres, kernels, config, device)
-
-    @classmethod
-    def of(cls, centers: ArrayLike, radii: ArrayLike, config: FieldConfig, device: Memory) -> Self:
-        """Make the field over (N, 3), (N,) [m]. Raises as `Spheres.of`."""
-        return cls(Spheres.of(centers, radii), config, device)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance and gradient, as in `DistanceField.query`."""

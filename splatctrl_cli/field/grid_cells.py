@@ -1,16 +1,28 @@
-"""A distance grid: layout, memory, what cameras saw in it, and its distance field."""
+"""A distance grid: layout, memory, what cameras saw in it, its distance field, and never-seen cells."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import distance_transform_cdt, distance_transform_edt
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.field.clusters import checked_points
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.records import Box, DistanceGrid, Float32, Float64, SplatSet, UInt8
+from splatctrl_cli.records import (
+    Bool,
+    Box,
+    Columns,
+    DistanceGrid,
+    Float32,
+    Float64,
+    SplatSet,
+    UInt8,
+    Values,
+)
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
@@ -36,13 +48,15 @@ class GridLayout:
 
         Raises UsageError for a voxel or box without size.
         """
-        if not (np.isfinite(voxel) and voxel > 0):
-            raise UsageError(f"voxel: expected a size above 0 m, got {voxel}")
+        refuse_if(
+            not (np.isfinite(voxel) and voxel > 0), f"voxel: expected a size above 0 m, got {voxel}", error=UsageError
+        )
         extent = box.upper - box.lower
-        if not np.isfinite(extent).all() or not (extent > 0).all():
-            raise UsageError(
-                f"box: expected lower < upper along each axis, got {box.lower.tolist()}, {box.upper.tolist()}"
-            )
+        refuse_if(
+            not np.isfinite(extent).all() or not (extent > 0).all(),
+            f"box: expected lower < upper along each axis, got {box.lower.tolist()}, {box.upper.tolist()}",
+            error=UsageError,
+        )
         x, y, z = (max(2, int(np.ceil(side / voxel - 1e-6)) + 1) for side in extent)
         return cls(origin=box.lower.copy(), voxel=voxel, shape=(x, y, z))
 
@@ -94,10 +108,12 @@ def check_memory(layout: GridLayout, bytes_per_cell: int) -> None:
 def check_room(what: str, needed: int, remedy: str) -> None:
     """Raise UsageError if `what` needs more memory [bytes] than is free."""
     free = available_memory()
-    if needed > free:
-        raise UsageError(
-            f"{what} needs {needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB is free", remedy=remedy
-        )
+    refuse_if(
+        needed > free,
+        f"{what} needs {needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB is free",
+        remedy=remedy,
+        error=UsageError,
+    )
 
 
 def available_memory() -> int:
@@ -148,14 +164,17 @@ class GridField:
 
     def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
         """Raises InputError without the channel or for one cell along an axis."""
-        if channel not in grid.channels:
-            raise InputError(f"distance grid: no channel {channel!r}", remedy=f"it has: {', '.join(grid.channels)}")
+        refuse_if(
+            channel not in grid.channels,
+            f"distance grid: no channel {channel!r}",
+            remedy=f"it has: {', '.join(grid.channels)}",
+        )
         self._values = np.ascontiguousarray(grid.channels[channel], dtype=np.float32)
-        if self._values.ndim != 3 or min(self._values.shape) < 2:
-            raise InputError(
-                f"distance grid: expected at least 2 cells along each axis, got {self._values.shape}",
-                remedy="bake a larger box or a smaller voxel",
-            )
+        refuse_if(
+            self._values.ndim != 3 or min(self._values.shape) < 2,
+            f"distance grid: expected at least 2 cells along each axis, got {self._values.shape}",
+            remedy="bake a larger box or a smaller voxel",
+        )
         self._has_blank = bool(np.isnan(self._values).any())
         bound = grid.channels.get("bound")
         self._bound = None if bound is None else np.ascontiguousarray(bound, dtype=np.float32)
@@ -194,3 +213,69 @@ def exact_channel(grid: DistanceGrid) -> Float32:
     if "bound" not in grid.channels or not isinstance(margin, float):
         raise InputError("distance grid: no channel 'hard' or 'bound'", remedy="bake it with --channels sdf,bound")
     return np.asarray(grid.channels["bound"], dtype=np.float32) + np.float32(margin)
+
+
+BLANKED = ("sdf", "gradient", "probability")  # by policy nan
+ROUNDING = 1e-6  # [m], and share of a distance: rounding of float32
+BOUND = (
+    "no point of the cell is nearer to a splat's sphere or a never-seen cell; "
+    "bound + bound_margin is the lesser of hard and the distance to never-seen cells at its centre"
+)
+
+Channels = dict[str, Values]
+
+
+def blank(channels: Mapping[str, Values], is_unknown: Bool) -> Channels:
+    """Set distance, gradient, probability (X, Y, Z) to NaN where unknown."""
+    blanked = dict(channels)
+    for name in BLANKED:
+        if name in channels:
+            where = is_unknown if channels[name].ndim == 3 else is_unknown[..., None]
+            blanked[name] = np.where(where, np.float32(np.nan), channels[name])
+    return blanked
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cubes(Columns):
+    """The never-seen cells (X, Y, Z) of a grid as solid cubes.
+
+    distance: lower bound [m] of the signed distance from cell centres; away (..., 3): unit vectors of its growth.
+    """
+
+    is_unknown: Bool
+    distance: Float32
+    away: Float32
+
+    @classmethod
+    def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
+        """Bound the distances in a grid with known and unknown cells.
+
+        Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance minus
+        half a cell. Inside: half a cell minus the distance to the nearest known centre.
+        """
+        here = np.indices(is_unknown.shape, dtype=np.int32)
+        distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
+        away = (here - nearest).astype(np.float32)
+        lowest = np.maximum(distance - HALF_DIAGONAL, distance_transform_cdt(~is_unknown, "chessboard") - 0.5)
+        distance, nearest = distance_transform_edt(is_unknown, return_indices=True)
+        np.copyto(away, nearest - here, where=is_unknown, casting="same_kind")
+        lowest = np.where(is_unknown, 0.5 - distance, lowest)
+        away /= np.sqrt(np.square(away).sum(axis=0))
+        return cls(
+            is_unknown=is_unknown,
+            distance=(voxel * lowest - ROUNDING * (1.0 + voxel * np.abs(lowest))).astype(np.float32),
+            away=np.moveaxis(away, 0, -1),
+        )
+
+    def join(self, channels: Mapping[str, Values], bound_margin: float) -> tuple[Channels, int]:
+        """Channels of the nearer of field and cubes, and the number of changed cells."""
+        joined = dict(channels)
+        is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))
+        joined["sdf"] = np.where(is_nearer, self.distance, channels["sdf"])
+        if "gradient" in channels:
+            joined["gradient"] = np.where(is_nearer[..., None], self.away, channels["gradient"])
+        if "bound" in channels:
+            joined["bound"] = np.minimum(channels["bound"], self.distance - np.float32(bound_margin))
+        if "probability" in channels:
+            joined["probability"] = np.where(self.is_unknown, np.float32(1.0), channels["probability"])
+        return joined, int(np.count_nonzero(is_nearer))

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from splatctrl_cli.config import FieldConfig, fixed
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres, checked_points
 from splatctrl_cli.field.distance import GpdfField
 from splatctrl_cli.field.weights import share_of_loss
@@ -52,11 +52,12 @@ class PaperProbability:
 
     def __init__(self, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> None:
         """Raises UsageError for weights cg: eq. 13 would need a solution per point."""
-        if config.weights == "cg":
-            raise UsageError(
-                "field.probability = paper: expected field.weights = rowsum or voxel, got cg",
-                remedy="set field.probability = calibrated, or other weights",
-            )
+        refuse_if(
+            config.weights == "cg",
+            "field.probability = paper: expected field.weights = rowsum or voxel, got cg",
+            remedy="set field.probability = calibrated, or other weights",
+            error=UsageError,
+        )
         self._gpdf = GpdfField(spheres, config, threads=threads)
         # k^2 is a Matern kernel too, of half the length: sum_i w_i k^2 = exp(-2 g / l), g the field of that kernel.
         self._half = 0.5 * self._gpdf.kernel.length

@@ -1,8 +1,7 @@
 """Statistics of a baked grid."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -18,91 +17,49 @@ BIN = 0.05  # bin k of the histogram is about k times this length
 NUM_BINS = 41  # about 0 to 2; the last one includes longer ones
 
 
-@dataclass(frozen=True, kw_only=True)
-class GradientLengths:
-    """Gradient lengths: 1 for a distance (Eikonal equation), less where a kernel field is flat.
+def grid_statistics(grid: DistanceGrid) -> dict[str, Any]:
+    """Statistics of a grid, as in ``field.json``; None or empty without channels for it.
 
-    histogram: bin k counts lengths within half a `bin_width` of k times that, the last also longer ones;
-    share_near_one: within 0.05 of 1.
+    A few planes at a time: channels may be memory maps. num_blank: sdf NaN; num_inside: sdf <= 0; lowest, highest: of
+    sdf [m]; observed: cells by state; hard_share: of cells whose sdf is exact; never_seen_share: neither seen nor
+    swept. excess, by kernel field: count and share of cells where it exceeds the exact distance, and the largest [m].
+
+    gradient: its lengths, 1 for a distance (Eikonal equation), less where a kernel field is flat. histogram: bin k
+    counts lengths within half a `bin_width` of k times that, the last also longer ones; share_near_one: within 0.05
+    of 1.
     """
-
-    histogram: tuple[int, ...]
-    bin_width: float
-    largest: float
-    mean: float
-    share_near_one: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Excess:
-    """Number and share of cells where a kernel field exceeds the exact distance; most [m]."""
-
-    count: int
-    share: float
-    largest: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class GridStatistics:
-    """Statistics of a grid; None or empty without channels for it.
-
-    num_blank: sdf NaN; num_inside: sdf <= 0; lowest, highest: of sdf [m]; observed: cells by state; hard_share: of
-    cells whose sdf is exact; excess: by kernel field.
-    """
-
-    num_cells: int
-    num_blank: int
-    num_inside: int
-    lowest: float | None
-    highest: float | None
-    observed: Mapping[str, int] | None
-    hard_share: float | None
-    excess: Mapping[str, Excess]
-    gradient: GradientLengths | None
-
-    @property
-    def never_seen_share(self) -> float | None:
-        """Share of cells neither seen nor swept."""
-        return None if self.observed is None else self.observed["never_seen"] / self.num_cells
-
-    def as_dict(self) -> dict[str, object]:
-        """Plain values, as in ``field.json``."""
-        return {**asdict(self), "never_seen_share": self.never_seen_share}
-
-
-def grid_statistics(grid: DistanceGrid) -> GridStatistics:
-    """Statistics of a grid, a few planes at a time: channels may be memory maps."""
     sums, most = dict[str, Any](), dict[str, float]()
     for part in _parts(grid):
         counted, largest = _measure(part)
         sums |= {name: value + sums.get(name, 0) for name, value in counted.items()}
         most |= {name: max(value, most.get(name, -np.inf)) for name, value in largest.items()}
     num, num_lengths = sums["cells"], 0 if "lengths" not in sums else int(sums["lengths"].sum())
-    return GridStatistics(
-        num_cells=num,
-        num_blank=sums["blank"],
-        num_inside=sums["inside"],
-        lowest=-most["lowest"] if "lowest" in most else None,
-        highest=most.get("highest"),
-        observed={state.name.lower(): int(sums["states"][state]) for state in VoxelState}
-        if "states" in sums
-        else None,
-        hard_share=sums["hard"] / num if "hard" in sums else None,
-        excess={
-            name: Excess(count=sums[name], share=sums[name] / num, largest=max(most[name], 0.0))
+    has_states = "states" in sums
+    observed = {state.name.lower(): int(sums["states"][state]) for state in VoxelState} if has_states else None
+    return {
+        "num_cells": num,
+        "num_blank": sums["blank"],
+        "num_inside": sums["inside"],
+        "lowest": -most["lowest"] if "lowest" in most else None,
+        "highest": most.get("highest"),
+        "observed": observed,
+        "hard_share": sums["hard"] / num if "hard" in sums else None,
+        "excess": {
+            name: {"count": sums[name], "share": sums[name] / num, "largest": max(most[name], 0.0)}
             for name in KERNELS
             if name in sums
         },
-        gradient=None
+        "gradient": None
         if not num_lengths
-        else GradientLengths(
-            histogram=tuple(int(count) for count in sums["lengths"]),
-            bin_width=BIN,
-            largest=most["length"],
-            mean=sums["length"] / num_lengths,
-            share_near_one=sums["near_one"] / num_lengths,
-        ),
-    )
+        else {
+            "histogram": tuple(int(count) for count in sums["lengths"]),
+            "bin_width": BIN,
+            "largest": most["length"],
+            "mean": sums["length"] / num_lengths,
+            "share_near_one": sums["near_one"] / num_lengths,
+        },
+        "never_seen_share": None if observed is None else observed["never_seen"] / num,
+    }
 
 
 def _measure(part: DistanceGrid) -> tuple[dict[str, Any], dict[str, float]]:

@@ -1,54 +1,43 @@
 """Bakes of a grid, whole or in slabs of x-planes, with headers and health."""
 
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig, fixed
-from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker, Planes
-from splatctrl_cli.field.grid_cells import GridLayout, check_memory, check_room, observed_planes
-from splatctrl_cli.field.unknown import BOUND, DEFAULT_LABELS, Cubes, blank, field_splats, label_counts
+from splatctrl_cli.field.clusters import DEFAULT_LABELS, field_splats, label_counts
+from splatctrl_cli.field.grid_cells import BOUND, Cubes, GridLayout, blank, check_memory, check_room, observed_planes
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Floats, Label, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 
-@dataclass(frozen=True, kw_only=True)
-class FieldHealth:
-    """Ratios that decide a field's quality, with warnings.
+def field_health(centers: Floats, radii: Floats, length: float, *, kernels: Collection[str]) -> dict[str, Any]:
+    """Ratios of splats (N, 3), (N,) [m] that decide a field's quality, with warnings, as in the header.
 
-    spacing [m]: `median_spacing`; radius: median [m]; planar_zero_level [m]: of the kernel field.
+    For kernels (se, gpdf) of this length scale [m]. spacing [m]: `median_spacing`; radius: median [m];
+    planar_zero_level [m]: of the kernel field.
     """
-
-    spacing: float
-    radius: float
-    spacing_per_length: float
-    radius_per_spacing: float | None
-    radius_per_length: float
-    planar_zero_level: float
-    warnings: tuple[str, ...]
-
-
-def field_health(centers: Floats, radii: Floats, length: float, *, kernels: Collection[str]) -> FieldHealth:
-    """Health of splats (N, 3), (N,) [m] for kernels (se, gpdf) of this length scale [m]."""
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
-    return FieldHealth(
-        spacing=spacing,
-        radius=radius,
-        spacing_per_length=spacing / length,
-        radius_per_spacing=radius / spacing if spacing > 0 else None,
-        radius_per_length=radius / length,
-        planar_zero_level=zero_level,
-        warnings=(
+    return {
+        "spacing": spacing,
+        "radius": radius,
+        "spacing_per_length": spacing / length,
+        "radius_per_spacing": radius / spacing if spacing > 0 else None,
+        "radius_per_length": radius / length,
+        "planar_zero_level": zero_level,
+        "warnings": (
             *_warnings(spacing, radius, length, zero_level, kernels),
             *_set_warnings(centers, radii, length, has_kernel=bool(kernels)),
         ),
-    )
+    }
 
 
 def _warnings(
@@ -161,7 +150,7 @@ def field_header(
             "mean": float(chosen.radii.mean(dtype=np.float64)),
             "max": float(chosen.radii.max()),
         },
-        "health": asdict(field_health(chosen.centers, chosen.radii, config.length_scale, kernels=baker.kernels)),
+        "health": field_health(chosen.centers, chosen.radii, config.length_scale, kernels=baker.kernels),
     }
     if baker.probability is not None:
         header |= {"probability": config.probability, "probability_numbers": baker.probability.described()}
@@ -233,11 +222,12 @@ class UnknownSpace:
                 for first, last in slabs(layout, ["gradient"])
             ]
         )
-        if self._is_unknown.all():
-            raise NotEvaluableError(
-                f"field.unknown = {self.policy}: expected a cell that a camera saw, got none of {layout.num_cells}",
-                remedy="bake a scene with an occupancy grid, check --box, or set field.unknown = free",
-            )
+        refuse_if(
+            self._is_unknown.all(),
+            f"field.unknown = {self.policy}: expected a cell that a camera saw, got none of {layout.num_cells}",
+            remedy="bake a scene with an occupancy grid, check --box, or set field.unknown = free",
+            error=NotEvaluableError,
+        )
         self._cubes: Cubes | None = None
         if self.policy == "obstacle" and self._is_unknown.any():
             remedy = "give a larger --voxel, a smaller --box, or --unknown nan, which needs less"

@@ -20,7 +20,7 @@ from splatctrl_cli.config.fixed import (
     KERNEL_REACH,
     VOXELS_PER_LENGTH,
 )
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.grid_cells import available_memory
 from splatctrl_cli.kernels import field as native
@@ -45,11 +45,12 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
     sampled = _sampled_kernel(kernel, voxel, reach)
     result = 1.0 - _own_terms(share, sampled[reach:, reach:, reach:])
     meetings = [block for block in _blocks(cells, reach) if len(block[1]) > 1]
-    if len(meetings) > MAX_BLOCKS:
-        raise UsageError(
-            f"field.weights = voxel: expected at most {MAX_BLOCKS} blocks of voxels with splats, got {len(meetings)}",
-            remedy="set field.weights = rowsum, which is fast on splats this far apart, or a larger length scale",
-        )
+    refuse_if(
+        len(meetings) > MAX_BLOCKS,
+        f"field.weights = voxel: expected at most {MAX_BLOCKS} blocks of voxels with splats, got {len(meetings)}",
+        remedy="set field.weights = rowsum, which is fast on splats this far apart, or a larger length scale",
+        error=UsageError,
+    )
     transformed = _transformed_kernel(sampled)
     alone = np.ones(len(centers), np.bool_)
     for first, near, own in meetings:
@@ -147,12 +148,13 @@ def solve_process(
     np.maximum.at(largest, group, log_values)
     np.minimum.at(smallest, group, log_values)
     spread = float((largest - smallest).max())
-    if spread > CG_MAX_SPREAD:
-        raise UsageError(
-            f"field.weights = cg: expected radii that differ by at most {CG_MAX_SPREAD:g} length scales between "
-            f"splats within {KERNEL_REACH} of each other, got {spread:.1f}",
-            remedy="set a larger field.length_scale, or field.weights = rowsum",
-        )
+    refuse_if(
+        spread > CG_MAX_SPREAD,
+        f"field.weights = cg: expected radii that differ by at most {CG_MAX_SPREAD:g} length scales between "
+        f"splats within {KERNEL_REACH} of each other, got {spread:.1f}",
+        remedy="set a larger field.length_scale, or field.weights = rowsum",
+        error=UsageError,
+    )
     tolerance = max(CG_TOLERANCE * float(np.exp(-spread)), CG_FLOOR)
     scaled, num_iterations, residual = conjugate_gradients(matrix, np.exp(log_values - largest[group]), tolerance)
     return scaled, largest[group], num_iterations, residual
@@ -200,12 +202,13 @@ def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: 
     tree = cKDTree(centers)
     num_pairs = int(tree.count_neighbors(tree, KERNEL_REACH * length))
     needed, free = BYTES_PER_PAIR * num_pairs, available_memory()
-    if needed > free:
-        raise UsageError(
-            f"field.weights = cg: {num_pairs} pairs of splats within {KERNEL_REACH} length scales need "
-            f"{needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB is free",
-            remedy="set a smaller field.length_scale, or field.weights = rowsum",
-        )
+    refuse_if(
+        needed > free,
+        f"field.weights = cg: {num_pairs} pairs of splats within {KERNEL_REACH} length scales need "
+        f"{needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB is free",
+        remedy="set a smaller field.length_scale, or field.weights = rowsum",
+        error=UsageError,
+    )
     pairs = tree.query_pairs(KERNEL_REACH * length, output_type="ndarray").astype(np.int32)
     distance = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
     upper = csr_array((kernel(distance), (pairs[:, 0], pairs[:, 1])), shape=(len(centers), len(centers)))
@@ -275,8 +278,7 @@ def voxel_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) 
 def process_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
     """Solve eq. 8, ``M = (K + noise I)^-1 y``: weights of either sign.
 
-    Matern: y is ``k_d(-r)``, ``w_i = M_i / k_d(-r_i)``. Gaussian: y is 1, ``w = M``: ``k_d(-r) = k_d(r)`` loses the
-    radius's sign.
+    Matern: y is ``k_d(-r)``, ``w_i = M_i / k_d(-r_i)``. Gaussian: y is 1, ``w = M``.
     """
     log_values = spheres.radii / kernel.length if kernel.is_matern else np.zeros(len(spheres.radii))
     scaled, log_scale, num_iterations, residual = solve_process(

@@ -187,17 +187,6 @@ def output_path(
     It also does so for a folder that no command wrote, another writer, or an unwritable parent. Raises WriteError if
     `is_write_failure`; other errors pass.
     """
-    with refuse_faults(
-        lambda error: f"{path}: cannot be written: {error.strerror}",
-        OSError,
-        remedy="give another --out",
-        error=UsageError,
-    ):
-        path = follow_link(path)
-        _check_replaceable(path, is_folder=is_folder)
-        _check_not_there(path, force=force)
-        partial = partial_path(path)
-        partial.parent.mkdir(parents=True, exist_ok=True)
 
     def can_go_on() -> bool:
         return checkpoint is not None and (partial / checkpoint).is_file()
@@ -209,6 +198,11 @@ def output_path(
             remedy="give another --out",
             error=UsageError,
         ):
+            path = follow_link(path)
+            _check_replaceable(path, is_folder=is_folder)
+            _check_not_there(path, force=force)
+            partial = partial_path(path)
+            partial.parent.mkdir(parents=True, exist_ok=True)
             stack.enter_context(held(partial, is_folder=is_folder))
             is_resumed = resume and can_go_on()
             if is_folder and not is_resumed:
@@ -391,9 +385,7 @@ def sha256(path: Path) -> str:
 
 
 def plain(value: object) -> object:
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return str(value)
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def finite(value: float) -> float | None:

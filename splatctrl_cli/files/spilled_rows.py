@@ -148,6 +148,4 @@ def absent(num: int, width: int) -> Rows:
 
 
 def scaled(rows: Rows, factor: float) -> Rows:
-    if factor == 1.0:
-        return rows
-    return Rows(RowFile(rows.shape[1:], (block * factor for block in blocks_of(rows))))
+    return rows if factor == 1.0 else Rows(RowFile(rows.shape[1:], (block * factor for block in blocks_of(rows))))

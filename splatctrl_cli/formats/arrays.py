@@ -44,8 +44,7 @@ def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) 
                 if isinstance(array, tuple):
                     header = {"descr": dtype, "fortran_order": False, "shape": shape}
                     np.lib.format.write_array_header_1_0(stream, header)
-                    for piece in array[2]():
-                        stream.write(piece.tobytes())
+                    stream.writelines(piece.tobytes() for piece in array[2]())
                 else:
                     np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
 
@@ -138,11 +137,11 @@ class ArrayFile(ABC):
 
     @abstractmethod
     def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
-        """Shape and dtype, None if missing. Raises InputError if unreadable."""
+        """Shape and dtype, None if missing."""
 
     @abstractmethod
     def _blocks(self, name: str) -> Iterator[Array]:
-        """Yield about `BLOCK` rows at a time. Raises InputError if unreadable."""
+        """Yield about `BLOCK` rows at a time."""
 
     def columns(self, names: Sequence[str]) -> Rows:
         """Arrays side by side as columns (T, K).
@@ -265,8 +264,7 @@ class NpzFile(ArrayFile):
 
 def _read(stream: IO[bytes], num: int) -> bytes:
     content = stream.read(num)
-    if len(content) < num:
-        raise EOFError(f"expected {num} bytes, got {len(content)}")
+    refuse_if(len(content) < num, f"expected {num} bytes, got {len(content)}", error=EOFError)
     return content
 
 

@@ -54,11 +54,8 @@ def _jpeg_head(data: bytes) -> ImageHead | None:
     at, head = 2, None
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
-        if marker == 0xFF:  # a byte of filling
-            at += 1
-            continue
-        if marker in _JPEG_BARE:
-            at += 2
+        if marker == 0xFF or marker in _JPEG_BARE:  # a byte of filling, or a marker
+            at += 1 if marker == 0xFF else 2
             continue
         length = int.from_bytes(data[at + 2 : at + 4], "big")
         if length < 2 or marker == 0xD9:
@@ -109,18 +106,16 @@ def decode_file(data: bytes, *, color: bool) -> Array | None:
 
     color: 8-bit RGB; else as OpenCV has it, in BGR.
     """
-    if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
-        return None
-    if data.startswith(PNG) and _says_more_than_it_holds(data):
-        return None
-    if data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"):  # a WebP, and its length
+    if (
+        not data
+        or any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS)
+        or (data.startswith(PNG) and _says_more_than_it_holds(data))
+        or (data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"))  # a WebP, and its length
+    ):
         return None
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION if color else cv2.IMREAD_UNCHANGED
-    buffer = np.frombuffer(data, dtype=np.uint8)
-    if buffer.size == 0:
-        return None
     try:
-        pixels = cv2.imdecode(buffer, flags)
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:
         return None
     return None if pixels is None else np.asarray(pixels)

@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -306,29 +307,24 @@ def _axes(name: str, cells: Sequence[str]) -> list[int] | None:
 
 def _numbers(name: str, block: Sequence[_Line], columns: Sequence[int], num_columns: int) -> Float64:
     i, j, k = columns
-    try:
+    with suppress(ValueError, IndexError):
         points = np.array([(float(row[i]), float(row[j]), float(row[k])) for _, row in block])
-    except (ValueError, IndexError):
-        raise _first_wrong(name, block, columns, num_columns) from None
-    if any(len(row) != num_columns for _, row in block) or not (np.abs(points) <= MAX_PLACE).all():
-        raise _first_wrong(name, block, columns, num_columns)
-    return points
-
-
-def _first_wrong(name: str, block: Sequence[_Line], columns: Sequence[int], num_columns: int) -> InputError:
-    for number, row in block:
-        if len(row) != num_columns:
-            return InputError(
-                f"{name}: line {number}: expected {num_columns} columns, got {len(row)}", remedy="correct the line"
-            )
+        if all(len(row) == num_columns for _, row in block) and (np.abs(points) <= MAX_PLACE).all():
+            return points
+    for number, row in block:  # to name the first line that is wrong
+        refuse_if(
+            len(row) != num_columns,
+            f"{name}: line {number}: expected {num_columns} columns, got {len(row)}",
+            remedy="correct the line",
+        )
         for axis, column in zip(AXES, columns, strict=True):
             value = _number(row[column])
-            if value is None or not abs(value) <= MAX_PLACE:
-                return InputError(
-                    f"{name}: line {number}: column {axis}: expected a finite number up to {MAX_PLACE:g} m, got"
-                    f" {row[column].strip()[:40]!r}",
-                    remedy="correct the line, or leave it out",
-                )
+            refuse_if(
+                value is None or not abs(value) <= MAX_PLACE,
+                f"{name}: line {number}: column {axis}: expected a finite number up to {MAX_PLACE:g} m, got"
+                f" {row[column].strip()[:40]!r}",
+                remedy="correct the line, or leave it out",
+            )
     raise AssertionError("expected a line that is wrong")
 
 

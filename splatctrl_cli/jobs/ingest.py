@@ -62,7 +62,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
         if (before := read_identity(partial)) is not None:
             check_same_run(partial, before, identity)
         with stopwatch.stage("write"):
-            summary = write_capture(
+            metrics, num_resumed = write_capture(
                 partial,
                 source,
                 topics=topics,
@@ -70,13 +70,8 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
                 progress=lambda num: progress.log(f"{num} frames") if num % 100 == 0 else None,
                 identity=identity,
             )
-        if summary.num_resumed:
-            progress.log(f"{summary.num_resumed} frames were there already")
-        metrics = {
-            "frames": summary.num_frames,
-            "joint_states": summary.num_joint_states,
-            "loss": asdict(summary.loss),
-        }
+        if num_resumed:
+            progress.log(f"{num_resumed} frames were there already")
         write_run(
             partial,
             command="ingest",

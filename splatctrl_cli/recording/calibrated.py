@@ -97,12 +97,13 @@ class Correction:
             return replace(stored, T_world_camera=T)
         if unit is None or camera.bias:
             return _with_depth(stored, T, lambda: self.depth(stored.camera, stored.depth))
-        scaled = unit * camera.scale
-
-        def counted() -> Float32:
-            return metres(np.rint(stored.depth / np.float32(unit)).astype(np.uint16), scaled)
-
-        return replace(stored, T_world_camera=T, read_depth=counted, depth_unit=scaled)
+        scaled, one = unit * camera.scale, np.float32(unit)
+        return replace(
+            stored,
+            T_world_camera=T,
+            read_depth=lambda: metres(np.rint(stored.depth / one).astype(np.uint16), scaled),
+            depth_unit=scaled,
+        )
 
     def digests(self) -> dict[str, str]:
         return {f"{CALIBRATION}{self.file.name}": sha256(self.file)}
@@ -210,12 +211,11 @@ class ChangedSource(FrameSource):
 
     @cached_property
     def _paths(self) -> dict[str, tuple[list[int], list[Float64]]]:
-        paths: dict[str, tuple[list[int], list[Float64]]] = {}
-        for stamp, camera, T in self.inner.poses():
-            stamps, poses = paths.setdefault(camera, ([], []))
-            stamps.append(stamp)
-            poses.append(T)
-        return paths
+        posed = list(self.inner.poses())
+        return {
+            name: ([stamp for stamp, camera, _ in posed if camera == name], [T for _, c, T in posed if c == name])
+            for name in self.cameras
+        }
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:

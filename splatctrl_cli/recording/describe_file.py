@@ -60,11 +60,11 @@ def _ply(path: Path, head: bytes) -> Summary:
 def _npz(path: Path, _head: bytes) -> Summary:
     with refuse_faults(f"{path}: not a readable .npz", *DAMAGE, OSError, remedy="the file is damaged"):
         with zipfile.ZipFile(path) as archive:
-            arrays = {n: _npy_header(archive, n) for n in archive.namelist() if n.endswith(".npy")}
+            arrays = {n: npy_head(archive.open(n)) for n in archive.namelist() if n.endswith(".npy")}
         refuse_if(not arrays, f"{path}: a zip file without arrays", remedy="expected .npz")
         short = [
             name.removesuffix(".npy")
-            for name, (shape, dtype) in arrays.items()
+            for name, (shape, _, dtype) in arrays.items()
             if (shape == () if dtype.kind in "US" else dtype.kind in "fiub" and prod(shape) <= _LIST_LIMIT)
         ]
         facts: dict[str, object] = {
@@ -73,7 +73,7 @@ def _npz(path: Path, _head: bytes) -> Summary:
         }
     rows = [
         [name.removesuffix(".npy"), "x".join(map(str, shape)) or "-", str(dtype)]
-        for name, (shape, dtype) in arrays.items()
+        for name, (shape, _, dtype) in arrays.items()
     ]
     names = {str(row[0]) for row in rows}
     return Summary(
@@ -82,12 +82,6 @@ def _npz(path: Path, _head: bytes) -> Summary:
         facts=facts,
         grids=(Grid(name="arrays", header=("array", "shape", "dtype"), rows=rows),),
     )
-
-
-def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    with archive.open(name) as stream:
-        shape, _, dtype = npy_head(stream)
-    return shape, dtype
 
 
 def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:

@@ -60,21 +60,15 @@ def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth
     """
     options = options or SourceOptions()
     refuse_if(not path.exists(), f"{path}: no such file or folder", remedy="check the path")
-    return calibrated(_opened(path, options, needs_depth=needs_depth), options)
-
-
-def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSource:
-    if path.suffix == ".toml" or (not is_capture(path) and has_views(path)):
-        source = open_image_folder(path, options) if path.suffix == ".toml" else open_layout(path, options)
-        if needs_depth and (refusal := lacks_depth(source)) is not None:
-            raise refusal
-        return source
-    return CaptureSource(path, options) if is_capture(path) else RosLogSource(open_log(path), options)
-
-
-def lacks_depth(source: FrameSource) -> InputError | None:
-    """The error for missing depth, possible only in image folders."""
-    return source.depth_fault if isinstance(source, ImageFolderSource) and not source.has_depth else None
+    if path.suffix == ".toml":
+        source: FrameSource = open_image_folder(path, options)
+    elif is_capture(path):
+        source = CaptureSource(path, options)
+    else:
+        source = open_layout(path, options) if has_views(path) else RosLogSource(open_log(path), options)
+    if needs_depth and source.depth_fault is not None:
+        raise source.depth_fault
+    return calibrated(source, options)
 
 
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
@@ -235,33 +229,29 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     entries = [path / name for name in names_in(path)[:1000]]
     rows = [[file.name + "/" if file.is_dir() else file.name, *files_below(file)] for file in entries]
     count, size = files_below(path)
-    has_run, is_run = "run.json" in names, "run.json" in names and not field
-    run = describe_file(path / "run.json").facts if is_run else {}
+    is_read = "run.json" in names and (not field or "occupancy.npz" in names)
+    run = describe_file(path / "run.json").facts if is_read else {}
     facts: dict[str, object] = {
         "files": count,
         "bytes": size,
         **({"splats": describe_file(path / "splats.ply").facts} if "splats.ply" in names else {}),
-        **({"space": _known_space(path, has_run=has_run)} if "occupancy.npz" in names else {}),
-        **field,
+        **({"space": _known_space(path, run)} if "occupancy.npz" in names else {}),
         **(
-            {"run": {key: value for key, value in run.items() if key != "config"}} if is_run else {}
-        ),  # `info run.json`
+            field
+            or ({"run": {key: value for key, value in run.items() if key != "config"}} if "run.json" in names else {})
+        ),
     }
     grid = Grid(name="files", header=("name", "files", "bytes"), rows=rows)
     return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,))
 
 
-def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
-    run: Mapping[str, Any] = describe_file(path / "run.json").facts if has_run else {}
-
-    def used(name: str, default: float) -> float:
-        return run_value(run, ("config", "occupancy", name), _probability, default, where=str(path / "run.json"))
-
-    thresholds = OccupancyConfig()
-    low, high = used("free_below", thresholds.free_below), used("occupied_above", thresholds.occupied_above)
-    return known_space(
-        read_occupancy(path / "occupancy.npz"), replace(thresholds, free_below=low, occupied_above=high)
-    )
+def _known_space(path: Path, run: Mapping[str, Any]) -> dict[str, object]:
+    thresholds, where = OccupancyConfig(), str(path / "run.json")
+    used: dict[str, Any] = {
+        name: run_value(run, ("config", "occupancy", name), _probability, getattr(thresholds, name), where=where)
+        for name in ("free_below", "occupied_above")
+    }
+    return known_space(read_occupancy(path / "occupancy.npz"), replace(thresholds, **used))
 
 
 def _probability(value: Any) -> float:
@@ -307,12 +297,12 @@ def _describe_images(path: Path, source: ImageFolderSource, kind: str) -> Summar
         "loss": {name: getattr(loss, name) for name in ("unpaired_color", "unpaired_depth", "without_pose")},
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
-    refusal = lacks_depth(source)
+    fault = "" if source.depth_fault is None else str(source.depth_fault)
     return Summary(
         path=str(path),
         kind=kind,
         facts=facts,
         grids=(grid,),
-        missing=() if refusal is None else (str(refusal)[str(refusal).index("depth is missing") :],),
+        missing=(fault[fault.index("depth is missing") :],) if fault else (),
         notes=tuple(loss.notes),
     )

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config.fixed import COVERED_EDGE, DEFICIT_GAP
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.geometry import face_normals, invert_transform, transform_points
 from splatctrl_cli.records import Bool, Float64, Index, SphereSet
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
@@ -115,16 +115,16 @@ def coverage_of_solids(
     """
     bodies = urdf.rigid_bodies()
     unknown = [link for link in spheres.links if link not in bodies]
-    if unknown:
-        raise InputError(
-            f"sphere set: link '{unknown[0]}' is not in {urdf.path}", remedy=f"links there: {', '.join(urdf.links)}"
-        )
+    refuse_if(
+        unknown,
+        f"sphere set: link '{''.join(unknown[:1])}' is not in {urdf.path}",
+        remedy=f"links there: {', '.join(urdf.links)}",
+    )
     return _measured(pickle.dumps((bodies, dict(solids), spheres, resolution)))
 
 
 @lru_cache(maxsize=32)
 def _measured(packed: bytes) -> CoverageReport:
-    """`coverage_of_solids` of pickled, hashable arguments."""
     bodies, solids, spheres, resolution = pickle.loads(packed)
     leaders = {link: leader for link, (leader, _) in bodies.items()}
     measured = {leaders[link] for link in solids}

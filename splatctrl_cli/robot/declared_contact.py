@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Bool, Box, Floats
 
@@ -104,8 +104,9 @@ def read_declarations(path: Path, links: Collection[str] | None = None) -> Decla
     with refuse_faults(f"{path}: not valid TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=REMEDY):
         document = tomllib.loads(read_text(path, "give --declare a TOML file"))
     unknown = sorted(set(document) - {"carried", "expected_contact"})
-    if unknown:
-        raise InputError(f"{path}: expected [[carried]] and [[expected_contact]], got {unknown[0]}", remedy=REMEDY)
+    refuse_if(
+        unknown, f"{path}: expected [[carried]] and [[expected_contact]], got {''.join(unknown[:1])}", remedy=REMEDY
+    )
     carried, expected = (
         tuple(DeclaredContact(**entry) for entry in _entries(path, document, table, links))
         for table in ("carried", "expected_contact")
@@ -117,8 +118,11 @@ def _entries(
     path: Path, document: dict[str, Any], table: str, links: Collection[str] | None
 ) -> Iterator[dict[str, Any]]:
     entries = document.get(table, [])
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise InputError(f"{path}: {table}: expected entries, got one table", remedy=f"write [[{table}]]")
+    refuse_if(
+        not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries),
+        f"{path}: {table}: expected entries, got one table",
+        remedy=f"write [[{table}]]",
+    )
     kinds: dict[str, type] = {"link": str, "box": list, "start": float, "end": float}
     kinds |= {"reason": str} if table == "expected_contact" else {}
     for index, entry in enumerate(entries):
@@ -135,8 +139,7 @@ def _entries(
                 f"{where}: reason: expected words, got {entry['reason']!r}", remedy="say why it is meant"
             )
         start, end = (_number(where, key, entry[key]) for key in ("start", "end"))
-        if not start < end:
-            raise InputError(f"{where}: expected start < end, got {start:g} and {end:g} s", remedy=REMEDY)
+        refuse_if(not start < end, f"{where}: expected start < end, got {start:g} and {end:g} s", remedy=REMEDY)
         yield {**entry, "box": _box(where, entry["box"]), "start": start, "end": end}
 
 
@@ -144,8 +147,11 @@ def _box(where: str, values: object) -> Box:
     if not isinstance(values, list) or len(values) != 6:
         raise InputError(f"{where}: box: expected [lx, ly, lz, ux, uy, uz] [m], got {values!r}", remedy=REMEDY)
     numbers = np.array([_number(where, "box", value) for value in values])
-    if not np.all(numbers[:3] < numbers[3:]):
-        raise InputError(f"{where}: box: expected its lower corner below its upper one, got {values}", remedy=REMEDY)
+    refuse_if(
+        not np.all(numbers[:3] < numbers[3:]),
+        f"{where}: box: expected its lower corner below its upper one, got {values}",
+        remedy=REMEDY,
+    )
     return Box(lower=numbers[:3], upper=numbers[3:])
 
 

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from splatctrl_cli.config.fixed import CYLINDER_SIDES, SPHERE_ROUNDS
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if, require
 from splatctrl_cli.formats.mesh import TriangleMesh, load_mesh
 from splatctrl_cli.geometry import face_normals, transform_points
 from splatctrl_cli.kernels.surface_image import TriangleTree
@@ -48,10 +48,9 @@ class MeshDistance:
         """
         distance, face, shares = self._tree.closest(points)
         surface = np.einsum("qk,qka->qa", shares, self.mesh.corners[face])
-        is_inside = np.zeros(len(points), dtype=np.bool_)
-        if self.mesh.is_closed:
-            is_inside = np.einsum("qa,qa->q", points - surface, self._normals(face, shares)) < 0
-        return distance, surface, is_inside
+        if not self.mesh.is_closed:
+            return distance, surface, np.zeros(len(points), dtype=np.bool_)
+        return distance, surface, np.einsum("qa,qa->q", points - surface, self._normals(face, shares)) < 0
 
     def distance(self, points: Float64, within: float = np.inf) -> Float64:
         """Distances (Q,), infinite beyond `within`."""
@@ -106,18 +105,16 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
             remedy="write it as a cylinder and spheres",
         )
     found: dict[str, list[Solid]] = {link: [] for link in urdf.collision_links}
-    if not found:
-        raise InputError(
-            f"{urdf.path}: expected collision geometry, got none", remedy="give a URDF with <collision> elements"
-        )
+    refuse_if(
+        not found,
+        f"{urdf.path}: expected collision geometry, got none",
+        remedy="give a URDF with <collision> elements",
+    )
     for shape in urdf.shapes:
         found[shape.link].append(_primitive(shape))
-    meshes: dict[Path, TriangleMesh] = {}
+    load = cache(load_mesh)
     for mesh in urdf.meshes:
-        path = mesh_path(urdf.path, mesh, folders)
-        if path not in meshes:
-            meshes[path] = load_mesh(path)
-        found[mesh.link] += mesh_pieces(mesh, meshes[path])
+        found[mesh.link] += mesh_pieces(mesh, load(mesh_path(urdf.path, mesh, folders)))
     return {link: tuple(solids) for link, solids in found.items()}
 
 
@@ -131,21 +128,18 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
     above = [Path(urdf).resolve().parent, *Path(urdf).resolve().parent.parents]
     if name.startswith("package://"):
         parts = Path(name.removeprefix("package://")).parts
-        if ".." in parts or name.startswith("package:///"):
-            raise InputError(
-                f"{urdf}: link '{mesh.link}': mesh {name} lies outside its package", remedy="correct the path"
-            )
+        refuse_if(
+            ".." in parts or name.startswith("package:///"),
+            f"{urdf}: link '{mesh.link}': mesh {name} lies outside its package",
+            remedy="correct the path",
+        )
         roots = [*folders, *above]
         tried = [root.joinpath(*parts) for root in roots]
         tried += [root.joinpath(*parts[1:]) for root in roots if parts and root.name == parts[0]]
-    elif name.startswith("file://"):
-        tried = [Path(name.removeprefix("file://"))]
     else:
-        tried = [above[0] / name]
-    for path in tried:
-        if path.is_file():
-            return path
-    raise InputError(
+        tried = [Path(name.removeprefix("file://")) if name.startswith("file://") else above[0] / name]
+    return require(
+        next(filter(Path.is_file, tried), None),
         f"{urdf}: link '{mesh.link}': mesh {name} was not found",
         remedy="give the folder that holds its package with --packages DIR"
         if name.startswith("package://")
@@ -193,11 +187,11 @@ def place_mesh(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
     """Mesh in the link's frame. Raises InputError for an implausible length (another unit)."""
     vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
     length = float(np.ptp(vertices, axis=0).max())
-    if not MESH_LENGTHS[0] <= length <= MESH_LENGTHS[1]:
-        raise InputError(
-            f"link '{shape.link}': mesh {shape.filename}: expected a length of 1 mm to 10 m, got {length:g} m",
-            remedy=_unit_words(shape, length),
-        )
+    refuse_if(
+        not MESH_LENGTHS[0] <= length <= MESH_LENGTHS[1],
+        f"link '{shape.link}': mesh {shape.filename}: expected a length of 1 mm to 10 m, got {length:g} m",
+        remedy=_unit_words(shape, length),
+    )
     return replace(
         mesh,
         vertices=vertices,
@@ -240,7 +234,6 @@ def _taken_apart(mesh: TriangleMesh) -> Iterator[TriangleMesh]:
 
 
 def _is_closed(faces: Index) -> bool:
-    """True if each edge joins two faces, in opposite directions."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     forth = np.unique(edges, axis=0)
     return len(forth) == len(edges) and np.array_equal(forth, np.unique(edges[:, ::-1], axis=0))

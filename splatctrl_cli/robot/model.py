@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Box, Float64, Floats, Index, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
@@ -156,9 +156,11 @@ class RobotModel:
 
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
         """Robot with measured coverage; `unknown` explains a missing one."""
-        deficit = np.full(len(self.sphere_set.radii), np.nan)
-        if coverage is not None:
-            deficit = deficit_by_sphere(self.urdf, self.sphere_set, coverage)
+        deficit = (
+            np.full(len(self.sphere_set.radii), np.nan)
+            if coverage is None
+            else deficit_by_sphere(self.urdf, self.sphere_set, coverage)
+        )
         return self._change(coverage=coverage, coverage_unknown=unknown, sphere_deficit=deficit)
 
     @property
@@ -215,21 +217,14 @@ class RobotModel:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Warnings about these spheres, in sentences."""
-        sentences = []
-        if self.bare_links:
-            sentences.append(
-                f"{self.urdf.path.name}: no sphere stands for {', '.join(self.bare_links)}; "
-                "nothing is said of the clearance of these links"
-            )
-        if self.left_out:
-            sentences.append(
-                f"spheres of {', '.join(self.left_out)} are left out: {self.urdf.path.name} has no such link"
-            )
-        if self.are_links_renamed:
-            sentences.append(RENAMED)
-        if self.held:
-            sentences.append(self.held_words)
-        return tuple(sentences)
+        name, bare, lost = self.urdf.path.name, ", ".join(self.bare_links), ", ".join(self.left_out)
+        sentences = (
+            (bare, f"{name}: no sphere stands for {bare}; nothing is said of the clearance of these links"),
+            (lost, f"spheres of {lost} are left out: {name} has no such link"),
+            (self.are_links_renamed, RENAMED),
+            (self.held, self.held_words),
+        )
+        return tuple(sentence for is_so, sentence in sentences if is_so)
 
     @property
     def held_words(self) -> str:
@@ -253,8 +248,10 @@ class RobotModel:
     def sphere_centers_batch(self, q: Float64, *, threads: int = 1) -> Float64:
         """Centres (T, S, 3) at q (T, J)."""
         postures = np.asarray(q, dtype=np.float64)
-        if postures.ndim != 2 or postures.shape[1] != self.num_joints:
-            raise InputError(f"joint positions: expected shape (T, {self.num_joints}), got {postures.shape}")
+        refuse_if(
+            postures.ndim != 2 or postures.shape[1] != self.num_joints,
+            f"joint positions: expected shape (T, {self.num_joints}), got {postures.shape}",
+        )
         return self.chain.centers(postures, threads=threads)
 
     def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
@@ -308,7 +305,14 @@ class RobotModel:
 
     def reach(self) -> float:
         """Radius [m] about the base that no sphere leaves (sum of link lengths)."""
-        return float(np.max(self._lever_arms() + self.sphere_set.radii))
+        length = np.zeros(self.num_joints + 1)
+        for body in range(1, self.num_joints + 1):
+            step = float(np.linalg.norm(self._model.jointPlacements[body].translation))
+            if "JointModelP" in self._model.joints[body].shortname():
+                step += max(abs(self.lower[body - 1]), abs(self.upper[body - 1]))
+            length[body] = length[self._model.parents[body]] + step
+        arms = length[self._sphere_joint] + np.linalg.norm(self._sphere_offset, axis=1)
+        return float(np.max(arms + self.sphere_set.radii))
 
     def self_pairs(self, posture: Float64 | None = None, touching: float = 0.0) -> Index:
         """Pairs (P, 2) of spheres that could collide.
@@ -357,16 +361,11 @@ class RobotModel:
             raise InputError(f"joint positions: expected shape ({self.num_joints},), got {np.shape(q)}")
         return np.asarray(q, dtype=np.float64)
 
-    def _configuration(self, q: Float64) -> Float64:
-        if not self._is_wrapped.any():
-            return q
-        columns = [[np.cos(x), np.sin(x)] if w else [x] for x, w in zip(q, self._is_wrapped, strict=True)]
-        return np.concatenate(columns)
-
     def _as_chain(self) -> Chain:
         placement = np.array([self.T_world_base, *(p.homogeneous for p in list(self._model.jointPlacements)[1:])])
-        data = self._model.createData()
-        pinocchio.computeJointJacobians(self._model, data, self._configuration(self.middle))
+        data, turns = self._model.createData(), zip(self.middle, self._is_wrapped, strict=True)
+        q = np.concatenate([[np.cos(angle), np.sin(angle)] if is_wrapped else [angle] for angle, is_wrapped in turns])
+        pinocchio.computeJointJacobians(self._model, data, q)
         local = [
             np.asarray(pinocchio.getJointJacobian(self._model, data, body, pinocchio.ReferenceFrame.LOCAL))
             for body in range(1, self.num_joints + 1)
@@ -396,35 +395,22 @@ class RobotModel:
         postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
         return np.asarray(np.max([np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures], axis=0) > 1e-9)
 
-    def _lever_arms(self) -> Float64:
-        length = np.zeros(self.num_joints + 1)
-        for body in range(1, self.num_joints + 1):
-            step = float(np.linalg.norm(self._model.jointPlacements[body].translation))
-            if "JointModelP" in self._model.joints[body].shortname():
-                step += max(abs(self.lower[body - 1]), abs(self.upper[body - 1]))
-            length[body] = length[self._model.parents[body]] + step
-        return np.asarray(length[self._sphere_joint] + np.linalg.norm(self._sphere_offset, axis=1))
-
     def _frame(self, frame: str) -> int:
-        if frame not in self._frames:
-            raise InputError(
-                f"{self.urdf.path}: no frame '{frame}'", remedy=f"frames there: {', '.join(self.urdf.links)}"
-            )
-        return self._frames[frame]
+        said, remedy = f"{self.urdf.path}: no frame '{frame}'", f"frames there: {', '.join(self.urdf.links)}"
+        return require(self._frames.get(frame), said, remedy=remedy)
 
 
 def _without(model: pinocchio.Model, locked: dict[str, float], path: Path) -> pinocchio.Model:
     names = [str(name) for name in model.names]
     for name, joint in zip(names[1:], list(model.joints)[1:], strict=True):
-        if joint.nv != 1:
-            raise InputError(f"{path}: joint '{name}': expected one degree of freedom, got {joint.nv}")
+        refuse_if(joint.nv != 1, f"{path}: joint '{name}': expected one degree of freedom, got {joint.nv}")
     missing = [name for name in locked if name not in names]
-    if missing:
-        raise InputError(
-            f"{path}: no joint '{missing[0]}' to lock", remedy=f"movable joints there: {', '.join(names[1:])}"
-        )
-    if len(locked) == len(names) - 1:
-        raise InputError(f"{path}: every joint is locked", remedy="leave at least one joint free")
+    refuse_if(
+        missing,
+        f"{path}: no joint '{''.join(missing[:1])}' to lock",
+        remedy=f"movable joints there: {', '.join(names[1:])}",
+    )
+    refuse_if(len(locked) == len(names) - 1, f"{path}: every joint is locked", remedy="leave at least one joint free")
     if not locked:
         return model
     q = pinocchio.neutral(model)

@@ -130,8 +130,7 @@ def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Ind
     """`self_pairs` (P, 2) without links that `disabled` (an SRDF) names."""
     off = {frozenset(pair.links) for pair in disabled}
     links, pairs = model.sphere_set.links, model.self_pairs()
-    keep = [frozenset((links[a], links[b])) not in off for a, b in pairs]
-    return np.asarray(pairs[np.array(keep, dtype=np.bool_)])
+    return np.asarray(pairs[np.array([frozenset((links[a], links[b])) not in off for a, b in pairs], dtype=bool)])
 
 
 def fixtures(model: RobotModel) -> set[str]:

@@ -258,9 +258,11 @@ def with_kept_margins(model: RobotModel, margin: float, kept: Sequence[KeptMargi
 
 def least_gap(model: RobotModel, surfaces: SelfSurfaces | None, pair: KeptMargin, postures: Float64) -> float:
     """A pair's least gap [m] at postures (T, J), exact below `pair.apart`."""
-    gaps = None
-    if surfaces is not None:
-        gaps = surfaces.gaps_of(pair.links, postures, model.sphere_centers_batch(postures), pair.apart)
+    gaps = (
+        None
+        if surfaces is None
+        else surfaces.gaps_of(pair.links, postures, model.sphere_centers_batch(postures), pair.apart)
+    )
     return float((sphere_gaps(model, pair.links, postures) if gaps is None else gaps).min())
 
 

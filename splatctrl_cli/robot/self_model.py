@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.records import Array, Float32, Float64, UInt8
 from splatctrl_cli.robot.coverage import areas
 from splatctrl_cli.robot.surface import RobotSurface
@@ -118,8 +118,11 @@ class SelfModel:
         ]
         learned = [LearnedLink(**{k: v if v.ndim else v.item() for k, v in row.items()}) for row in rows]
         for part in learned:
-            if part.triangles.shape[1:] != (3, 3) or not np.isfinite(part.triangles).all():
-                raise ValueError(f"triangles of {part.link}: expected finite (F, 3, 3), got {part.triangles.shape}")
+            refuse_if(
+                part.triangles.shape[1:] != (3, 3) or not np.isfinite(part.triangles).all(),
+                f"triangles of {part.link}: expected finite (F, 3, 3), got {part.triangles.shape}",
+                error=ValueError,
+            )
         links, unknown = tuple(map(str, found["links"])), {str(link): str(why) for link, why in found["unknown"]}
         return cls(links=links, digest=str(found["digest"]), learned=tuple(learned), unknown=unknown)
 

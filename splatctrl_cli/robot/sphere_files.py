@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from splatctrl_cli.config.fixed import CARRIED_CELL
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.kernels.chain import PRISMATIC, Chain
 from splatctrl_cli.records import Box, Float64, SphereSet
@@ -77,10 +77,11 @@ def match_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSe
         names = {link.partition("_")[2] or link: link for link in urdf.links}
         asked = tuple(link.partition("_")[2] or link for link in asked)
     kept = [index for index, link in enumerate(asked) if link in names]
-    if asked and not kept:
-        raise InputError(
-            f"{name}: none of its links is in {urdf.path}", remedy=f"links there: {', '.join(urdf.links)}"
-        )
+    refuse_if(
+        asked and not kept,
+        f"{name}: none of its links is in {urdf.path}",
+        remedy=f"links there: {', '.join(urdf.links)}",
+    )
     matched = SphereSet(
         links=tuple(names[asked[index]] for index in kept), centers=spheres.centers[kept], radii=spheres.radii[kept]
     )
@@ -212,7 +213,6 @@ def _join(path: Path, entries: list[dict[Any, Any]]) -> dict[Any, Any]:
 
 
 def _xrdf(path: Path, tree: dict[Any, Any]) -> dict[Any, Any]:
-    """An XRDF's spheres for world collisions, and their buffer."""
     asked = tree.get("collision") or tree.get("world_collision")
     collision, groups = (value if isinstance(value, dict) else {} for value in (asked, tree.get("geometry")))
     name = collision.get("geometry", next(iter(groups), None) if len(groups) == 1 else None)
@@ -233,8 +233,10 @@ def _buffers(path: Path, buffer: Any, table: dict[Any, Any]) -> dict[str, float]
     by_link = buffer if isinstance(buffer, dict) else dict.fromkeys(table, buffer)
     buffers = {}
     for link, value in by_link.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise InputError(f"{path}: collision_sphere_buffer: expected numbers [m], got {value!r} for '{link}'")
+        refuse_if(
+            isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value),
+            f"{path}: collision_sphere_buffer: expected numbers [m], got {value!r} for '{link}'",
+        )
         buffers[str(link)] = float(value)
     return buffers
 
@@ -250,10 +252,11 @@ def _sphere(where: str, sphere: Any) -> list[float]:
         row = [float(value) for value in [*sphere["center"], sphere["radius"]]]
     except (TypeError, KeyError, ValueError):
         row = []
-    if len(row) != 4 or not np.all(np.isfinite(row)):
-        raise InputError(
-            f"{where}: expected {{center: [x, y, z], radius: r}}, got {sphere!r}", remedy="finite, in metres"
-        )
+    refuse_if(
+        len(row) != 4 or not np.all(np.isfinite(row)),
+        f"{where}: expected {{center: [x, y, z], radius: r}}, got {sphere!r}",
+        remedy="finite, in metres",
+    )
     return row
 
 

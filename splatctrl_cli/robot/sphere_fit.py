@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config.fixed import DEFICIT_GAP, FIT_BISECTIONS, FIT_MIN_PATCH, FIT_ROUNDS, FIT_STEPS, FIT_TIE
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.records import Bool, Float64, Index, SphereSet
 from splatctrl_cli.robot.coverage import areas, largest_deficit, refine_triangles
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
@@ -50,10 +50,11 @@ def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> S
     """
     _check(options, len(solids))
     links = [_Link(name, parts, options, index) for index, (name, parts) in enumerate(solids.items())]
-    if options.max_protrusion is not None:
-        fitted = [link.within(options.max_protrusion) for link in links]
-    else:
-        fitted = _share_out(links, options.max_spheres or 0)
+    fitted = (
+        _share_out(links, options.max_spheres or 0)
+        if options.max_protrusion is None
+        else [link.within(options.max_protrusion) for link in links]
+    )
     return SphereSet(
         links=tuple(link.name for link, (centers, _) in zip(links, fitted, strict=True) for _ in centers),
         centers=np.concatenate([centers for centers, _ in fitted]),
@@ -62,13 +63,17 @@ def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> S
 
 
 def _check(options: FitOptions, num_links: int) -> None:
-    if (options.max_spheres is None) == (options.max_protrusion is None):
-        raise UsageError("sphere fit: expected a number of spheres or a protrusion, not both")
-    if options.max_spheres is not None and options.max_spheres < num_links:
-        raise UsageError(
-            f"sphere fit: {options.max_spheres} spheres for {num_links} links with collision geometry",
-            remedy=f"allow at least {num_links}, one for each",
-        )
+    refuse_if(
+        (options.max_spheres is None) == (options.max_protrusion is None),
+        "sphere fit: expected a number of spheres or a protrusion, not both",
+        error=UsageError,
+    )
+    refuse_if(
+        options.max_spheres is not None and options.max_spheres < num_links,
+        f"sphere fit: {options.max_spheres} spheres for {num_links} links with collision geometry",
+        remedy=f"allow at least {num_links}, one for each",
+        error=UsageError,
+    )
     for name, value in {"protrusion": options.max_protrusion, "deficit": options.max_deficit}.items():
         if value is not None and not (np.isfinite(value) and value >= 0):
             raise UsageError(f"sphere fit: largest {name}: expected 0 m or more, got {value:g}")
@@ -114,8 +119,7 @@ class _Link:
         self._parts = parts
         self._distance = SolidDistance(parts)
         area = float(areas(np.concatenate([part.surface.corners for part in parts])).sum())
-        if not area > 0:
-            raise InputError(f"link '{name}': expected a collision surface, got none of any area")
+        refuse_if(not area > 0, f"link '{name}': expected a collision surface, got none of any area")
         longest = max(FIT_MIN_PATCH, 2 * float(np.sqrt(area / options.num_patches)))
         cut = [refine_triangles(part.surface.corners, longest) for part in parts]
         self._slack = np.concatenate([np.full(len(t), p.slack) for t, p in zip(cut, parts, strict=True)])
@@ -259,10 +263,8 @@ def _greedy(by_patch: Bool, rng: np.random.Generator | None, at_most: int) -> li
     while pending.any():
         if len(picked) >= at_most:
             return None
-        if rng is None:
-            choice = int(np.argmax(gain))
-        else:
-            choice = int(rng.choice(np.flatnonzero(gain >= (1 - FIT_TIE) * gain.max())))
+        best = np.argmax(gain) if rng is None else rng.choice(np.flatnonzero(gain >= (1 - FIT_TIE) * gain.max()))
+        choice = int(best)
         picked.append(choice)
         newly = pending & by_patch[:, choice]
         gain = gain - by_patch[newly].sum(axis=0, dtype=np.int32)

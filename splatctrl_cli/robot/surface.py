@@ -70,17 +70,10 @@ class RobotSurface:
         by_spheres = tuple(
             link for link in dict.fromkeys(spheres.links) if link in unread or link not in seen.collision_links
         )
-        left_out = set(by_spheres)
-        shapes = [shape for shape in seen.shapes if shape.link not in left_out]
-        is_ball = [link in left_out for link in spheres.links]
-        balls = [
-            _ball(link, center, radius)
-            for link, center, radius, chosen in zip(
-                spheres.links, spheres.centers, spheres.radii, is_ball, strict=True
-            )
-            if chosen
-        ]
-        kept = [(link, corners) for link, corners in pieces if link not in left_out]
+        shapes = [shape for shape in seen.shapes if shape.link not in by_spheres]
+        rows = zip(spheres.links, spheres.centers, spheres.radii, strict=True)
+        balls = [_ball(link, center, radius) for link, center, radius in rows if link in by_spheres]
+        kept = [(link, corners) for link, corners in pieces if link not in by_spheres]
         bodies = urdf.rigid_bodies()
         children = {child for _, child in urdf.parents}
         surface = cls.from_parts(
@@ -314,9 +307,7 @@ def _sizes(shape: Shape) -> tuple[float, float, float]:
     if shape.kind == "box":
         x, y, z = shape.size
         return x / 2, y / 2, z / 2
-    if shape.kind == "sphere":
-        return shape.size[0], 0.0, 0.0
-    return shape.size[0], shape.size[1] / 2, 0.0
+    return shape.size[0], 0.0 if shape.kind == "sphere" else shape.size[1] / 2, 0.0
 
 
 def _ball(link: str, center: Float64, radius: float) -> Shape:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64
 
@@ -164,22 +164,25 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
 
     Raises InputError for no URDF, several roots, missing limits, a zero axis, or no movable joint.
     """
-    text = _read(path) if text is None else text
+    with refuse_faults(lambda _: f"{path}: expected a URDF, got bytes that are not text", UnicodeDecodeError):
+        text = read_text(path, "give the robot's URDF file") if text is None else text
     # ValueError: what defusedxml forbids
     with refuse_faults(f"{path}: expected a URDF, got broken XML", ElementTree.ParseError, ValueError):
         root = ElementTree.fromstring(text)
-    if root.tag != "robot":
-        raise InputError(f"{path}: expected a URDF with root <robot>, got <{root.tag}>")
+    refuse_if(root.tag != "robot", f"{path}: expected a URDF with root <robot>, got <{root.tag}>")
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
-    if len(set(links)) < len(links):
-        twice = next(link for link in links if links.count(link) > 1)
-        raise InputError(f"{path}: link '{twice}' is defined twice", remedy="give the expanded URDF of one robot")
+    twice = [link for link in links if links.count(link) > 1]
+    refuse_if(
+        twice,
+        f"{path}: link '{''.join(twice[:1])}' is defined twice",
+        remedy="give the expanded URDF of one robot",
+    )
     joints = list(root.findall("joint"))
-    if not any(joint.get("type") in MOVABLE for joint in joints):
-        raise InputError(
-            f"{path}: expected movable joints, got none",
-            remedy="an unexpanded xacro looks like this; expand it first: xacro FILE.xacro > FILE.urdf",
-        )
+    refuse_if(
+        not any(joint.get("type") in MOVABLE for joint in joints),
+        f"{path}: expected movable joints, got none",
+        remedy="an unexpanded xacro looks like this; expand it first: xacro FILE.xacro > FILE.urdf",
+    )
     _check_tree(path, links, joints)
     found = [
         shape
@@ -217,26 +220,18 @@ def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
     return read_urdf(urdf.path, ElementTree.tostring(root, encoding="unicode"))
 
 
-def _read(path: Path) -> str:
-    try:
-        return read_text(path, "give the robot's URDF file")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected a URDF, got bytes that are not text") from None
-
-
 def _check_tree(path: Path, links: tuple[str, ...], joints: list[Any]) -> None:
     for joint in joints:
         name = _attribute(path, joint, "name")
         for role in ("parent", "child"):
             element = joint.find(role)
             link = None if element is None else element.get("link")
-            if link not in links:
-                raise InputError(f"{path}: joint '{name}': {role} link {link!r} does not exist")
+            refuse_if(link not in links, f"{path}: joint '{name}': {role} link {link!r} does not exist")
     children = {joint.find("child").get("link") for joint in joints}
     roots = [link for link in links if link not in children]
-    if len(roots) != 1:
-        got = ", ".join(roots) or "none (the joints form a loop)"
-        raise InputError(f"{path}: expected one root link, got {got}", remedy="join the links with fixed joints")
+    got = ", ".join(roots) or "none (the joints form a loop)"
+    said = f"{path}: expected one root link, got {got}"
+    refuse_if(len(roots) != 1, said, remedy="join the links with fixed joints")
 
 
 def _joint(path: Path, joint: Any) -> Joint:
@@ -269,20 +264,19 @@ def _joint(path: Path, joint: Any) -> Joint:
 
 def _check_limits(where: str, kind: str, limit: Any) -> None:
     remedy = 'write <limit lower="..." upper="..." velocity="..." effort="..."/>, from the data sheet of the robot'
-    if limit is None:
-        raise InputError(f"{where}: {kind}: expected limits, got none", remedy=remedy)
+    refuse_if(limit is None, f"{where}: {kind}: expected limits, got none", remedy=remedy)
     lower, upper = (_numbers(f"{where}: limit {key}", limit.get(key, "0"), 1)[0] for key in ("lower", "upper"))
-    if lower >= upper:
-        raise InputError(f"{where}: limits: expected lower < upper, got {lower:g} and {upper:g}", remedy=remedy)
+    refuse_if(lower >= upper, f"{where}: limits: expected lower < upper, got {lower:g} and {upper:g}", remedy=remedy)
     for key in ("velocity", "effort"):
-        if limit.get(key) is None:
-            raise InputError(f"{where}: limits: expected {key}, got none", remedy=remedy)
-    if _numbers(f"{where}: limit velocity", limit.get("velocity"), 1)[0] <= 0:
-        raise InputError(f"{where}: limits: expected a velocity above 0, got {limit.get('velocity')}", remedy=remedy)
+        refuse_if(limit.get(key) is None, f"{where}: limits: expected {key}, got none", remedy=remedy)
+    refuse_if(
+        _numbers(f"{where}: limit velocity", limit.get("velocity"), 1)[0] <= 0,
+        f"{where}: limits: expected a velocity above 0, got {limit.get('velocity')}",
+        remedy=remedy,
+    )
 
 
 def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape | tuple[str, str]]:
-    """Primitives, a mesh, or (link, tag) of anything else."""
     geometry = collision.find("geometry")
     element = None if geometry is None else next(iter(geometry), None)
     if element is None:
@@ -291,8 +285,7 @@ def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape
     T_link_shape = _origin(where, collision.find("origin"))
     if element.tag == "mesh":
         scale = _numbers(f"{where}: scale", element.get("scale", "1 1 1"), 3)
-        if 0 in scale:
-            raise InputError(f"{where}: scale: expected three numbers that are not 0, got {scale}")
+        refuse_if(0 in scale, f"{where}: scale: expected three numbers that are not 0, got {scale}")
         return [
             MeshShape(
                 link=link, filename=_attribute(path, element, "filename"), scale=scale, T_link_mesh=T_link_shape
@@ -306,8 +299,7 @@ def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape
         size = _numbers(where, element.get("radius"), 1)
     else:
         return [(link, str(element.tag))]
-    if min(size) <= 0:
-        raise InputError(f"{where}: expected sizes above 0, got {size}")
+    refuse_if(min(size) <= 0, f"{where}: expected sizes above 0, got {size}")
     if element.tag == "capsule":
         return _capsule(link, size, T_link_shape)
     return [Shape(link=link, kind=element.tag, size=size, T_link_shape=T_link_shape)]
@@ -348,13 +340,14 @@ def _numbers(where: str, text: str | None, count: int) -> tuple[float, ...]:
         values = tuple(float(word) for word in (text or "").split())
     except ValueError:
         values = ()
-    if len(values) != count or not np.all(np.isfinite(values)):
-        raise InputError(f"{where}: expected {count} number{'s' * (count > 1)}, got {text!r}")
+    refuse_if(
+        len(values) != count or not np.all(np.isfinite(values)),
+        f"{where}: expected {count} number{'s' * (count > 1)}, got {text!r}",
+    )
     return values
 
 
 def _attribute(path: Path, element: Any, name: str) -> str:
     value = element.get(name)
-    if not value:
-        raise InputError(f"{path}: <{element.tag}> without {name}")
+    refuse_if(not value, f"{path}: <{element.tag}> without {name}")
     return str(value)

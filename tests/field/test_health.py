@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.field.clusters import NO_SPLAT, obstacle_spheres
 from splatctrl_cli.field.slabs import field_health, median_spacing
-from splatctrl_cli.field.unknown import NO_SPLAT, obstacle_spheres
 from splatctrl_cli.records import Label
 from splatctrl_cli.voxels import Balls
 from tests.field.scenes import splat_set
@@ -41,15 +41,15 @@ FINE = square_lattice(0.01)
 def test_each_ratio_out_of_range_has_its_warning(
     centers: np.ndarray, radii: np.ndarray, length: float, words: tuple[str, ...]
 ) -> None:
-    found = field_health(centers, radii, length, kernels=KERNELS).warnings
+    found = field_health(centers, radii, length, kernels=KERNELS)["warnings"]
     for warning, part in zip(found, words, strict=True):
         assert part in warning
 
 
 def test_a_field_is_not_warned_of_kernels_that_it_has_not() -> None:
     health = [field_health(FINE, np.full(100, 0.008), 0.009, kernels=names) for names in ((), ("se",), KERNELS)]
-    assert [len(found.warnings) for found in health] == [0, 1, 2]
-    assert health[0].radius_per_spacing == pytest.approx(0.8)
+    assert [len(found["warnings"]) for found in health] == [0, 1, 2]
+    assert health[0]["radius_per_spacing"] == pytest.approx(0.8)
     assert [median_spacing(points) for points in (np.zeros((1, 3)), np.zeros((5, 3)))] == [0.0, 0.0]
 
 

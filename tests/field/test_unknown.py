@@ -7,9 +7,8 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.grid_cells import GridField
+from splatctrl_cli.field.grid_cells import Cubes, GridField
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.field.unknown import Cubes
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 from tests.field.scenes import cloud, queries, splat_set

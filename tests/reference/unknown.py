@@ -7,7 +7,7 @@ import numpy as np
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.ranges import check
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.field.unknown import BOUND, Cubes, blank
+from splatctrl_cli.field.grid_cells import BOUND, Cubes, blank
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.voxels import VoxelState
 

@@ -53,8 +53,7 @@ def write_nrrd(path: Path, grid: DistanceGrid, channel: str) -> None:
     lines += [f"{key}:={value}" for key, value in pairs.items()]
     with path.open("wb") as stream:
         stream.write(("\n".join(lines) + "\n\n").encode("ascii"))
-        for planes in x_fastest(grid.channels[channel]):
-            stream.write(planes.tobytes())
+        stream.writelines(planes.tobytes() for planes in x_fastest(grid.channels[channel]))
 
 
 def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:

@@ -75,8 +75,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
         stream.write("\n".join(lines).encode("utf-8"))
         for values in grid.channels.values():
             stream.write(values.nbytes.to_bytes(8, "little"))
-            for planes in x_fastest(values):
-                stream.write(planes.tobytes())
+            stream.writelines(planes.tobytes() for planes in x_fastest(values))
         stream.write(b"\n  </AppendedData>\n</VTKFile>\n")
 
 

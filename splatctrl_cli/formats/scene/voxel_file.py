@@ -1,15 +1,15 @@
 """Voxel files of a scene: ``occupancy.npz`` and snapshots' states, with evidence."""
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.errors import InputError, refuse_if
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.records import Array, Label, UInt8, Values
 from splatctrl_cli.voxels import (
@@ -67,7 +67,7 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> Values:
 
 
 def _evidence(known: KnownVoxels) -> dict[str, Values]:
-    """Arrays of both files; one-byte last_seen is twice as fast."""
+    """Arrays of both files."""
     balls = known.unrepresented
     return {
         "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < FIRST_REASON else np.uint16),
@@ -77,14 +77,13 @@ def _evidence(known: KnownVoxels) -> dict[str, Values]:
     }
 
 
-@contextmanager
-def _refuse(path: Path, what: str) -> Iterator[None]:
-    try:
-        yield
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:
-        raise InputError(f"{path}: not {what}: {error}") from error
+def _refuse(path: Path, what: str) -> AbstractContextManager[None]:
+    return refuse_faults(
+        lambda error: (
+            f"{path}: no such file" if isinstance(error, FileNotFoundError) else f"{path}: not {what}: {error}"
+        ),
+        Exception,
+    )
 
 
 def read_states(path: Path) -> OccupancyGrid:

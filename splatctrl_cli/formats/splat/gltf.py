@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
-from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
-from splatctrl_cli.formats.splat.splat_format import SH_C0, SplatFormat, refuse, unit_quaternions
+from splatctrl_cli.formats.splat.gaussian_ply import SH_C0, SplatFormat, check_gaussians, refuse, unit_quaternions
 from splatctrl_cli.formats.unpacking import read_bytes
 from splatctrl_cli.records import Array, Float32, GaussianSet, Label
 
@@ -35,7 +34,7 @@ PROPERTIES = {
 
 
 def _write(path: Path, document: Mapping[str, Any], tables: Sequence[Array]) -> None:
-    """Write a document and its tables (N, 1 | 3 | 4), float32 or uint8."""
+    """Write a document and tables (N, 1 | 3 | 4)."""
     views, accessors, binary = list[dict[str, Any]](), list[dict[str, Any]](), bytearray()
     for table in tables:
         is_float, content = table.dtype == np.float32, np.ascontiguousarray(table).tobytes()
@@ -90,7 +89,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, width: int) -> Float32:
-    """(N, width) float32. Raises InputError for another width or missing data."""
+    """An accessor's numbers (N, width)."""
     accessor, where = document["accessors"][index], f"{path}: accessor {index}"
     dtype = np.dtype(COMPONENTS[accessor["componentType"]])
     refuse_if(
@@ -185,8 +184,7 @@ def _primitive(path: Path, document: Mapping[str, Any]) -> dict[str, Any]:
     refuse_if(
         len(found) != 1, f"{path}: expected one primitive with {EXTENSION}, got {len(found)} of {len(primitives)}"
     )
-    if names:
-        raise InputError(f"{path}: its Gaussians are packed by {names[0]}, expected plain attributes")
+    refuse_if(names, f"{path}: its Gaussians are packed by {''.join(names[:1])}, expected plain attributes")
     primitive: dict[str, Any] = found[0]
     kernel = primitive["extensions"][EXTENSION].get("kernel")
     refuse_if(

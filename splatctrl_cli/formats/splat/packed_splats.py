@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
-from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
-from splatctrl_cli.formats.splat.splat_format import (
+from splatctrl_cli.formats.splat.gaussian_ply import (
     SH_C0,
     Differences,
     SplatFormat,
     check_finite,
+    check_gaussians,
     unit_quaternions,
     without_labels,
 )
@@ -174,7 +174,7 @@ def spz_bound(gaussians: GaussianSet) -> Differences:
 
 
 def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
-    """Fraction bits and bytes (N, width) by attribute. Raises InputError for another length."""
+    """Fraction bits and bytes (N, width) by attribute."""
     start = content[:4]
     if start == PLAIN:
         num, bits, widths = _parse_head(path, content, (4,), len(content))
@@ -188,7 +188,7 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
 
 
 def _parse_head(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
-    """Number of Gaussians, fraction bits, bytes per attribute; size: the file's."""
+    """Number of Gaussians, fraction bits, bytes per attribute."""
     refuse_if(
         len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC,
         f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}",

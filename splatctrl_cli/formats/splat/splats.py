@@ -15,20 +15,18 @@ from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError, refuse_
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.ply import PlyFile, read_table, write_table
 from splatctrl_cli.formats.splat.gaussian_ply import (
+    SH_C0,
+    Comments,
     RoundedError,
+    SplatFormat,
     centers_of,
+    check_finite,
     exact_centers,
     gaussians_of,
     labels_of,
     log_sigmas,
-    rows_of,
-)
-from splatctrl_cli.formats.splat.splat_format import (
-    SH_C0,
-    Comments,
-    SplatFormat,
-    check_finite,
     refuse,
+    rows_of,
     sigma_of_log,
     sigmoid,
 )
@@ -268,23 +266,25 @@ def read_spheres(path: Path) -> SplatSet:
         return read_world_splats(path)
     found, comments = read_splats(path)
     check_world(path, comments)
-    if isinstance(found, SplatSet):
-        return found
-    return as_splats(replace(found, harmonics=found.harmonics[:, :1]), str(path))
+    if isinstance(found, GaussianSet):
+        found = as_splats(replace(found, harmonics=found.harmonics[:, :1]), str(path))
+    return found
 
 
 def describe_splats(path: Path, _head: bytes) -> Summary:
     """Summarise a splat file. Raises InputError for another kind."""
     found, comments = read_splats(path)
     gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
-    ranges: dict[str, Floats] = {}
-    if len(gaussians):
-        ranges = {
+    ranges: dict[str, Floats] = (
+        {}
+        if not len(gaussians)
+        else {
             "lower_m": gaussians.centers.min(axis=0),
             "upper_m": gaussians.centers.max(axis=0),
             "sigma_m": np.percentile(gaussians.scales, [0, 50, 100]),
             "opacity": np.percentile(gaussians.opacities, [0, 50, 100]),
         }
+    )
     labels = {label.name.lower(): int(np.count_nonzero(gaussians.labels == label)) for label in Label}
     facts: dict[str, object] = {
         "format": format_of(path).name,

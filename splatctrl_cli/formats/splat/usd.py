@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
-from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
-from splatctrl_cli.formats.splat.splat_format import SplatFormat, unit_quaternions
+from splatctrl_cli.formats.splat.gaussian_ply import SplatFormat, check_gaussians, unit_quaternions
 from splatctrl_cli.records import Array, Float32, GaussianSet, Label
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"

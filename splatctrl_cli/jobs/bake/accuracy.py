@@ -23,7 +23,6 @@ from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import LOSS, exact_channel
 from splatctrl_cli.field.incremental import Changes
 from splatctrl_cli.field.probability import probabilities
-from splatctrl_cli.field.report import GridStatistics
 from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
@@ -158,10 +157,10 @@ def _held_out_cameras(
     return chosen
 
 
-def field_document(grid: DistanceGrid, statistics: GridStatistics, changes: Changes | None) -> dict[str, Any]:
+def field_document(grid: DistanceGrid, statistics: Mapping[str, Any], changes: Changes | None) -> dict[str, Any]:
     """Content of ``field.json`` without accuracy: header and place first, an update's changes last."""
     header: Mapping[str, Any] = grid.header
-    warnings, lowest, update = tuple(header["health"]["warnings"]), statistics.lowest, {}
+    warnings, lowest, update = tuple(header["health"]["warnings"]), statistics["lowest"], {}
     if lowest is not None and lowest > FAR_GRID:
         far = f"the box holds no splat: the nearest is {lowest:.3g} m from every cell; check --box"
         warnings = (*warnings, far)
@@ -174,7 +173,7 @@ def field_document(grid: DistanceGrid, statistics: GridStatistics, changes: Chan
         "first_cell": grid.origin,
         "voxel": grid.voxel,
         "channels": list(grid.channels),
-        "statistics": statistics.as_dict(),
+        "statistics": statistics,
         "warnings": warnings,
         **update,
     }

@@ -14,9 +14,10 @@ from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
 from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker
+from splatctrl_cli.field.clusters import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.report import GradientLengths, grid_statistics
+from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import (
     Kept,
     UnknownSpace,
@@ -26,7 +27,6 @@ from splatctrl_cli.field.slabs import (
     field_header,
     slabs,
 )
-from splatctrl_cli.field.unknown import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, remove, write_json, write_run
 from splatctrl_cli.formats.grid.grid_format import CHANNELS, GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
@@ -191,7 +191,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
         with stopwatch.stage("report"):
             write_json(partial / "field.json", document | ({"accuracy": accuracy} if accuracy else {}))
             if not request.no_report:
-                _draw(partial / "report", grid, statistics.gradient, curves, _middle(job))
+                _draw(partial / "report", grid, statistics["gradient"], curves, _middle(job))
         summary = summary_of(document)
         metrics = metrics_of(summary, accuracy)
         verdict = bake_verdict(request, document, metrics, has_occupancy=job.source.occupancy is not None)
@@ -325,14 +325,14 @@ def _bake_grid(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGr
 def _draw(
     folder: Path,
     grid: DistanceGrid,
-    lengths: GradientLengths | None,
+    lengths: Mapping[str, Any] | None,
     curves: Mapping[str, Reliability],
     point: Sequence[float],
 ) -> None:
     folder.mkdir()
     slices_picture(folder / "slices.png", grid, point)
     if lengths is not None:
-        gradient_picture(folder / "gradient.png", grid, lengths.histogram, lengths.bin_width, point)
+        gradient_picture(folder / "gradient.png", grid, lengths["histogram"], lengths["bin_width"], point)
     if "probability" in grid.channels:
         probability_picture(folder / "probability.png", grid, point)
     if curves:

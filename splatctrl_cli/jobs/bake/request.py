@@ -11,9 +11,9 @@ from splatctrl_cli import __version__
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import CARD_LEAST_BAKE, CARD_SPLATS
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.field.clusters import DEFAULT_LABELS, field_splats
 from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box, check_room
-from splatctrl_cli.field.unknown import DEFAULT_LABELS, field_splats
 from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene

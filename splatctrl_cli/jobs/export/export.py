@@ -19,8 +19,14 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, Writ
 from splatctrl_cli.files.output import finite, output_path, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import Snapshot, open_scene
-from splatctrl_cli.formats.splat.gaussian_ply import REFERENCE_PLY
-from splatctrl_cli.formats.splat.splat_format import Comments, Differences, SplatFormat, differences, refuse
+from splatctrl_cli.formats.splat.gaussian_ply import (
+    REFERENCE_PLY,
+    Comments,
+    Differences,
+    SplatFormat,
+    differences,
+    refuse,
+)
 from splatctrl_cli.formats.splat.splats import (
     FORMATS,
     ORIGIN,

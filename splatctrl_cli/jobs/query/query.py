@@ -16,11 +16,10 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_TABLE, MARCH_STEPS
 from splatctrl_cli.control.audit import observed_at
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.clusters import DEFAULT_LABELS, ObstacleSpheres, Spheres, obstacle_spheres
 from splatctrl_cli.field.distance import OnDevice, SphereField, field_over, march
 from splatctrl_cli.field.grid_cells import GridField, check_room
 from splatctrl_cli.field.probability import make_probability
-from splatctrl_cli.field.unknown import DEFAULT_LABELS, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Parts, Stopwatch, output_path
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.ply import point_blocks

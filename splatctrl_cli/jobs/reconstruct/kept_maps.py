@@ -6,9 +6,8 @@ import numpy as np
 
 from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.clusters import Spheres, obstacle_spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.unknown import obstacle_spheres
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.formats.scene.voxel_file import read_states, read_unrepresented
 from splatctrl_cli.formats.splat.splats import read_ply

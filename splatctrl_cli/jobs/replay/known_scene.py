@@ -17,10 +17,9 @@ from splatctrl_cli.control.barriers import SceneStep, guard_people
 from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.field.clusters import Spheres
+from splatctrl_cli.field.clusters import NO_SPLAT, ObstacleSpheres, Spheres, obstacle_spheres
 from splatctrl_cli.field.distance import SphereField, field_over
 from splatctrl_cli.field.grid_cells import GridField, exact_channel
-from splatctrl_cli.field.unknown import NO_SPLAT, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import open_scene

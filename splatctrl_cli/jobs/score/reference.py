@@ -16,8 +16,8 @@ from splatctrl_cli.jobs.recordings.open_recording import (
 )
 from splatctrl_cli.jobs.recordings.provenance import changed_files, differences
 from splatctrl_cli.jobs.running.progress import Progress
-from splatctrl_cli.recording.folder.dtu_source import DtuSource
-from splatctrl_cli.recording.source import lacks_depth, open_session, open_source
+from splatctrl_cli.recording.folder.idr import DtuSource
+from splatctrl_cli.recording.source import open_session, open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
 
@@ -62,7 +62,7 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
         return _session_reference((where, *recording.beside), replace(recording.options, cameras=None))
     if recording.protocol is None:
         source = open_source(where, replace(recording.options, cameras=None), needs_depth=False)
-        return Reference(where=where, source=source, has_depth=lacks_depth(source) is None)
+        return Reference(where=where, source=source, has_depth=source.depth_fault is None)
     source, protocol, split = open_held_out(recording)
     stamps = [stamp for stamp, _, _ in source.poses()]
     return Reference(
@@ -72,7 +72,7 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
         protocol=protocol,
         split=split,
         training_stamps_ns=frozenset(stamps[n] for n in split.training),
-        has_depth=lacks_depth(source) is None,
+        has_depth=source.depth_fault is None,
     )
 
 

@@ -20,7 +20,7 @@ from splatctrl_cli.evaluate.score_report import (
     score_verdict,
 )
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
-from splatctrl_cli.field.unknown import field_splats, obstacle_spheres
+from splatctrl_cli.field.clusters import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run, write_table
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, run_value
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest

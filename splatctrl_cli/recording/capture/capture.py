@@ -6,6 +6,7 @@ import json
 import math
 from array import array
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -140,15 +141,14 @@ class FrameRows:
 
     def __iter__(self) -> Iterator[Mapping[str, str]]:
         """Raises InputError if the file has changed."""
-        num, changed = 0, InputError(f"{self._file}: changed while it was read", remedy="try again")
-        try:
+        num = 0
+        with suppress(*_UNREADABLE):
             for row in self._read():
                 num += 1
                 yield row
-        except _UNREADABLE:
-            raise changed from None
-        if num != self._num:
-            raise changed
+            if num == self._num:
+                return
+        raise InputError(f"{self._file}: changed while it was read", remedy="try again")
 
     def _read(self) -> Iterator[Mapping[str, str]]:
         with self._file.open("rb") as stream:
@@ -172,8 +172,7 @@ def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
         float(row[key])
     for name in (row["color"], row["depth"], *(row.get(mask) or "" for mask in MASKS)):
         path = PurePosixPath(name)
-        if path.is_absolute() or ".." in path.parts:
-            raise ValueError(f"{name} lies outside the capture")
+        refuse_if(path.is_absolute() or ".." in path.parts, f"{name} lies outside the capture", error=ValueError)
     return row
 
 
@@ -187,13 +186,11 @@ class FileSums:
         keys, sums = array("Q"), bytearray()
         with file.open("rb") as stream:
             while line := stream.readline(_MOST_ROW):
-                try:
+                with suppress(ValueError):  # UnicodeDecodeError among them
                     digest = bytes.fromhex(line[:64].decode("ascii"))
-                except ValueError:  # UnicodeDecodeError among them
-                    continue
-                if len(digest) == 32:
-                    keys.append(_key(line[66:].rstrip(b"\r\n")))
-                    sums += digest
+                    if len(digest) == 32:
+                        keys.append(_key(line[66:].rstrip(b"\r\n")))
+                        sums += digest
         order = np.argsort(np.frombuffer(keys, dtype=np.uint64), kind="stable")
         self._keys = np.frombuffer(keys, dtype=np.uint64)[order]
         self._sums = np.frombuffer(sums, dtype=np.uint8).reshape(-1, 32)[order]
@@ -205,7 +202,7 @@ class FileSums:
 
 
 def _key(name: bytes) -> int:
-    """64 bits of a name; a collision would make a good file look damaged."""
+    """64 bits of a name: good files may not collide."""
     return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")
 
 

@@ -8,8 +8,8 @@ import json
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     write_rows,
     write_topics,
 )
-from splatctrl_cli.records import Float32, JointState, LossReport
+from splatctrl_cli.records import Float32, JointState
 
 JOURNAL = "ingest.jsonl"  # in the folder while it is partial
 
@@ -54,43 +54,27 @@ class Journal:
 
     def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
         """identity: the facts that decide the bytes, for a resumed run."""
-        self._path = folder / JOURNAL
+        self.path = folder / JOURNAL
         self.num_entries = 0
         folder.mkdir(parents=True, exist_ok=True)
-        if not self._path.is_file():
-            self._path.write_text(json.dumps({"identity": identity}) + "\n", encoding="utf-8")
-        self._cut()
-        self._kept = _lines(self._path)
-        next(self._kept, None)
-        self._stream = self._path.open("a", encoding="utf-8")
-
-    def close(self) -> None:
-        self._stream.close()
+        if not self.path.is_file():
+            self.path.write_text(json.dumps({"identity": identity}) + "\n", encoding="utf-8")
+        with self.path.open("r+b") as stream:  # a killed run may leave half a line
+            stream.truncate(sum(len(line) for line in stream if line.endswith(b"\n")))
+        self._kept = self.entries()
 
     def next_kept(self) -> Entry | None:
         found = next(self._kept, None)
         self.num_entries += found is not None
-        return None if found is None else Entry(**found)
+        return found
 
     def add(self, entry: Entry) -> None:
         self.num_entries += 1
-        self._stream.write(json.dumps(vars(entry)) + "\n")
-        self._stream.flush()
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(vars(entry)) + "\n")
 
     def entries(self) -> Iterator[Entry]:
-        lines = _lines(self._path)
-        next(lines, None)
-        yield from (Entry(**line) for line in lines)
-
-    def remove(self) -> None:
-        self._stream.close()
-        self._path.unlink()
-
-    def _cut(self) -> None:
-        with self._path.open("rb") as stream:
-            size = sum(len(line) for line in stream if line.endswith(b"\n"))
-        with self._path.open("r+b") as stream:
-            stream.truncate(size)
+        return (Entry(**line) for line in islice(_lines(self.path), 1, None))
 
 
 def read_identity(folder: Path) -> Mapping[str, Any] | None:
@@ -110,9 +94,7 @@ def check_not_partial(folder: Path) -> None:
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
     with path.open(encoding="utf-8") as stream:
-        for line in stream:
-            if line.endswith("\n"):
-                yield json.loads(line)
+        yield from (json.loads(line) for line in stream if line.endswith("\n"))
 
 
 LENSES = "valid/"  # masks that a lens's frames share, out of order
@@ -120,16 +102,6 @@ PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
 _FILTERED = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
-
-
-@dataclass(frozen=True, kw_only=True)
-class CaptureSummary:
-    """The written counts; num_resumed: frames of an earlier run."""
-
-    num_frames: dict[str, int]
-    num_joint_states: int
-    loss: LossReport
-    num_resumed: int = 0
 
 
 def write_capture(
@@ -140,61 +112,57 @@ def write_capture(
     robot: str = "",
     progress: Callable[[int], None] | None = None,
     identity: Mapping[str, Any] | None = None,
-) -> CaptureSummary:
+) -> tuple[dict[str, Any], int]:
     """Write all of `source` into `folder`, empty or of an interrupted run. Same input, same bytes.
 
     JPEG and PNG colour with the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded unit,
     or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the log's
-    URDF, or "". Raises InputError without a frame, UsageError if existing frames differ.
+    URDF, or "". Returns frames by camera, joint_states and loss, as in run.json, and the number of frames of an
+    earlier run. Raises InputError without a frame, UsageError if existing frames differ.
     """
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}
-    num_states = num_resumed = 0
-    with closing(Journal(folder, identity or {})) as journal:
-        for item in source.stored():
-            if isinstance(item, JointState):
-                states.add(item)
-                num_states += 1
-                continue
-            row, kept = _row(item, cameras), journal.next_kept()
-            if kept is None:
-                journal.add(_write_frame(folder, item, row, cameras[item.camera]))
-            else:
-                name = next((name for name in row if kept.row.get(name) != row[name]), "")
-                refuse_if(
-                    name,
-                    f"{folder}: --resume: {kept.row.get('color')}: {name} was {kept.row.get(name)}, is"
-                    f" {row.get(name)}",
-                    remedy="the source has changed; start over without --resume",
-                    error=UsageError,
-                )
-                num_resumed += 1
-            if progress is not None:
-                progress(journal.num_entries)
-        refuse_if(not journal.num_entries, f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
-        header = {
-            "format": FORMAT,
-            "version": VERSION,
-            "name": source.name,
-            "world_frame": source.world_frame,
-            "units": {"length": "m", "time": "ns", "angle": "rad"},
-            "pose": "T_world_camera, optical frame (x right, y down, z forward), quaternion x y z w",
-            "pixels": "pixel (0, 0) is centred at u = v = 0",
-            "has_clock": source.has_clock,
-            "cameras": cameras,
-            "joint_names": list(source.joint_names),
-            "sources": source.digests(),
-            "loss": asdict(source.loss),
-        }
-        _write_joints(folder / "joints.npz", states.columns())
-        _write_index(folder, header, journal, topics, robot)
-        journal.remove()
-    return CaptureSummary(
-        num_frames={name: camera["num_frames"] for name, camera in cameras.items()},
-        num_joint_states=num_states,
-        loss=source.loss,
-        num_resumed=num_resumed,
-    )
+    num_resumed = 0
+    journal = Journal(folder, identity or {})
+    for item in source.stored():
+        if isinstance(item, JointState):
+            states.add(item)
+            continue
+        row, kept = _row(item, cameras), journal.next_kept()
+        if kept is None:
+            journal.add(_write_frame(folder, item, row, cameras[item.camera]))
+        else:
+            name = next((name for name in row if kept.row.get(name) != row[name]), "")
+            refuse_if(
+                name,
+                f"{folder}: --resume: {kept.row.get('color')}: {name} was {kept.row.get(name)}, is {row.get(name)}",
+                remedy="the source has changed; start over without --resume",
+                error=UsageError,
+            )
+            num_resumed += 1
+        if progress is not None:
+            progress(journal.num_entries)
+    refuse_if(not journal.num_entries, f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": source.name,
+        "world_frame": source.world_frame,
+        "units": {"length": "m", "time": "ns", "angle": "rad"},
+        "pose": "T_world_camera, optical frame (x right, y down, z forward), quaternion x y z w",
+        "pixels": "pixel (0, 0) is centred at u = v = 0",
+        "has_clock": source.has_clock,
+        "cameras": cameras,
+        "joint_names": list(source.joint_names),
+        "sources": source.digests(),
+        "loss": asdict(source.loss),
+    }
+    logged = states.columns()
+    _write_joints(folder / "joints.npz", logged)
+    _write_index(folder, header, journal, topics, robot)
+    journal.path.unlink()
+    frames = {name: camera["num_frames"] for name, camera in cameras.items()}
+    return {"frames": frames, "joint_states": len(logged), "loss": header["loss"]}, num_resumed
 
 
 def _write_index(
@@ -290,9 +258,7 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
 
 
 def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
-    if not stored.places:
-        return {}
-    found = {"color": color, "depth": depth}
+    found = {"color": color, "depth": depth} if stored.places else {}
     for kind, place in zip(("color", "depth"), stored.places, strict=False):
         found |= {
             f"{kind}_file": place.file,

@@ -134,21 +134,17 @@ class Bag1Log(RawLog):
                 damage.add(f"{self.path.name}: bytes {offset} to {place} are damaged and were left out")
                 stream.seek(place)
 
-    def _connections(self) -> list[Part]:
+    def _connections(self) -> Iterator[Part]:
         with self.path.open("rb") as stream:
             stream.readline(64)
             first = self._record(stream, stream.tell())
             place = number(first.fields, "index_pos") if first is not None and first.opcode == BAG_HEADER else 0
-            if not 0 < place < self._size:
-                return []
-            stream.seek(place)
-            found = []
+            stream.seek(place if 0 < place < self._size else self._size)
             while (record := self._record(stream, stream.tell())) is not None and record.opcode == CONNECTION:
-                found.append(record)
-            return found
+                yield record
 
     def _record(self, stream: BinaryIO, offset: int) -> Part | None:
-        """Read a record or None; the stream is left after it."""
+        """Read a record; the stream is left after it."""
         head = self._head(stream)
         if head is None:
             return None
@@ -160,7 +156,7 @@ class Bag1Log(RawLog):
         return Part(offset, kind, body, is_cut, fields)
 
     def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
-        """Kind, fields and body length; the stream is left at the body."""
+        """Read a head; the stream is left at the body."""
         length = self._length(stream)
         if length is None or length > min(1 << 20, self._size - stream.tell()):  # those of connections hold a name
             return None
@@ -232,8 +228,9 @@ def records_in(content: bytes, offset: int) -> Iterator[Part]:
         body = end + 4
         at = body + _U32.unpack_from(content, end)[0]
         kind = fields.get("op", b"")
-        if at > len(content) or len(kind) != 1:
-            raise ValueError(f"{len(content) - body} bytes are not a record")
+        refuse_if(
+            at > len(content) or len(kind) != 1, f"{len(content) - body} bytes are not a record", error=ValueError
+        )
         yield Part(offset, kind[0], content[body:at], fields=fields)
 
 
@@ -276,7 +273,7 @@ class Db3Log(RawLog):
             raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
 
     def _copy(self, size: int) -> None:
-        """Copy the files, `size` [bytes] of the database. Raises InputError without room for it."""
+        """Copy the files; size [bytes]: of the database."""
         folder = Path(tempfile.mkdtemp(prefix="splatctrl-", dir=scratch_folder()))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         try:
@@ -344,10 +341,9 @@ class Db3Log(RawLog):
 def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
     found = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     refuse_if(not {"topics", "messages"} <= found, "no tables named topics and messages", error=ValueError)
-    definitions = {}
-    if "message_definitions" in found:
-        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        definitions = {kind: (encoding, text) for kind, encoding, text in database.execute(query)}
+    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    rows = database.execute(query) if "message_definitions" in found else ()
+    definitions = {kind: (encoding, text) for kind, encoding, text in rows}
     topics: dict[object, Topic] = {}
     for number, name, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
         definition_format, text = definitions.get(kind, ("", ""))

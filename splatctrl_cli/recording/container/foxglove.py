@@ -105,9 +105,12 @@ def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> A
 
     Raises ValueError, KeyError, TypeError or AttributeError if they do not decode.
     """
-    if encoding == "json":
-        return as_ros(schema, _object(json.loads(data)))
-    return as_ros(schema, read_protobuf(definition.encode("latin-1"), schema, data))
+    return as_ros(
+        schema,
+        _object(json.loads(data))
+        if encoding == "json"
+        else read_protobuf(definition.encode("latin-1"), schema, data),
+    )
 
 
 def as_ros(schema: str, message: Any) -> Any:

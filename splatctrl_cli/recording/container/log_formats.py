@@ -57,21 +57,17 @@ def unpack(path: Path, target: Path) -> str:
             written.write(piece)
 
 
-def unpack_messages(messages: Iterable[RawMessage], damage: Damage, size: int) -> Iterator[RawMessage]:
-    """Yield unpacked zstd messages of a log of `size` bytes; failures are counted."""
-    budget = Budget(size)
+def unpack_messages(messages: Iterable[RawMessage], damage: Damage, log_bytes: int) -> Iterator[RawMessage]:
+    """Yield unpacked zstd messages of a log of `log_bytes`; failures are counted."""
+    budget = Budget(log_bytes)
     for message in messages:
         try:
-            yield replace(message, data=_unpacked_message(message.data, budget))
+            with refuse_faults(lambda _: "is not a zstd frame", zstandard.ZstdError, error=BadBlockError):
+                size = zstandard.frame_content_size(message.data)
+            size = size if size >= 0 else len(unpacked_start(message.data, "zstd", MAX_BLOCK))
+            yield replace(message, data=budget.unpacked(message.data, "zstd", size))
         except BadBlockError as error:
             damage.add(f"{message.topic.name}: a message was left out: {error}")
-
-
-def _unpacked_message(data: bytes, budget: Budget) -> bytes:
-    with refuse_faults(lambda _: "is not a zstd frame", zstandard.ZstdError, error=BadBlockError):
-        size = zstandard.frame_content_size(data)
-    size = size if size >= 0 else len(unpacked_start(data, "zstd", MAX_BLOCK))
-    return budget.unpacked(data, "zstd", size)
 
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -101,11 +97,9 @@ class SessionLog(JoinedLog):
         If parts share a topic, all are read: skipping would reorder its messages between passes.
         """
         pushed = None if names is None or self._share(names) else names
-        for message in heapq.merge(
-            *(part.messages(damage, pushed) for part in self._parts), key=lambda message: message.log_time_ns
-        ):
-            if names is None or message.topic.name in names:
-                yield message
+        messages = (part.messages(damage, pushed) for part in self._parts)
+        merged = heapq.merge(*messages, key=lambda message: message.log_time_ns)
+        yield from (message for message in merged if names is None or message.topic.name in names)
 
     def _share(self, names: Collection[str]) -> bool:
         seen: set[str] = set()
@@ -132,7 +126,7 @@ def open_raw_log(path: Path) -> RawLog:
         log = open_kind(path)
         first = () if isinstance(log, Bag1Log) else islice(log.messages(Damage()), 5)  # some may be damaged
         is_packed = any(m.topic.encoding == "cdr" and m.data.startswith(_ZSTD) for m in first)  # CDR begins with a 0
-        unpack_all = partial(unpack_messages, size=sum(file.stat().st_size for file in log.files))
+        unpack_all = partial(unpack_messages, log_bytes=sum(file.stat().st_size for file in log.files))
         return JoinedLog(path, (log,), log.container, change=unpack_all) if is_packed else log
     if magic.startswith(_ZSTD):
         return _open_compressed(path)
@@ -287,7 +281,7 @@ FOREIGN = (
 def refuse_foreign(path: Path) -> None:
     """Raise InputError for a known unsupported format, with its name and export.
 
-    Some are supported containers with other contents (a .svo2 is an MCAP).
+    Some are supported containers with other contents (.svo2).
     """
     ends, names = (b"", []) if path.is_dir() else (_ends(path), _entries(path))
     for kind in FOREIGN:

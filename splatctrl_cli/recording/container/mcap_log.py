@@ -126,9 +126,7 @@ class McapLog(RawLog):
             if part.opcode == CHUNK and part.content:
                 yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
             elif part.opcode == MESSAGE and part.content:
-                yield from filter(
-                    None, [self._message(part.content, 0, len(part.content), part.offset, damage, names)]
-                )
+                yield from self._message(part.content, 0, len(part.content), part.offset, damage, names)
             elif part.opcode in {SCHEMA, CHANNEL}:
                 self._declare(part.opcode, part.content, damage)
         self._whole = state if damage.count == count else None
@@ -162,7 +160,7 @@ class McapLog(RawLog):
                     damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are not a record")
                 return
             if opcode == MESSAGE:
-                yield from filter(None, [self._message(records, start, at, offset, damage, names)])
+                yield from self._message(records, start, at, offset, damage, names)
             elif opcode in {SCHEMA, CHANNEL}:
                 self._declare(opcode, records[start:at], damage)
 
@@ -185,24 +183,22 @@ class McapLog(RawLog):
 
     def _message(
         self, records: bytes, start: int, end: int, offset: int, damage: Damage, names: Collection[str] | None
-    ) -> RawMessage | None:
+    ) -> Iterator[RawMessage]:
         if end - start < _MESSAGE.size:
             damage.add(f"{self.path.name}: a message record of {end - start} bytes")
-            return None
+            return
         channel, _, log_time_ns, _ = _MESSAGE.unpack_from(records, start)
         topic = self.channels.get(channel)
         if topic is None:
             damage.add(f"{self.path.name}: a message of undeclared channel {channel}")
-            return None
-        if names is not None and topic.name not in names:
-            return None
-        return RawMessage(
-            topic=topic,
-            log_time_ns=log_time_ns,
-            data=records[start + _MESSAGE.size : end],
-            file=self.path.name,
-            offset=offset,
-        )
+        elif names is None or topic.name in names:
+            yield RawMessage(
+                topic=topic,
+                log_time_ns=log_time_ns,
+                data=records[start + _MESSAGE.size : end],
+                file=self.path.name,
+                offset=offset,
+            )
 
     def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
         try:

@@ -9,6 +9,7 @@ mcap-protobuf-support.
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -52,7 +53,7 @@ class McapLog:
         self._store = get_typestore(Stores.ROS2_HUMBLE)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._sequence: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()  # messages by topic
 
     def add_joint_state(self, state: JointState, joint_names: Sequence[str]) -> None:
         """Add a /joint_states message, effort empty."""
@@ -154,14 +155,13 @@ class McapLog:
         if topic not in self._channels:
             qos = {"offered_qos_profiles": LATCHED} if topic == "/tf_static" else {}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
-        sequence = self._sequence.get(topic, 0)
-        self._sequence[topic] = sequence + 1
+        self._counts[topic] += 1
         self._writer.add_message(
             self._channels[topic],
             log_time=stamp_ns,
             data=bytes(self._store.serialize_cdr(message, kind)),
             publish_time=stamp_ns,
-            sequence=sequence,
+            sequence=self._counts[topic] - 1,
         )
 
 
@@ -194,7 +194,7 @@ class FoxgloveLog:
         self._writer = writer
         self._register = register
         self._channels: dict[str, int] = {}
-        self.counts: dict[str, int] = {}  # messages by topic
+        self.counts: Counter[str] = Counter()  # messages by topic
 
     def add_cloud(self, topic: str, stamp_ns: int, columns: Mapping[str, NDArray[Any]]) -> None:
         """Add a PointCloud of float32 or uint8 columns (N,), with x, y, z [m]."""
@@ -236,8 +236,7 @@ class FoxgloveLog:
         for frame, T in poses.items():
             each = message.transforms.add(parent_frame_id=WORLD, child_frame_id=frame)
             each.timestamp.FromNanoseconds(stamp_ns)
-            for axis, value in zip("xyz", T[:3, 3], strict=True):
-                setattr(each.translation, axis, float(value))
+            each.translation.x, each.translation.y, each.translation.z = T[:3, 3].tolist()
             for axis, value in zip("xyzw", quat_from_rotation(T[:3, :3]), strict=True):
                 setattr(each.rotation, axis, float(value))
         self._add(topic, stamp_ns, message)
@@ -280,10 +279,13 @@ class FoxgloveLog:
         self._write(topic, stamp_ns, message.SerializeToString(deterministic=True))
 
     def _write(self, topic: str, stamp_ns: int, data: bytes) -> None:
-        sequence = self.counts.get(topic, 0)
-        self.counts[topic] = sequence + 1
+        self.counts[topic] += 1
         self._writer.add_message(
-            self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, sequence=sequence, data=data
+            self._channels[topic],
+            log_time=stamp_ns,
+            publish_time=stamp_ns,
+            sequence=self.counts[topic] - 1,
+            data=data,
         )
 
 

@@ -128,7 +128,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
 
 
 def _present(description: Description, loss: LossReport) -> list[ListedView]:
-    """Keep views with files; others count as unpaired. Raises InputError for a file outside."""
+    """Keep views with files; others count as unpaired."""
     root, present, absent = description.root.absolute(), [], []
     for view in description.listed:
         files = [whole_file(path) for path in (view.color, view.depth, view.valid) if path is not None]

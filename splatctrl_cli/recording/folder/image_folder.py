@@ -5,6 +5,7 @@ Dataset layouts are known by their own files, without a description.
 
 import heapq
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -66,8 +67,7 @@ class ImageFolderSource(FrameSource):
         self.name = path.name
         self._descriptions = tuple(map(fill_transforms, descriptions))
         self._description = self._descriptions[0]
-        stamps = self._description.stamps
-        self.has_clock = stamps.rate is not None or stamps.names
+        self.has_clock = self._description.stamps.rate is not None or self._description.stamps.names
         self._loss = LossReport()
         self._damaged: list[str] = []
         self._num_invalid = 0
@@ -83,15 +83,12 @@ class ImageFolderSource(FrameSource):
         self.cameras = tuple(names) if options.cameras is None else options.cameras
         refuse_unknown_cameras(path, self.cameras, names)
         self._views = [view for view in self._views if view.camera in self.cameras]
-        self.depth_fault = InputError(
-            f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
-            remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
-        )
-
-    @property
-    def has_depth(self) -> bool:
-        """True if any view has a depth file; without, every depth is 0."""
-        return any(view.depth is not None for view in self._views)
+        if all(view.depth is None for view in self._views):  # every depth is 0
+            self.depth_fault = InputError(
+                f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
+                remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without"
+                " depth",
+            )
 
     @property
     def loss(self) -> LossReport:
@@ -106,8 +103,8 @@ class ImageFolderSource(FrameSource):
 
     def _in_metres(self) -> str:
         """Convert lengths that look like millimetres or centimetres; return a note, or ""."""
-        places = [view.T_world_camera[:3, 3] for view in self._views]
-        apart = float(np.linalg.norm(np.ptp(places, axis=0)))  # the diagonal of their box, in the unit of the poses
+        places = np.ptp([view.T_world_camera[:3, 3] for view in self._views], axis=0)
+        apart = float(np.linalg.norm(places))  # the diagonal of their box, in the unit of the poses
         for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():
             depth = self._depth(view, self._lens(view))
             if depth is None or not (depth > 0).any():
@@ -132,11 +129,8 @@ class ImageFolderSource(FrameSource):
             stored = self._stored_frame(view)
             if stored is None:
                 continue
-            if (
-                view.depth is not None
-                and view.camera not in checked
-                and check_depth(stored.frame.depth, str(view.depth), view.depth_scale)
-            ):
+            is_next = view.depth is not None and view.camera not in checked
+            if is_next and check_depth(stored.depth, str(view.depth), view.depth_scale):
                 checked.add(view.camera)
             yield stored
 
@@ -276,16 +270,14 @@ def _corrected(camera: CameraTable) -> Lens:
 
 
 def _float_pixels(path: ImageFile) -> NDArray[np.float32] | None:
-    if path.suffix == ".npy":
-        try:
-            return np.asarray(npy_of(path.read_bytes()), dtype=np.float32)
-        except DAMAGE:
-            return None
     if path.suffix == ".pfm" and isinstance(path, Path):
-        try:
+        with suppress(InputError):
             return read_pfm(path)
-        except InputError:
-            return None
+        return None
+    if path.suffix == ".npy":
+        with suppress(*DAMAGE):
+            return np.asarray(npy_of(path.read_bytes()), dtype=np.float32)
+        return None
     pixels = decode_file(path.read_bytes(), color=False)
     return None if pixels is None else pixels.astype(np.float32)
 

@@ -2,10 +2,10 @@
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 CAMERA = "camera"  # the name of a layout's only lens
-Key = TypeVar("Key", int, str)
 _WHOLE = "check that the folder is whole"
 _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
 
@@ -92,22 +91,6 @@ def list_views(path: Path, views: Sequence[ListedView], num_colors: int, num_dep
 def move_poses(pairs: Description, change: Callable[[Float64], Float64]) -> Description:
     views = (v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in pairs.listed)
     return replace(pairs, listed=tuple(views))
-
-
-def pair_names(
-    path: Path,
-    colors: Mapping[Key, Path],
-    depths: Mapping[Key, Path],
-    pose: Callable[[Key], Float64 | None],
-    name: Callable[[Key], str] = str,
-) -> Description:
-    """Pair files of equal key, which gives name and pose."""
-    views = [
-        ListedView(name=name(key), color=color, depth=depths[key], matrix=pose(key))
-        for key, color in colors.items()
-        if key in depths
-    ]
-    return list_views(path, views, len(colors), len(depths))
 
 
 def pair_stamps(

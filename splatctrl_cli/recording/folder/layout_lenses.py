@@ -99,11 +99,11 @@ def _poses(path: Path) -> dict[str, Float64]:
     """T_world_camera by stamp [s] as written."""
     poses = {}
     for where, words, values in read_rows(path):
-        if len(values) != 7 or not np.isfinite(values).all():
-            raise InputError(
-                f"{where}: expected seconds, a rotation vector and a translation, got {' '.join(words)!r}",
-                remedy="copy the file again",
-            )
+        refuse_if(
+            len(values) != 7 or not np.isfinite(values).all(),
+            f"{where}: expected seconds, a rotation vector and a translation, got {' '.join(words)!r}",
+            remedy="copy the file again",
+        )
         poses[words[0]] = invert_transform(pose_at(values[4:], cv2.Rodrigues(np.array(values[1:4]))[0]))
     return poses
 

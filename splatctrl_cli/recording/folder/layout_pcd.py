@@ -160,7 +160,6 @@ def _unfit(path: Path, far: float, what: str) -> InputError:
 
 
 def _head(path: Path) -> Any:
-    """Read a header. Raises InputError if not organised or without colour."""
     lines: list[str] = []
     with _refuse_damage(path):
         with path.open("rb") as stream:

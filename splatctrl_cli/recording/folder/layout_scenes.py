@@ -13,9 +13,6 @@ Open3D and Redwood: a colour folder, ``depth/``, ``trajectory.log``, ``camera_in
 open3d.data (RedwoodIndoorLivingRoom1 with ``colors/``, LoungeRGBDImages, BedroomRGBDImages). Poses are camera to
 world (examples/python/reconstruction_system/integrate_scene.py). Images match them in natural order
 (open3d_example.py, get_rgbd_file_lists), or by number if their counts differ.
-
-Described by hand (docs/input.md): Replica of NICE-SLAM and Semantic-NeRF, ICL-NUIM in TUM's form, ScanNet of
-SensReader.
 """
 
 import re
@@ -44,7 +41,6 @@ from splatctrl_cli.recording.folder.layout import (
     move_poses,
     number_key,
     own_depth_camera,
-    pair_names,
     pinhole,
     pose_or_none,
     read_json,
@@ -82,7 +78,12 @@ def read_frames(folder: Path, options: SourceOptions) -> Description:
     matrices = {
         name: pose_or_none(read_matrix_file(file)) for name, file in zip(colors, poses, strict=True) if file.is_file()
     }
-    pairs = pair_names(folder, colors, depths, matrices.get)
+    views = [
+        ListedView(name=name, color=color, depth=depths[name], matrix=matrices.get(name))
+        for name, color in colors.items()
+        if name in depths
+    ]
+    pairs = list_views(folder, views, len(colors), len(depths))
     first = pairs.listed[0]
     places = (colors[first.name].parent, folder, folder.parent)
     if any((place / name).is_file() for place in places for name in ("_info.txt", "info.txt")):

@@ -198,7 +198,7 @@ def _parts(name: str) -> tuple[str, ...]:
 def _name_cameras(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
     """Name cameras by the namespace's last part if unique, else all of it.
 
-    Names are folders: other characters than letters, digits, ``_``, ``-``, ``.`` become ``_``.
+    Names are folders: unusual characters become ``_``.
     """
     short, long = (
         [re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:80] or "camera" for name in names]

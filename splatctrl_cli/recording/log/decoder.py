@@ -176,7 +176,7 @@ def _names(description: Any) -> list[str]:
 
 
 def _check_fields(store: Any) -> None:
-    """Raise ValueError for a missing standard field; case, lengths and extras are free."""
+    """Raise ValueError for a missing standard field."""
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}

@@ -307,10 +307,11 @@ def _maps(
 ) -> tuple[Float32, Float32]:
     K, P = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], dtype=np.float64) for k in (lens, result))
     size = (result.width, result.height)
-    if model == "equidistant":
-        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], R, P, size, cv2.CV_32FC1)
-    else:
-        maps = cv2.initUndistortRectifyMap(K, coefficients, R, P, size, cv2.CV_32FC1)
+    maps = (
+        cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], R, P, size, cv2.CV_32FC1)
+        if model == "equidistant"
+        else cv2.initUndistortRectifyMap(K, coefficients, R, P, size, cv2.CV_32FC1)
+    )
     return np.asarray(maps[0]), np.asarray(maps[1])
 
 

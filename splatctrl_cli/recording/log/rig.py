@@ -314,7 +314,7 @@ class _Builder:
         )
 
     def _check_clock(self) -> None:
-        """Raise InputError if a clock went back: stamps are then ambiguous."""
+        """Raise InputError if a clock went back."""
         for name in (self._topics.color, self._topics.depth):
             clock = self._survey.topics[name].clock
             refuse_if(

@@ -340,10 +340,9 @@ class RosLogSource(FrameSource):
             if depth.compressed is None:
                 lost.num_invalid += num_invalid(depth.pixels)
             stored = _stored_frame(planned, color, depth, human[0] if human else None, messages)
-            if camera.name not in checked:
-                scale = depth.unit(camera.depth_scale)
-                if check_depth(stored.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
-                    checked.add(camera.name)
+            of_depth = f"{self._log.path}: topic {camera.depth_topic}"
+            if camera.name not in checked and check_depth(stored.depth, of_depth, depth.unit(camera.depth_scale)):
+                checked.add(camera.name)
             yield stored
 
 

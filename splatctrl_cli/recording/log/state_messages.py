@@ -117,24 +117,19 @@ def _franka(message: Any) -> _Read:
 def _controller(message: Any) -> _Read:
     """Filled `feedback` and `reference`, else the older `actual` and `desired` (control_msgs)."""
     names = message.joint_names
-    actual, wanted = (
-        _find_filled(message, fields, len(names)) for fields in (("feedback", "actual"), ("reference", "desired"))
-    )
+
+    def filled(*fields: str) -> Any:
+        there = (getattr(message, name) for name in fields if name in message.__dataclass_fields__)
+        return next((point for point in there if len(point.positions) == len(names)), None)
+
     what = f"a controller state of {len(names)} joints without positions"
-    actual, commanded = (
-        require(actual, what, error=UndecodableMessageError),
-        _NONE if wanted is None else wanted.velocities,
-    )
+    actual = require(filled("feedback", "actual"), what, error=UndecodableMessageError)
+    commanded = getattr(filled("reference", "desired"), "velocities", _NONE)
     return "a controller state", names, actual.positions, actual.velocities, commanded, None
 
 
-def _find_filled(message: Any, fields: tuple[str, ...], num_joints: int) -> Any:
-    there = [getattr(message, name) for name in fields if name in message.__dataclass_fields__]
-    return next((point for point in there if len(point.positions) == num_joints), None)
-
-
 def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
-    """Every point of a planned motion, from log time without a header stamp."""
+    """Every point of a planned motion."""
     names = tuple(str(name) for name in message.joint_names)
     start_ns = stamp_ns(message.header) or log_time_ns
     states = []

@@ -132,14 +132,15 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
 
 
 def _tracks(topics: Sequence[TopicSurvey]) -> list[RawTrack]:
-    """A topic's states by their joints, in file order, at the headers' stamps."""
+    """A track per topic and set of joints."""
     found = []
     for topic in topics:
         for stream in topic.joints.streams.values():
-            columns, times = stream.columns(), {"stamp_ns": stream.stamp_ns, "log_ns": stream.log_time_ns}
+            names, columns = stream.names, stream.columns()
             if "velocity" not in columns:
-                columns["velocity"] = absent(len(stream), len(stream.names))
-            found.append(RawTrack(where=topic.topic.name, names=stream.names, **times, **columns))
+                columns["velocity"] = absent(len(stream), len(names))
+            stamp_ns, log_ns, where = stream.stamp_ns, stream.log_time_ns, topic.topic.name
+            found.append(RawTrack(where=where, names=names, stamp_ns=stamp_ns, log_ns=log_ns, **columns))
     return found
 
 
@@ -212,7 +213,7 @@ def _apart(base: RawTrack, other: RawTrack, shared: Sequence[str]) -> float:
 
 
 def _num_turns(track: RawTrack, names: Sequence[str]) -> int:
-    """Count states far from both neighbours, which are close: no joint returns so fast."""
+    """Count states far from both neighbours, which are close."""
     columns = [track.names.index(name) for name in names]
     num, order = 0, np.argsort(track.stamp_ns, kind="stable")
     seconds = track.stamp_ns[order] * 1e-9
@@ -361,7 +362,7 @@ def _refuse_mixed(step: float, state: int, where: str) -> None:
 def _drift(late: Float64, seconds: Float64) -> tuple[float, float]:
     """Growth [s] of the log delay from first to last quarter, and the seconds between.
 
-    Each quarter's tenth percentile counts: a message may be logged late, not early. 0 if it is a step or a stall.
+    By each quarter's tenth percentile, as a message may be logged late; 0 if it is a step or a stall.
     """
     quarter = len(late) // 4
     span = float(np.median(seconds[-quarter:]) - np.median(seconds[:quarter])) if quarter >= 10 else 0.0

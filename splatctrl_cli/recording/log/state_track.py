@@ -59,10 +59,7 @@ def smoothed_seconds(stamp_ns: Stamps) -> Float64:
 
 
 def _numbers(seconds: Float64, period: float) -> Float64:
-    """Number (T,) of each state since the first, lost ones counted.
-
-    A clock that slowly follows the stamps takes jitter up to half a period for no loss.
-    """
+    """Number (T,) of each state since the first, lost ones counted."""
     numbers = np.zeros(len(seconds))
     clock, number = 0.0, 0
     for first, last in ranges(len(seconds)):

@@ -137,8 +137,7 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
 def write_rows(stream: IO[bytes], rows: Table) -> None:
     """Write float64 as .npy, a block at a time."""
     np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)})
-    for block in blocks_of(rows):
-        stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
+    stream.writelines(np.ascontiguousarray(block, dtype="<f8").tobytes() for block in blocks_of(rows))
 
 
 def npy_bytes(depth: Float32) -> bytes:
@@ -228,7 +227,7 @@ class FrameSource:
     """A `RecordSource` by stamp: joint states, and `_frames`, which are read as stored.
 
     world_frame: the source's frame of poses. states: by stamp, without reading frames. joint_topics: those that a log
-    has, None if unknown.
+    has, None if unknown. depth_fault: why no frame has depth, None where some may; only image folders have one.
     """
 
     name: str
@@ -238,6 +237,7 @@ class FrameSource:
     world_frame: str
     states: StateColumns = NO_STATES
     joint_topics: JointTopics | None = None
+    depth_fault: InputError | None = None
 
     @property
     def loss(self) -> LossReport:

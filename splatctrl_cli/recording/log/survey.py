@@ -30,7 +30,7 @@ from splatctrl_cli.recording.log.decoder import (
 )
 from splatctrl_cli.recording.log.messages import ImageMessage, read_image
 from splatctrl_cli.recording.log.registration import TfTree
-from splatctrl_cli.recording.log.state_messages import STANDARD_TYPES, STATE_TYPES, JointLog, RawJoints, read_states
+from splatctrl_cli.recording.log.state_messages import STANDARD_TYPES, STATE_TYPES, JointLog, read_states
 from splatctrl_cli.recording.log.video import VideoLog
 from splatctrl_cli.records import Bool, Float64
 
@@ -99,9 +99,7 @@ def dropped(stamps_ns: Stamps) -> tuple[int, int, float]:
         return 0, 0, 0.0
     period = float(np.median(intervals))
     is_steady = np.abs(intervals - period) <= IMAGES_STEADY * period
-    gaps = intervals[intervals > IMAGES_GAP * period]
-    if is_steady.mean() < 0.75:
-        gaps = gaps[:0]
+    gaps = intervals[(intervals > IMAGES_GAP * period) & (is_steady.mean() >= 0.75)]
     return len(gaps), int((np.rint(gaps / period) - 1).sum()), period
 
 
@@ -226,7 +224,12 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
         if entry.calibration is not None and entry.calibration.cut and entry.calibration.is_possible:
             result.damage.remark(f"{message.topic.name}: says {entry.calibration.cut}: K is moved and scaled to that")
     elif kind in STATE_TYPES and (message.topic.definition or kind in STANDARD_TYPES):
-        entry.joints.extend(_states(result, decoder.decode(message), message))
+        decoded = decoder.decode(message)
+        states = read_states(decoded, kind, message.log_time_ns)
+        if result.by_log_time:
+            late_ns = message.log_time_ns - stamp_ns(decoded.header)
+            states = [replace(state, stamp_ns=state.stamp_ns + late_ns) for state in states]
+        entry.joints.extend(states)
     elif kind in {TRANSFORM, OPTION} and message.topic.name.startswith("/device_"):
         result.realsense.add(message.topic.name, decoder.decode(message))
     elif kind in TRANSFORMS:
@@ -282,14 +285,6 @@ def _calibration(message: Any) -> Calibration | None:
         cut=", ".join(filter(None, (region, binning))),
         is_possible=width > 0 and height > 0 and x + width <= size[0] and y + height <= size[1],
     )
-
-
-def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
-    states = read_states(decoded, message.topic.type_name, message.log_time_ns)
-    if not result.by_log_time:
-        return states
-    late_ns = message.log_time_ns - stamp_ns(decoded.header)
-    return [replace(state, stamp_ns=state.stamp_ns + late_ns) for state in states]
 
 
 def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
@@ -355,9 +350,8 @@ def robot_descriptions(log: RawLog) -> list[tuple[str, str]]:
     """Topic or node and text of a log's URDFs, each once, from first messages; reads only their topics."""
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
-    wanted = own or {t.name for t in topics if t.type_name == EVENT}
-    if not topics:  # no index
-        wanted = {f"/{NAME}", EVENTS}
+    of_events = {t.name for t in topics if t.type_name == EVENT} if topics else {f"/{NAME}", EVENTS}  # no index
+    wanted = own or of_events
     found: dict[str, str] = {}
     decoder = MessageDecoder()
     for message in log.messages(Damage(), wanted) if wanted else ():

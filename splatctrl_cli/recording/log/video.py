@@ -189,9 +189,8 @@ class VideoFileLog(RawLog):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        beside = next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None)
         beside = require(
-            beside,
+            next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None),
             f"{path}: no stamps beside it",
             remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
             + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),

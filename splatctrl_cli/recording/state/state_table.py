@@ -70,7 +70,6 @@ class CsvTable:
         return np.array(stamps, dtype=np.int64), {name: Rows(file) for name, file in files.items()}
 
     def _blocks(self) -> Iterator[dict[int, list[str]]]:
-        """Yield rows by line number, without empty lines."""
         with self.path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream)
             lines = ((reader.line_num, row) for row in reader if row)

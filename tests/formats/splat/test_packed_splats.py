@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from splatctrl_cli.formats.splat.gaussian_ply import differences
 from splatctrl_cli.formats.splat.gltf import read_gltf, write_glb
 from splatctrl_cli.formats.splat.packed_splats import read_splat, read_spz, spz_bound, write_splat, write_spz
-from splatctrl_cli.formats.splat.splat_format import differences
 from splatctrl_cli.formats.splat.usd import read_usd, write_usd
 from splatctrl_cli.records import GaussianSet
 from tests.formats.splat.test_gaussian_ply import changed, gaussian_set

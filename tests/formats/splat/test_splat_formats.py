@@ -9,8 +9,7 @@ import pytest
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.formats.splat import usd
-from splatctrl_cli.formats.splat.gaussian_ply import REFERENCE_PLY, write_gaussian_ply
-from splatctrl_cli.formats.splat.splat_format import SplatFormat, differences
+from splatctrl_cli.formats.splat.gaussian_ply import REFERENCE_PLY, SplatFormat, differences, write_gaussian_ply
 from splatctrl_cli.formats.splat.splats import (
     FORMATS,
     as_gaussians,

@@ -21,8 +21,7 @@ from splatctrl_cli.jobs.score.reference import missing_views
 from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.score.views import CloudSettings
 from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
-from splatctrl_cli.recording.folder.dtu_source import DtuSource
-from splatctrl_cli.recording.folder.idr import write_idr
+from splatctrl_cli.recording.folder.idr import DtuSource, write_idr
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 from tests.evaluate.test_protocols import write_observed

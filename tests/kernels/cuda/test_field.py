@@ -258,7 +258,7 @@ def test_a_field_on_a_device_answers_as_that_of_the_processor(device: Memory) ->
     points, config = queries(100), FieldConfig()
     for distance in ("safe", "hard", "gpdf"):
         named = replace(config, distance=distance)
-        field = OnDevice.of(*cloud(NUM), named, device)
+        field = OnDevice(Spheres.of(*cloud(NUM)), named, device)
         found, expected = field.distance(points), field_over(Spheres.of(*cloud(NUM)), named).query(points)[0]
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2 * config.truncation)
         np.testing.assert_array_equal(field.nearest(points), SphereField(Spheres.of(*cloud(NUM))).nearest(points))

@@ -16,7 +16,7 @@ import pytest
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
 from splatctrl_cli.recording.folder.dtu import DtuView
-from splatctrl_cli.recording.folder.dtu_source import shrink_view
+from splatctrl_cli.recording.folder.idr import shrink_view
 from splatctrl_cli.recording.folder.poses import OPENGL_FROM_OPTICAL
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame

@@ -14,8 +14,15 @@ from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, project
 from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
-from splatctrl_cli.recording.folder.dtu_source import DtuSource, shrink_view, view_numbers
-from splatctrl_cli.recording.folder.idr import decompose, projection, read_idr, write_idr
+from splatctrl_cli.recording.folder.idr import (
+    DtuSource,
+    decompose,
+    projection,
+    read_idr,
+    shrink_view,
+    view_numbers,
+    write_idr,
+)
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Intrinsics
 from tests.recording.log.make_log import frames_of
