@@ -63,7 +63,7 @@ def measured(name: str, scene: Scene) -> list[str]:
     """The field before and after marching."""
     centers, radii, points, truth = scene
     field, exact = GpdfField(Spheres.of(centers, radii)), SphereField(Spheres.of(centers, radii))
-    errors = {steps: march(field, exact, points, steps=steps).distance - truth for steps in STEPS}
+    errors = {steps: march(field, exact, points, steps=steps)[2] - truth for steps in STEPS}
     plain, hard = (rms(one.query(points)[0] - truth) for one in (field, exact))
     figures = (plain, *map(rms, errors.values()), float(errors[5].mean()), hard)
     return [name, str(len(radii)), *(f"{1e3 * value:.2f}" for value in figures)]

@@ -139,8 +139,7 @@ def checked_points(points: Floats) -> Float64:
 def shaped_points(points: Floats) -> Float64:
     """Points as float64. Raises InputError unless (Q, 3)."""
     array = np.ascontiguousarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"query points: expected shape (Q, 3), got {array.shape}")
+    refuse_if(array.ndim != 2 or array.shape[1] != 3, f"query points: expected shape (Q, 3), got {array.shape}")
     return array
 
 

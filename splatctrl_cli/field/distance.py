@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -230,23 +229,14 @@ def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Di
     return kernel if config.distance == name else SafeField(SphereField(spheres, threads=threads), kernel)
 
 
-@dataclass(frozen=True, kw_only=True)
-class March:
-    """Result of a march from Q points.
-
-    hit (Q, 3) [m]: points reached; rest (Q,) [m]: the field there; distance (Q,) [m]: length walked plus rest.
-    """
-
-    distance: Float64
-    hit: Float64
-    rest: Float64
-
-
-def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps: int = fixed.MARCH_STEPS) -> March:
+def march(
+    field: DistanceField, exact: DistanceField, points: Float64, *, steps: int = fixed.MARCH_STEPS
+) -> tuple[Float64, Float64, Float64]:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
-    Each of the `steps` goes against the local gradient, as far as the field reads, at most the `exact` distance: it
-    crosses no sphere. Points at or behind the zero level, which Matern's field has before the spheres
+    Returns points reached (Q, 3) [m], the field there (Q,) [m], and length walked plus that (Q,) [m]. Each of the
+    `steps` goes against the local gradient, as far as the field reads, at most the `exact` distance: it crosses no
+    sphere. Points at or behind the zero level, which Matern's field has before the spheres
     (`slabs.planar_zero_level`), stay. Raises UsageError for less than one step.
     """
     refuse_if(steps < 1, f"marching: expected at least 1 step, got {steps}", error=UsageError)
@@ -259,7 +249,7 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
         hit -= length[:, None] * direction
         walked += np.where(direction.any(axis=1), length, 0.0)  # without a slope there is nowhere to go
         rest, gradient = field.query(hit)
-    return March(distance=walked + rest, hit=hit, rest=rest)
+    return hit, rest, walked + rest
 
 
 class OnDevice:

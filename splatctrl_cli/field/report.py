@@ -10,7 +10,7 @@ from splatctrl_cli.config.fixed import NEAR_ONE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.field.distance import KERNELS
 from splatctrl_cli.field.grid_cells import RESOLUTION, exact_channel
-from splatctrl_cli.records import DistanceGrid, Float32
+from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.voxels import VoxelState
 
 BIN = 0.05  # bin k of the histogram is about k times this length
@@ -64,7 +64,7 @@ def grid_statistics(grid: DistanceGrid) -> dict[str, Any]:
 
 def _measure(part: DistanceGrid) -> tuple[dict[str, Any], dict[str, float]]:
     """Counts and sums of some planes, and their largest values; lowest: negative."""
-    channels, sdf = part.channels, _floats(part, "sdf")
+    channels, sdf = part.channels, np.asarray(part.channels["sdf"], np.float32)
     known = sdf[np.isfinite(sdf)]
     inside = int(np.count_nonzero(known <= 0))
     sums: dict[str, Any] = {"cells": sdf.size, "blank": sdf.size - known.size, "inside": inside}
@@ -72,7 +72,7 @@ def _measure(part: DistanceGrid) -> tuple[dict[str, Any], dict[str, float]]:
     if "observed" in channels:
         sums["states"] = np.bincount(channels["observed"].ravel(), minlength=len(VoxelState))
     if "gradient" in channels:
-        gradient = _floats(part, "gradient")
+        gradient = np.asarray(channels["gradient"], np.float32)
         lengths = np.sqrt(np.einsum("...i,...i->...", gradient, gradient)).ravel()
         lengths = lengths[np.isfinite(lengths)]
         bins = np.minimum((lengths / BIN + 0.5).astype(np.int64), NUM_BINS - 1)
@@ -85,13 +85,9 @@ def _measure(part: DistanceGrid) -> tuple[dict[str, Any], dict[str, float]]:
         exact = exact_channel(part)
         sums["hard"] = int(np.count_nonzero(np.abs(sdf - exact) <= RESOLUTION))
         for name in (name for name in KERNELS if name in channels):
-            over = _floats(part, name) - exact
+            over = np.asarray(channels[name], np.float32) - exact
             sums[name], most[name] = int(np.count_nonzero(over > RESOLUTION)), float(over.max())
     return sums, most
-
-
-def _floats(part: DistanceGrid, channel: str) -> Float32:
-    return np.asarray(part.channels[channel], np.float32)
 
 
 def _parts(grid: DistanceGrid) -> Iterator[DistanceGrid]:

@@ -1,6 +1,6 @@
 """Pairs of links to check for self-collision, and reasons to omit others (SRDF: MoveIt's)."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -9,23 +9,15 @@ import numpy as np
 from defusedxml import ElementTree
 
 from splatctrl_cli.config.fixed import NEVER_MARGIN
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64, Index
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
 
 
-@dataclass(frozen=True, kw_only=True)
-class DisabledPair:
-    """Two links exempt from collision, and the SRDF's reason ("Adjacent", "Never", ...)."""
-
-    links: tuple[str, str]
-    reason: str
-
-
-def read_srdf(path: Path, urdf: UrdfFile) -> tuple[tuple[DisabledPair, ...], tuple[DisabledPair, ...]]:
-    """``disable_collisions`` pairs within `urdf`, and those with an unknown link.
+def read_srdf(path: Path, urdf: UrdfFile) -> tuple[dict[frozenset[str], str], list[tuple[str, str]]]:
+    """Reasons ("Adjacent", "Never", ...) by ``disable_collisions`` pair in `urdf`, and pairs with an unknown link.
 
     Raises InputError for a file that is no SRDF, a pair without links, or no pair within the URDF.
     """
@@ -37,20 +29,23 @@ def read_srdf(path: Path, urdf: UrdfFile) -> tuple[tuple[DisabledPair, ...], tup
     if root.tag != "robot" or root.find("link") is not None or root.find("joint") is not None:
         got = "a URDF" if root.tag == "robot" else f"<{root.tag}>"
         raise InputError(f"{path}: expected an SRDF, got {got}", remedy="give the file with <disable_collisions>")
-    pairs = []
+    known: dict[frozenset[str], str] = {}
+    foreign: list[tuple[str, str]] = []
     for element in root.findall("disable_collisions"):
         first, second = element.get("link1"), element.get("link2")
         if not first or not second:
             raise InputError(f"{path}: disable_collisions: expected link1 and link2, got {dict(element.attrib)}")
-        pairs.append(DisabledPair(links=(first, second), reason=element.get("reason") or "no reason given"))
-    known = tuple(pair for pair in pairs if set(pair.links) <= set(urdf.links))
-    if not known:
-        got = f"{len(pairs)} of links that {urdf.path.name} lacks" if pairs else "none"
-        raise InputError(
-            f"{path}: expected disable_collisions between links of the URDF, got {got}",
-            remedy="give the SRDF of the same robot, or none",
-        )
-    return known, tuple(pair for pair in pairs if pair not in known)
+        if {first, second} <= set(urdf.links):
+            known[frozenset((first, second))] = element.get("reason") or "no reason given"
+        else:
+            foreign.append((first, second))
+    refuse_if(
+        not known,
+        f"{path}: expected disable_collisions between links of the URDF, got "
+        + (f"{len(foreign)} of links that {urdf.path.name} lacks" if foreign else "none"),
+        remedy="give the SRDF of the same robot, or none",
+    )
+    return known, foreign
 
 
 CHUNK = 200  # postures at a time
@@ -86,7 +81,7 @@ class SelfCollisionPairs:
 
 def self_collision_pairs(
     model: RobotModel,
-    disabled: Sequence[DisabledPair] = (),
+    disabled: Mapping[frozenset[str], str] | None = None,
     *,
     num_postures: int = 2000,
     seed: int = 0,
@@ -100,7 +95,7 @@ def self_collision_pairs(
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)
-    known = {frozenset(pair.links): f"SRDF: {pair.reason}" for pair in disabled} | joined_links(model, links)
+    known = {pair: f"SRDF: {reason}" for pair, reason in (disabled or {}).items()} | joined_links(model, links)
     num_postures = 0 if disabled else num_postures
     a, b = np.triu_indices(len(links), k=1)
     gaps = _gaps(model, owner, np.stack([a, b], axis=1), num_postures, seed)
@@ -126,11 +121,12 @@ def self_collision_pairs(
     )
 
 
-def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Index:
+def without_disabled(model: RobotModel, disabled: Collection[frozenset[str]]) -> Index:
     """`self_pairs` (P, 2) without links that `disabled` (an SRDF) names."""
-    off = {frozenset(pair.links) for pair in disabled}
     links, pairs = model.sphere_set.links, model.self_pairs()
-    return np.asarray(pairs[np.array([frozenset((links[a], links[b])) not in off for a, b in pairs], dtype=bool)])
+    return np.asarray(
+        pairs[np.array([frozenset((links[a], links[b])) not in disabled for a, b in pairs], dtype=bool)]
+    )
 
 
 def fixtures(model: RobotModel) -> set[str]:

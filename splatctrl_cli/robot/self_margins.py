@@ -3,7 +3,7 @@
 Spheres decide where far enough apart, else triangles, exactly (coal). T postures, J joints, S spheres, K pairs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -25,7 +25,7 @@ from splatctrl_cli.geometry import face_normals, invert_transform, transform_poi
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import DisabledPair, fixtures, joined_links, random_postures
+from splatctrl_cli.robot.self_collision import fixtures, joined_links, random_postures
 
 LinkNames = tuple[str, str]
 Depth = Callable[[Float64], Float64]
@@ -106,7 +106,7 @@ class SelfSurfaces:
         self,
         model: RobotModel,
         solids: Mapping[str, Sequence[Solid]],
-        disabled: Sequence[DisabledPair] = (),
+        disabled: Collection[frozenset[str]] = (),
         recorded: Float64 | None = None,
     ) -> None:
         """model: with coverage of these solids; recorded: logged postures (R, J)."""
@@ -124,7 +124,7 @@ class SelfSurfaces:
             [(a, b) for a, b in model.self_pairs() if not {leaders[links[a]], leaders[links[b]]} <= solid_bodies],
             dtype=np.int64,
         ).reshape(-1, 2)
-        off = {frozenset(pair.links) for pair in disabled} | set(joined_links(model, tuple(solids)))
+        off = {*disabled, *joined_links(model, tuple(solids))}
         found = [(a, b) for a, b in combinations(solids, 2) if frozenset((a, b)) not in off]
         self.fused = self._never_apart(found, recorded)
         self.pairs: tuple[LinkNames, ...] = tuple(pair for pair in found if pair not in self.fused)

@@ -19,7 +19,7 @@ from splatctrl_cli.planner.configuration_clearance import Clearance, Solids
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import MeshDistance, Solid, read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import DisabledPair, random_postures
+from splatctrl_cli.robot.self_collision import random_postures
 from splatctrl_cli.robot.self_margins import (
     KeptMargin,
     LinkSurface,
@@ -169,7 +169,7 @@ def test_a_body_without_geometry_is_judged_by_its_spheres(tmp_path: Path) -> Non
 def test_pairs_of_an_srdf_or_that_no_posture_parts_are_not_judged(tmp_path: Path) -> None:
     model, _ = folding_arm(tmp_path, covering_spheres())
     solids = read_solids(model.urdf)
-    off = [DisabledPair(links=("drum", "block"), reason="Never")]
+    off = {frozenset(("drum", "block"))}
     silent = SelfSurfaces(model, solids, off)
     assert silent.pairs == silent.names == ()
     assert nearest(model, silent, FOLDED)[0] == np.inf

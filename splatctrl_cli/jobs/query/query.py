@@ -106,7 +106,7 @@ class SceneAnswers:
         """Answer at points (Q, 3) [m], world."""
         distance, gradient = self._field.query(points)
         nearest = self._exact.nearest(points)
-        walked = march(self._field, self._exact, points, steps=MARCH_STEPS)
+        surface, rest, _ = march(self._field, self._exact, points, steps=MARCH_STEPS)
         size = self._reach + np.abs(points - self._spheres.anchor).max(axis=1)
         return Answers(
             in_box=None if self._workspace is None else self._workspace.contains(points),
@@ -118,8 +118,8 @@ class SceneAnswers:
             label=self._labels[nearest].astype(np.int8),
             splat=self._index[nearest],
             observed=None if self._observed is None else self._observed(points).astype(np.int8),
-            surface=walked.hit,
-            rest=walked.rest,
+            surface=surface,
+            rest=rest,
         )
 
     def complete(self, points: Float64, of_grid: Answers) -> Answers:

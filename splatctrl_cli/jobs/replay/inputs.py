@@ -1,6 +1,6 @@
 """A replay's robot with its sphere coverage, and a log's states."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -29,7 +29,7 @@ from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
 from splatctrl_cli.robot.declared_contact import DeclaredContact
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import DisabledPair, read_srdf, without_disabled
+from splatctrl_cli.robot.self_collision import read_srdf, without_disabled
 from splatctrl_cli.robot.self_margins import (
     KeptMargin,
     SelfSurfaces,
@@ -87,7 +87,7 @@ def measured_robot(
 
     recorded: `recorded_postures`. Raises InputError if `config.coverage` is "margin" and coverage is unbounded.
     """
-    disabled: tuple[DisabledPair, ...] = ()
+    disabled: Collection[frozenset[str]] = ()
     if request.srdf is not None:
         disabled, _ = read_srdf(request.srdf, model.urdf)
         model = model.with_self_pairs(without_disabled(model, disabled))

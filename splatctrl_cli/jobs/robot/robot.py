@@ -166,7 +166,7 @@ def check_robot(request: RobotRequest) -> CoverageResult:
 def robot_pairs(request: RobotRequest) -> tuple[SelfCollisionPairs, dict[str, Any]]:
     """Find links that may collide, and why others may not; also as a document."""
     model = RobotModel.from_urdf(request.urdf, request.spheres, locked=request.locked)
-    disabled, foreign = ((), ()) if request.srdf is None else read_srdf(request.srdf, model.urdf)
+    disabled, foreign = ({}, []) if request.srdf is None else read_srdf(request.srdf, model.urdf)
     found = self_collision_pairs(
         model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
     )

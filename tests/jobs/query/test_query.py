@@ -57,11 +57,11 @@ def test_a_scene_answers_with_its_field_its_nearest_splat_and_the_surface(scene:
     centers, radii = np.array([ball[0] for ball in BALLS]), np.array([ball[1] for ball in BALLS])
     field, exact = field_over(Spheres.of(centers, radii), FieldConfig()), SphereField(Spheres.of(centers, radii))
     distance, gradient = field.query(POINTS)
-    walked = march(field, exact, POINTS)
+    surface, rest, _ = march(field, exact, POINTS)
     assert column(rows, "distance")[:, 0] == pytest.approx(distance, abs=1e-6)
     assert column(rows, "gradient_x", "gradient_y", "gradient_z") == pytest.approx(gradient, abs=1e-5)
-    assert column(rows, "surface_x", "surface_y", "surface_z") == pytest.approx(walked.hit, abs=1e-6)
-    assert column(rows, "surface_rest")[:, 0] == pytest.approx(walked.rest, abs=1e-6)
+    assert column(rows, "surface_x", "surface_y", "surface_z") == pytest.approx(surface, abs=1e-6)
+    assert column(rows, "surface_rest")[:, 0] == pytest.approx(rest, abs=1e-6)
     assert [row["label"] for row in rows[:3]] == ["object", "human", "object"]
     assert [row["splat"] for row in rows[:3]] == ["0", "1", "0"]
     assert {row["observed"] for row in rows[:4]} == {"free"} and rows[4]["observed"] == "never_seen"
