@@ -49,6 +49,7 @@ class FakeSource:
     has_clock: bool = True
     name: str = "fake"
     joint_names: tuple[str, ...] = ()
+    depth_fault: None = None
     loss: LossReport = field(default_factory=LossReport)
 
     @property
