@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("unchecked")
 
 DTU = Path(__file__).parents[3] / "sample_data" / "dtu"
 FAST = [
-    *("--max-splats", "600", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4"),
+    *("--max-splats", "400", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4"),
     *("--set", "scene.refine_iterations=30", "--set", "scene.checkpoint_period=0"),
     *("--set", "occupancy.voxel=0.04", "-q"),
 ]
@@ -96,7 +96,7 @@ def test_a_budget_left_at_its_default_grows_to_what_the_first_frames_show(
     recording: Path, whole: dict[str, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A default of 200 was left alone; four times as many at most. A stopped run keeps it; what is asked for, too."""
-    assert whole["log"]["run.json"]["config"]["scene"]["max_splats"] == 600
+    assert whole["log"]["run.json"]["config"]["scene"]["max_splats"] == 400
     monkeypatch.setattr(reconstruction, "SceneConfig", lambda: SceneConfig(max_splats=200))
     given = [*command(recording, "log", tmp_path / "scene"), "--max-splats", "200"]
     with pytest.MonkeyPatch.context() as patch:
