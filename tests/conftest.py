@@ -1,5 +1,6 @@
 """Where tests find data: the project's own sample_data/, an arm without meshes, and real recordings kept outside."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -10,6 +11,13 @@ ROOT = Path(__file__).parent.parent
 # As the command line does before numpy is imported; and torch, which only tests use, waits for its threads as much.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def pytest_collection_finish() -> None:
+    """Search for garbage less often, and not in what was imported."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from copy import deepcopy
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import yaml
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from splatctrl_cli.files import output
 from splatctrl_cli.jobs.replay import files
 from splatctrl_cli.robot import sphere_files
 
@@ -29,11 +31,12 @@ def unpainted() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def parsed_once() -> Iterator[None]:
-    """Parse each text of a sphere file once: the arm's takes as long as many a test."""
+    """Parse each text of a sphere file once, and look up each package's version once."""
     parse = cache(yaml.safe_load)
     parser = SimpleNamespace(safe_load=lambda text: deepcopy(parse(text)), YAMLError=yaml.YAMLError)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sphere_files, "yaml", parser)
+        patch.setattr(output, "metadata", SimpleNamespace(version=cache(metadata.version)))
         yield
 
 

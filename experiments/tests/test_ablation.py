@@ -106,7 +106,7 @@ def test_a_map_serves_all_that_changes_the_motion_alone(monkeypatch: pytest.Monk
     whole, without = measured(asked("table-0003", methods, 64), Config(), Stopwatch())
     assert (whole.method, without.method) == (ALL, "distance-rate") and "distance-rate" in OF_MOTION
     assert whole.psnr is not None and without.psnr is None
-    assert without.map_clearance == whole.map_clearance and without.true_clearance == whole.true_clearance
+    assert (without.map_clearance, without.true_clearance) == (whole.map_clearance, whole.true_clearance)
     assert whole.loop_clearance is not None and whole.audit and whole.loop
 
 
@@ -137,7 +137,7 @@ def test_differences_are_paired_and_what_gives_nothing_is_said() -> None:
     ((title, header, table),) = sections(rows)
     assert "4 of 20" in title
     shown = {line[0]: dict(zip(header, line, strict=True)) for line in table}
-    assert shown[ALL]["dB"] == "26.50" and shown["noise"]["dB"] == "+0.00 [+0.00, +0.00]"
+    assert (shown[ALL]["dB"], shown["noise"]["dB"]) == ("26.50", "+0.00 [+0.00, +0.00]")
     assert shown["hole-term"]["false greens"] == "4" and shown["gap-filling"]["audit: false collisions"] == "4"
     assert shown["shell"]["loop time [s]"] == "+1.00 [+1.00, +1.00]"
     assert "Nothing changes beyond chance without: noise." in list(notes(rows))

@@ -51,7 +51,7 @@ def test_a_floor_is_reconstructed_in_colour_and_depth_from_a_view_not_trained_on
     error = (view.color - frame(x=0.03, y=-0.02).color / 255.0)[inside]
     assert -10 * np.log10(np.mean(error**2)) > 30
     assert np.median(np.abs(view.normalised_depth()[inside] - HEIGHT)) < 0.01 * HEIGHT
-    assert rows[-1].psnr is not None and rows[-1].psnr > 30
+    assert rows[-1].psnr > 30
 
 
 def test_growing_shows_detail_that_the_seeds_cannot() -> None:
@@ -82,7 +82,7 @@ def test_the_degree_rises_with_the_iterations() -> None:
     rules = replace(FAST, iterations=50, degree_every=0.3)
     fitter = GaussianFitter(CONFIG, WORKSPACE, frames(), settings=rules, threads=1)
     fitter.fit()
-    assert fitter.degree == 3 and fitter.gaussians().harmonics.shape[1] == 16
+    assert (fitter.degree, fitter.gaussians().harmonics.shape[1]) == (3, 16)
     assert GaussianFitter(CONFIG, WORKSPACE, frames(), threads=1).gaussians().harmonics.shape[1] == 1
 
 

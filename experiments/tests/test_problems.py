@@ -48,7 +48,7 @@ def _with_spheres() -> str:
 
 def test_a_drawn_problem_is_that_of_its_seed() -> None:
     problem, again = read_problem("tabletop-0003", None), read_problem("tabletop-0003", None)
-    assert problem.number == 3 and problem.name == "tabletop-0003"
+    assert (problem.number, problem.name) == (3, "tabletop-0003")
     assert problem.start.tolist() == again.start.tolist()
     assert {p.name for p in problem.primitives} > {p.name for p in problem.things}  # it stands in a room
 

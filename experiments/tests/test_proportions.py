@@ -43,4 +43,4 @@ def test_differences_within_pairs_are_tested_by_their_signed_ranks() -> None:
     mean, between, above, p = signed_rank(differences)
     assert (mean, above) == ("+1.83", "4/6") and between.startswith("-2.")
     assert float(p) == pytest.approx(wilcoxon(differences).pvalue, rel=0.05)
-    assert signed_rank([0.0] * 6)[3] == "nan" and signed_rank(differences[:4])[3] == "nan"
+    assert (signed_rank([0.0] * 6)[3], signed_rank(differences[:4])[3]) == ("nan", "nan")

@@ -83,7 +83,7 @@ def rows(title: str, found: list[Visit]) -> list[tuple[str, ...]]:
 def test_differences_are_taken_within_a_visit() -> None:
     time, distance, _ = (row for row in rows("Differences", visits()) if row[0] == NAMES[CONTROLLER])
     assert time[2:] == ("-2.00", "-2.00 to -2.00", "0/3", "nan")
-    assert distance[2] == "+0.67" and distance[4] == "2/3"
+    assert (distance[2], distance[4]) == ("+0.67", "2/3")
 
 
 def test_a_visit_without_the_standstill_is_in_no_pair() -> None:

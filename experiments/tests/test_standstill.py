@@ -54,7 +54,7 @@ def test_a_visit_delays_the_path_by_as_long_as_it_lasts() -> None:
     run = visit(0.3, 0.8)
     assert run.is_complete and run.duration_s == pytest.approx(1.5, abs=0.011)
     ((first, end),) = runs_of(run.is_stopped)
-    assert run.stamp_ns[first] == 300_000_000 and end - first == 50
+    assert (run.stamp_ns[first], end - first) == (300_000_000, 50)
     held = run.position[first:end]
     assert np.all(held == held[0])
     assert run.distance.min() == pytest.approx(0.1)
@@ -83,7 +83,7 @@ def test_a_known_motion_is_measured_the_same_way() -> None:
         PlanarArm(), logged.stamp_ns, logged.position, velocity, lambda points, _: points[:, 1] + 1.0,
         still=1e-3, is_complete=True,
     )  # fmt: skip
-    assert run.is_stopped.sum() == 3 and run.duration_s == pytest.approx(1.0)
+    assert (run.is_stopped.sum(), run.duration_s) == (3, pytest.approx(1.0))
     arm = PlanarArm()
     expected = [np.min(arm.sphere_centers(q)[1:, 1] + 1.0 - 0.04) for q in logged.position]
     np.testing.assert_allclose(run.distance, expected)
@@ -111,7 +111,7 @@ def test_braking_stays_on_the_path_and_within_the_acceleration() -> None:
     change = np.abs(np.diff(run.path_speed)) / 0.01
     assert change.max() == pytest.approx(4.0 / fastest)
     np.testing.assert_allclose(np.diff(run.path_s), 0.01 * run.path_speed[:-1], atol=1e-12)
-    assert run.path_speed.min() == 0.0 and run.path_speed.max() == 1.0
+    assert (run.path_speed.min(), run.path_speed.max()) == (0.0, 1.0)
     num_braking = np.count_nonzero((run.path_speed > 0) & (run.path_speed < 1))
     assert num_braking == pytest.approx(2 * fastest / 4.0 / 0.01, abs=3)
 
@@ -130,7 +130,7 @@ def test_a_glance_slows_the_path_without_a_stop() -> None:
     assert not run.is_stopped.any() and run.path_speed.min() < 0.8
     assert run.duration_s > 1.02
     at_once = braked(0.25, 0.35, max_acceleration=0.0)
-    assert at_once.is_stopped.sum() == 10 and set(at_once.path_speed) == {0.0, 1.0}
+    assert (at_once.is_stopped.sum(), set(at_once.path_speed)) == (10, {0.0, 1.0})
 
 
 def test_an_arm_that_starts_beside_a_person_stands() -> None:

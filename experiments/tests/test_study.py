@@ -95,7 +95,7 @@ def test_trials_made_elsewhere_come_to_the_same_table(
         (tmp_path / name).write_text("".join([lines[0], *part]))
     files = (tmp_path / "a.csv", tmp_path / "b.csv")
     merged = merged_study(replace(request(tmp_path / "table2"), made=files))
-    assert merged.sections == result.sections and merged.verdict == result.verdict
+    assert (merged.sections, merged.verdict) == (result.sections, result.verdict)
     assert (tmp_path / "table2" / TRIALS).read_bytes() == (out / TRIALS).read_bytes()
     unfinished = tmp_path / "unfinished"
     shutil.copytree(out, unfinished)

@@ -50,7 +50,7 @@ def test_the_plan_is_taken_that_comes_to_least_space_that_no_camera_saw(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     attempt, tried = chosen(rig, {0: 5.0, 1: 3.0, 3: 2.0, 5: 4.0}, monkeypatch)
-    assert attempt.position is not None and attempt.position[0, 0] == 2.0
+    assert attempt.position[0, 0] == 2.0
     assert tried == list(range(PLANS))
 
 
@@ -66,7 +66,7 @@ def test_a_way_is_given_up_after_one_search_and_the_last_after_others(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     attempt, tried = chosen(rig, {1: 1.0, PLANS: 2.0}, monkeypatch)
-    assert attempt.position is not None and attempt.position[0, 0] == 2.0
+    assert attempt.position[0, 0] == 2.0
     assert tried == [0, *range(PLANS, 2 * PLANS)]
     attempt, tried = chosen(rig, {2 * PLANS + 1: 0.0}, monkeypatch)
     assert attempt.position is not None and tried == [0, PLANS, 2 * PLANS, 2 * PLANS + 1]
@@ -94,5 +94,5 @@ def test_a_way_out_is_the_safest_that_keeps_the_margin_or_else_any(rig: Rig, mon
     for name, order in (("any", ["known", "unseen", "any"]), ("unseen", ["known", "unseen"])):
         leads.add(name)
         found = way_out(0, rig.problem.start, np.eye(4))
-        assert found is not None and found.path == name and asked == order
+        assert (found.path, asked) == (name, order)
         asked.clear()

@@ -41,9 +41,10 @@ def views_of(sample_data: Path) -> list[RgbdFrame]:
 
 
 def shrink_refinement(patch: pytest.MonkeyPatch) -> None:
-    """Set smaller images, fewer points and a wider lattice than a calibration has, for speed."""
+    """Set smaller images, fewer points and rounds, and a wider lattice than a calibration has, for speed."""
     for name, value in {
-        "BEND_GRID": (9, 12), "REFINE_NEIGHBOURS": 4, "REFINE_POINTS": 3000, "REFINE_ROWS": 104
+        "BEND_GRID": (9, 12), "REFINE_NEIGHBOURS": 4, "REFINE_POINTS": 3000, "REFINE_ROWS": 104,
+        "REFINE_WIDTHS": (60.0, 25.0, 10.0, 6.0), "REFINE_ROUNDS": 8,
     }.items():  # fmt: skip
         patch.setattr(fixed, name, value)
 

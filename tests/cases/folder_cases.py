@@ -94,7 +94,7 @@ def write_windows(folder: Path) -> None:
 def one_frame(folder: Path, out: Path, run: Run) -> None:
     """It is read."""
     frames = list(open_source(folder, SourceOptions()).records())
-    assert len(frames) == 1 and run(["info", folder]).code == 0
+    assert (len(frames), run(["info", folder]).code) == (1, 0)
 
 
 def all_frames(folder: Path, out: Path, run: Run) -> None:

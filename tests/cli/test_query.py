@@ -31,7 +31,7 @@ def test_points_come_from_stdin(folder: Path, monkeypatch: pytest.MonkeyPatch) -
     with (folder / "points.csv").open() as stream:
         monkeypatch.setattr("sys.stdin", stream)
         done = splatctrl("query", folder / "splats.ply", "-", "--json")
-    assert json.loads(done.stdout)["num_points"] == 2 and done.stderr == ""
+    assert (json.loads(done.stdout)["num_points"], done.stderr) == (2, "")
 
 
 def test_json_has_the_figures_of_what_is_written(folder: Path) -> None:

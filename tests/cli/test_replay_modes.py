@@ -43,13 +43,14 @@ def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) ->
     moving(desk)
     assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "open-loop") == 0
     metrics = desk.metrics()
-    assert metrics["intervention_share"] == 0 and metrics["max_velocity_difference"] < 1e-5
-    assert metrics["min_barrier_margin_logged"] > 0 and metrics["first_intervention_s"] is None
+    assert metrics["intervention_share"] == 0
+    assert metrics["max_velocity_difference"] < 1e-5
+    assert metrics["min_barrier_margin_logged"] > 0
+    assert metrics["first_intervention_s"] is None
     assert [float(row["v_joint1"]) for row in desk.rows()] == pytest.approx([0.5] * 11, abs=1e-5)
     assert (desk.folder / "out" / "open_loop.png").is_file()
 
 
-@pytest.mark.usefixtures("painted")
 def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -57,7 +58,8 @@ def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
     scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05), ball_ahead(arm, 0.01))))
     assert desk.replay("--scene", str(scene), "-q", "--mode", "open-loop") == 0
     metrics, rows = desk.metrics(), desk.rows()
-    assert 0 < metrics["intervention_share"] < 1 and metrics["num_barrier_broken_logged"] > 0
+    assert 0 < metrics["intervention_share"] < 1
+    assert metrics["num_barrier_broken_logged"] > 0
     broken = [float(row["barrier_margin_logged"]) < 0 for row in rows]
     assert sum(broken) == metrics["num_barrier_broken_logged"]
     assert all(row["intervening"] for row, is_broken in zip(rows, broken, strict=True) if is_broken)
@@ -66,19 +68,21 @@ def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
     assert float(last["velocity_difference"]) == pytest.approx(np.linalg.norm(difference))
     assert [float(last[f"v_joint{j}"]) for j in range(1, 8)] == pytest.approx(MOVE + difference, abs=1e-7)
     (scene_event,) = [event for event in events(desk) if event["kind"] == "scene"]
-    assert scene_event["obstacle"]["splat"] == 1 and scene_event["obstacle"]["label"] == "object"  # type: ignore[index]
+    assert (scene_event["obstacle"]["splat"], scene_event["obstacle"]["label"]) == (1, "object")
     assert scene_event["start_s"] == pytest.approx(metrics["first_intervention_s"])
     assert str(scene_event["worst_name"]).startswith("hand[")
     first = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("first intervention"))
     assert first.startswith(f"first intervention: {scene_event['start_s']:.2f} to 1.00 s, scene row hand[")
-    assert "near object splat 1 at (" in first and desk.json("summary.json")["when_and_why"][0] == first
+    assert "near object splat 1 at (" in first
+    assert desk.json("summary.json")["when_and_why"][0] == first
 
 
 def test_open_loop_may_ask_for_a_goal_instead_of_the_log(desk: Desk) -> None:
     moving(desk)
     goal = "--goal-joints=" + ",".join(str(v) for v in START)
     assert desk.replay(*scene_of(desk, BALL), "-q", "--mode", "open-loop", goal) == 0
-    assert float(desk.rows()[-1]["v_joint1"]) < 0 and desk.metrics()["max_velocity_difference"] > 0.5
+    assert float(desk.rows()[-1]["v_joint1"]) < 0
+    assert desk.metrics()["max_velocity_difference"] > 0.5
 
 
 def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(
@@ -88,8 +92,9 @@ def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(
     assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05), ball_ahead(arm, -0.01)), "-q") == 0
     found = {(event["kind"], event["source"]): event for event in events(desk)}
     below, hit = found["below-margin", "exact"], found["in-collision", "exact"]
-    assert below["end_s"] == hit["end_s"] == 1.0 and below["start_s"] < hit["start_s"]
-    assert below["worst"] == pytest.approx(desk.metrics()["min_clearance"]) and below["unit"] == "m"
+    assert below["end_s"] == hit["end_s"] == 1.0
+    assert below["start_s"] < hit["start_s"]
+    assert (below["worst"], below["unit"]) == (pytest.approx(desk.metrics()["min_clearance"]), "m")
     assert below["obstacle"]["splat"] == 1  # type: ignore[index]
     words = f"below-margin: {below['start_s']:.2f} to 1.00 s, {below['worst_name']}"
     assert any(line.startswith(words) for line in capsys.readouterr().out.splitlines())
@@ -110,7 +115,8 @@ def test_the_names_of_gates_are_those_of_the_metrics(desk: Desk) -> None:
     """This is the audit. test_the_recorded_commands_of_ours_make_the_same_steps does the other modes."""
     assert desk.replay(*scene_of(desk, BALL), "-q") == 0
     names = metric_scales("audit", ("exact", "barrier"), has_truth=False)
-    assert set(desk.metrics()) == set(names) and len(set(names)) == len(names)
+    assert set(desk.metrics()) == set(names)
+    assert len(set(names)) == len(names)
 
 
 def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
@@ -124,7 +130,8 @@ def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
     first = next(row for row in rows if float(row["clearance_exact"]) < 0.03)
     second = next(row for row in rows if float(row["clearance_exact"]) < 0.02)
     assert f"required >= 0.03, first at {float(first['time_s']):.3f} s" in message
-    assert f"required <= 0, first at {float(second['time_s']):.3f} s" in message and "required >= 2" in message
+    assert f"required <= 0, first at {float(second['time_s']):.3f} s" in message
+    assert "required >= 2" in message
 
 
 @pytest.mark.usefixtures("painted")
@@ -132,8 +139,9 @@ def test_a_driven_arm_follows_the_log_and_its_divergence_is_measured(desk: Desk)
     moving(desk)
     assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "closed-loop", "--follow") == 0
     metrics = desk.metrics()
-    assert metrics["num_steps"] == 101 and metrics["goal_reached"] == 1
-    assert metrics["max_divergence_joints"] < 0.01 and metrics["max_divergence_position"] < 0.005
+    assert (metrics["num_steps"], metrics["goal_reached"]) == (101, 1)
+    assert metrics["max_divergence_joints"] < 0.01
+    assert metrics["max_divergence_position"] < 0.005
     assert float(desk.rows()[-1]["divergence_joints"]) == pytest.approx(metrics["end_divergence_joints"])
     assert (desk.folder / "out" / "divergence.png").is_file()
 
@@ -143,7 +151,8 @@ def test_a_later_start_says_what_its_times_count_from(desk: Desk, capsys: pytest
     drive = (*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "closed-loop", "--follow")
     assert desk.replay(*drive, "--start-time", "0.9") == 0
     assert "times count from the start, at 0.90 s of the log" in capsys.readouterr().out.splitlines()
-    assert desk.rows()[0]["time_s"] == "0" and desk.replay(*drive, "--force") == 0
+    assert desk.rows()[0]["time_s"] == "0"
+    assert desk.replay(*drive, "--force") == 0
     assert "times count from" not in capsys.readouterr().out
 
 
@@ -151,7 +160,8 @@ def test_an_anchor_puts_the_arm_back_into_the_log(desk: Desk) -> None:
     moving(desk)
     stay = "--goal-joints=" + ",".join(str(v) for v in START + np.array([0, 0, 0, 0, 0, 0, 0.5]))
     drive = (*scene_of(desk, BALL), "-q", "--mode", "closed-loop", stay)
-    assert desk.replay(*drive, "--re-anchor", "0.25", out="anchored") == 0 and desk.replay(*drive) == 0
+    assert desk.replay(*drive, "--re-anchor", "0.25", out="anchored") == 0
+    assert desk.replay(*drive) == 0
     found = [float(row["divergence_joints"] or "nan") for row in desk.rows("anchored")]
     assert found[25] == found[50] == 0.0 < found[24]
     assert desk.json("events.json", "anchored")["anchored"][:2] == [25, 50]

@@ -53,7 +53,7 @@ def test_a_log_of_the_robot_alone_is_audited(desk: Desk, scene: str, capsys: pyt
     said = capsys.readouterr().out
     assert "log: no camera is used" in said and "log: /joint_states: no velocities recorded" in said
     found = desk.json("states.json")
-    assert found["num_states"] == 30 and found["loss"]["differentiated_velocities"] == 30
+    assert (found["num_states"], found["loss"]["differentiated_velocities"]) == (30, 30)
     assert (found["end_effector_poses"], found["clock_offset"]) == (None, None)
 
 

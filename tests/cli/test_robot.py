@@ -48,7 +48,7 @@ def test_the_table_names_links_and_what_sticks_out(capsys: pytest.CaptureFixture
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[0].startswith("robot check: PASSED (1 spheres on 2 links)")
-    assert lines[2].split()[:2] == ["link", "spheres"] and lines[4].split()[0] == "base"
+    assert (lines[2].split()[:2], lines[4].split()[0]) == (["link", "spheres"], "base")
     assert "no sphere" in lines[4] and "10.0" in lines[5]
     assert "1 spheres: 100.0 % of the surface outside" in out and "no sphere stands for base" in out
 

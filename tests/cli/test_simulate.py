@@ -69,7 +69,7 @@ def test_the_container_is_a_ros_2_profile_with_checksums_and_full_schemas(record
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
-        assert summary is not None and all(chunk.compression == "zstd" for chunk in summary.chunk_indexes)
+        assert all(chunk.compression == "zstd" for chunk in summary.chunk_indexes)
         assert all(schema.encoding == "ros2msg" for schema in summary.schemas.values())
         schema = next(s for s in summary.schemas.values() if s.name == "sensor_msgs/msg/CameraInfo")
         assert b"MSG: sensor_msgs/RegionOfInterest" in schema.data

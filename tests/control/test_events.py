@@ -119,7 +119,7 @@ def test_an_event_has_the_worst_value_of_its_run_and_every_name_in_order() -> No
     assert second.first_ns == second.last_ns == 500_000_000 and second.worst == 5.0
     many = replace(given, is_on=given.value < 4, is_high_worse=False, names=lambda i: [f"{i}{j}" for j in "abcde"])
     (low,) = events_of(STAMPS, [many])
-    assert low.worst == 1.0 and len(low.names) == 12 and low.num_names == 15
+    assert (low.worst, len(low.names), low.num_names) == (1.0, 12, 15)
 
 
 def test_a_clearance_below_the_margin_names_its_sphere_and_a_collision_lies_within_it() -> None:

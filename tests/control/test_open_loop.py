@@ -61,7 +61,7 @@ def test_a_wall_shapes_the_command_where_the_logged_velocity_breaks_its_row() ->
     assert 0 < is_broken.sum() < 21 and np.all(has_shaped[is_broken])
     assert is_clear.any() and not has_shaped[is_clear].any()
     assert np.abs(trace.difference[is_clear]).max() < 1e-5 < np.abs(trace.difference[is_broken]).max()
-    assert trace.margins[-1] is not None and trace.margins[-1].barrier_row == "fore[1]"
+    assert trace.margins[-1].barrier_row == "fore[1]"
 
 
 def test_a_goal_is_asked_for_at_every_state_alike() -> None:
@@ -84,7 +84,6 @@ def test_each_state_is_asked_in_the_field_of_its_time() -> None:
 
 def test_a_logged_velocity_above_the_limit_is_named() -> None:
     trace = run(far_away(), asked=replace(motion(), velocity=np.tile([0.0, -1.8], (21, 1))))
-    assert trace.margins[0] is not None
     assert (trace.margins[0].limit_row, trace.margins[0].limit) == ("elbow lowest", pytest.approx(-0.3))
     assert all(is_shaped(step, RowKind.LIMIT) and not is_shaped(step, RowKind.SCENE) for step in trace.steps)
 

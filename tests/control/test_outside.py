@@ -146,7 +146,7 @@ def test_a_program_that_prints_nothing_is_not_waited_for_nor_one_for_longer_than
 ) -> None:
     monkeypatch.setattr(outside, "RUN_LIMIT", 0.2)
     _, commander = driven(at_third("time.sleep(0.3)"))
-    assert commander.failure is not None and commander.failure.fault is Fault.OUT_OF_TIME
+    assert commander.failure.fault is Fault.OUT_OF_TIME
     monkeypatch.setattr(outside, "START_LIMIT", 0.5)
     with pytest.raises(InputError, match=r"at the start: hung: no answer within 0\.5 s"):
         make_controller(program("import time; time.sleep(60)"), step_limit=0.1)
@@ -269,7 +269,7 @@ def test_in_open_loop_it_is_asked_at_every_state_until_it_fails(classes: Path) -
     with recorded(classes, ours.steps[:4]) as commander:
         theirs = asking(commander=commander)
     np.testing.assert_array_equal(theirs.commanded[:4], ours.commanded[:4])
-    assert commander.failure is not None and commander.failure.fault is Fault.CRASHED
+    assert commander.failure.fault is Fault.CRASHED
     assert "StopIteration" in commander.failure.sentence and commander.failure.stamp_ns == stamps[4]
     assert theirs.steps[4] is not None and theirs.steps[4].rung is Rung.HOLD and theirs.steps[5] is None
     assert theirs.margins == ours.margins
@@ -304,5 +304,5 @@ def test_two_of_it_must_agree_and_may_talk_much_on_stderr() -> None:
     _, same = driven(talking, is_twice=True)
     assert same.failure is None and same.num_answers == 50
     _, other = driven(at_third("answer['velocity'][0] = 0.5 + 1e-9 * os.getpid()"), is_twice=True)
-    assert other.failure is not None and other.failure.fault is Fault.DIFFERS
+    assert other.failure.fault is Fault.DIFFERS
     assert other.failure.sentence.startswith("two of it, asked the same, differ: shoulder 0.")

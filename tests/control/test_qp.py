@@ -256,6 +256,6 @@ def test_terms_of_ones_own_add_up_with_those_of_the_paper(program: str) -> None:
     )
     assert np.all(np.abs(plain.velocity) > 0.1) and not plain.interventions
     assert abs(held.velocity[1]) < 0.01 and abs(held.velocity[0]) > 0.1
-    assert slow.velocity[0] == pytest.approx(-0.05, abs=1e-6) and slow.scale == 1.0
+    assert (slow.velocity[0], slow.scale) == (pytest.approx(-0.05, abs=1e-6), 1.0)
     assert [row.name for row in slow.interventions] == ["shoulder backwards"]
     assert abs(both.velocity[0]) <= 0.05 + 1e-6 and abs(both.velocity[1]) < 0.01

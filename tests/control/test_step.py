@@ -70,7 +70,7 @@ def test_a_step_never_approaches_faster_than_its_row_allows() -> None:
     rate = np.einsum("si,sij,j->s", gradient, arm.spheres_at(q)[1], step.velocity)[1:]
     slack = sum(row.slack for row in step.relaxed)
     assert np.all(rate >= -CONFIG.barrier_gain * (clearance - CONFIG.margin) - slack - 1e-5)
-    assert step.clearance == pytest.approx(clearance.min()) and step.nearest == "fore[1]"
+    assert (step.clearance, step.nearest) == (pytest.approx(clearance.min()), "fore[1]")
     guarding = {row.name: row for row in step.interventions}["fore[1]"]
     assert guarding.kind is RowKind.SCENE and guarding.multiplier > MULTIPLIER
 

@@ -50,7 +50,7 @@ def test_a_cut_is_the_row_of_what_is_met_after_a_period() -> None:
     q, velocity, builder = np.array([0.7, 0.5]), np.array([0.9, -0.4]), RowBuilder(ARM, CONFIG, BEAM)
     state, later, step = state_at(q), q + CONFIG.period * velocity, 1e-6 * np.eye(2)
     rows = builder.cut(builder.at(state), state, velocity, np.array([3]))
-    assert rows.cuts is not None and list(rows.cuts.index) == [3]
+    assert list(rows.cuts.index) == [3]
 
     def clearance(posture: np.ndarray) -> float:
         return float(BEAM.query(ARM.sphere_centers(posture)[[TIP]])[0][0] - ARM.sphere_set.radii[TIP])
@@ -75,7 +75,7 @@ def test_cuts_add_up_and_give_their_slack_to_the_row_they_belong_to() -> None:
     builder, state, velocity = RowBuilder(ARM, CONFIG, BEAM), state_at(np.array([0.7, 0.5])), np.array([0.9, -0.4])
     rows = builder.at(state)
     cut = builder.cut(builder.cut(rows, state, velocity, np.array([3])), state, velocity, np.array([2, 3]))
-    assert cut.cuts is not None and list(cut.cuts.index) == [3, 2, 3]
+    assert list(cut.cuts.index) == [3, 2, 3]
     spread = cut.spread(np.concatenate([np.zeros(int(rows.in_qp.sum())), [0.1, 0.2, 0.3]]))
     assert spread[2] == 0.2 and spread[3] == 0.3 and np.count_nonzero(spread) == 2
 

@@ -96,7 +96,7 @@ def test_pixels_without_reference_depth_count_for_colour_but_not_for_depth() -> 
 
 def test_holes_in_the_render_lower_the_depth_coverage_and_nothing_else_of_depth() -> None:
     result = score(perfect(), ONES * (np.arange(W) >= 3), photo().depth > 0)
-    assert result["depth_coverage_seen"] == pytest.approx(0.9) and result["depth_mean_seen"] == 0.0
+    assert (result["depth_coverage_seen"], result["depth_mean_seen"]) == (pytest.approx(0.9), 0.0)
 
 
 def test_a_render_beyond_0_to_1_is_scored_as_a_screen_shows_it() -> None:

@@ -71,7 +71,7 @@ def test_a_moment_is_shown_by_the_newest_image_not_later() -> None:
 )
 def test_the_camera_that_sees_the_worst_sphere_best_is_taken(others: list[RgbdFrame], best: str) -> None:
     (sight,) = sights_of([MOMENT], [frame(0, "near"), *others])
-    assert sight is not None and sight[1].camera == best
+    assert sight[1].camera == best
 
 
 def drawn(path: Path, moment: Moment, view: RgbdFrame) -> Float64:

@@ -161,7 +161,7 @@ def test_safe_is_within_a_millimetre_and_a_third_of_the_spacing(shape: Shape) ->
     for row in judged:
         assert row.whole.count == NUM_NEAR
         assert row.is_kept, (row.shape, row.spacing, row.is_inset, row.whole.rmse)
-        assert row.whole.over_max is not None and row.whole.over_max < row.spacing
+        assert row.whole.over_max < row.spacing
     far = [row.bands[-1].mean for row in rows if row.field == "gpdf"]
     assert all(mean is not None and mean < -0.01 for mean in far)
 

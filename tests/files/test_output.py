@@ -156,7 +156,6 @@ def another_writer(out: Path, kind: str) -> Iterator["subprocess.Popen[str]"]:
     """A process that is in the middle of writing an output until a line is sent to it."""
     command = [sys.executable, "-c", HOLDER, str(out), kind]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "writing\n"
         try:
             yield process

@@ -47,7 +47,7 @@ def chunk(kind: bytes, content: bytes) -> bytes:
 def test_the_head_of_a_plain_file_is_that_of_its_pixels(data: bytes, channels: int, bits: int) -> None:
     assert image_head(data) == ImageHead(width=11, height=7, channels=channels, bits=bits)
     pixels = decode_file(data, color=channels == 3)
-    assert pixels is not None and pixels.shape == ((7, 11, 3) if channels == 3 else (7, 11))
+    assert pixels.shape == ((7, 11, 3) if channels == 3 else (7, 11))
     assert pixels.itemsize * 8 == bits
 
 

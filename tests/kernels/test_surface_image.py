@@ -83,15 +83,15 @@ def test_depth_link_and_inside_are_those_of_one_ray_at_a_time(seed: int) -> None
     solids = random_solids(rng)
     measured = rng.uniform(0.5, 1.3, (int(K[5]), int(K[4]))).astype(np.float32)
     image = rendered(scene_of(solids), measured)
+    inverses = [(kind, size, invert_transform(T)) for kind, size, T in solids]
     num_seen = num_inside = 0
     for (v, u), direction in zip(np.ndindex(image.depth.shape), rays().reshape(-1, 3), strict=True):
-        spans = []
-        for kind, size, T in solids:
-            inverse = invert_transform(T)
-            spans.append(span(kind, size, inverse[:3, 3], inverse[:3, :3] @ direction))
+        spans = [span(kind, size, inverse[:3, 3], inverse[:3, :3] @ direction) for kind, size, inverse in inverses]
         near, far = np.array(spans).T
         if not np.isfinite(near).any():
-            assert image.depth[v, u] == 0 and image.link[v, u] == -1 and image.inside[v, u] == -1
+            assert image.depth[v, u] == 0
+            assert image.link[v, u] == -1
+            assert image.inside[v, u] == -1
             continue
         ends = np.sort(near[np.isfinite(near)])
         if np.min(far[np.isfinite(near)] - near[np.isfinite(near)]) < 0.02 or np.min(np.diff(ends), initial=1) < 1e-4:
@@ -105,7 +105,8 @@ def test_depth_link_and_inside_are_those_of_one_ray_at_a_time(seed: int) -> None
             inside = is_inside_spans(at, TOLERANCE, spans)
             num_inside += inside
             assert (image.inside[v, u] >= 0) == inside
-    assert num_seen > 300 and num_inside > 20
+    assert num_seen > 300
+    assert num_inside > 20
 
 
 def test_triangles_show_what_their_solid_shows() -> None:
@@ -134,12 +135,14 @@ def test_the_nearest_triangle_shows_from_whichever_side() -> None:
     for (v, u), direction in zip(np.ndindex(image.depth.shape), rays().reshape(-1, 3), strict=True):
         depths = np.array([triangle_depth(corners, direction) for corners in triangles])
         if not np.isfinite(depths).any():
-            assert image.depth[v, u] == 0 and image.link[v, u] == -1
+            assert image.depth[v, u] == 0
+            assert image.link[v, u] == -1
             continue
         num_shown += 1
         assert image.depth[v, u] == pytest.approx(depths.min(), rel=1e-6)
         assert image.link[v, u] == links[depths.argmin()]
-    assert num_shown > 300 and (image.depth == 0).sum() > 100
+    assert num_shown > 300
+    assert (image.depth == 0).sum() > 100
 
 
 @pytest.mark.parametrize("is_first_from_inside", [False, True])
@@ -147,7 +150,8 @@ def test_of_two_triangles_in_one_place_the_first_shows(is_first_from_inside: boo
     corners = np.array([[-0.2, -0.2, 1.0], [0.2, -0.2, 1.0], [0.0, 0.3, 1.0]])
     both = np.array([corners, corners[::-1]])
     image = rendered(mesh_scene(both[::-1] if is_first_from_inside else both, [3, 5]))
-    assert (image.link[image.depth > 0] == 3).all() and (image.depth > 0).sum() > 100
+    assert (image.link[image.depth > 0] == 3).all()
+    assert (image.depth > 0).sum() > 100
 
 
 def test_a_triangle_that_reaches_behind_the_camera_hides_none() -> None:

@@ -93,7 +93,6 @@ def test_a_hand_comes_straight_to_its_goal_as_far_as_that_is_free() -> None:
 
     def before(scene: Solids) -> list[float]:
         path = planned_path(model, scene, asked, PLANNER, CONFIG, approach=0.12).path
-        assert path is not None
         T_goal = np.linalg.inv(pose) @ [model.frame_pose(q, "hand") for q in path.waypoints]
         np.testing.assert_allclose(T_goal[-1], np.eye(4), atol=2e-3)
         is_on_axis = np.linalg.norm(T_goal[:, :2, 3], axis=1) < 1e-3
@@ -145,7 +144,7 @@ def test_a_way_out_is_planned_in_the_scene_of_the_stall_and_waits_as_configured(
     scene_at = Mock(return_value=one_wall())
     detour = planned_detours(ARM, scene_at, "tip", PLANNER, CONFIG)(7, START, task().T_world_goal)
     scene_at.assert_called_once_with(7)
-    assert detour is not None and detour.wait_distance == PLANNER.wait_distance and detour.clock == 0.0
+    assert (detour.wait_distance, detour.clock) == (PLANNER.wait_distance, 0.0)
     np.testing.assert_array_equal(detour.path.waypoints[0], START)
 
 

@@ -45,7 +45,7 @@ def test_a_contact_is_expected_at_its_link_place_and_time_alone(tmp_path: Path) 
     entries = declared(tmp_path)
     place = np.array([0.5, 0.0, 0.1])
     found = entries.find_expected("hand", place, 3.5)
-    assert found is not None and found.reason == "the peg goes into its hole"
+    assert found.reason == "the peg goes into its hole"
     assert entries.find_expected("arm", place, 3.5) is None
     assert entries.find_expected("hand", place + 0.2, 3.5) is None
     assert entries.find_expected("hand", place, 4.5) is None

@@ -198,7 +198,7 @@ def test_batches_are_the_same_at_any_thread_count(arm: RobotModel) -> None:
 def test_what_a_robot_carries_is_part_of_it_and_moves_with_its_link(arm: RobotModel) -> None:
     box = Box(lower=np.array([-0.02, -0.02, 0.12]), upper=np.array([0.02, 0.02, 0.20]))
     carrying, num = arm.carrying([("hand", box)]), len(arm.sphere_set.radii)
-    assert carrying.joint_names == arm.joint_names and len(arm.sphere_set.radii) == num
+    assert (carrying.joint_names, len(arm.sphere_set.radii)) == (arm.joint_names, num)
     assert carrying.moving_spheres[num:].all() and carrying.sphere_set.links[num:] == ("hand",) * 12
     for q in (arm.middle, arm.middle + 0.4):
         T = arm.frame_pose(q, "hand")

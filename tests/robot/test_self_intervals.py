@@ -60,7 +60,7 @@ def off_box(triangles: Float64) -> float:
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 def test_a_box_that_is_taken_and_put_down_is_robot_in_between(noise: float) -> None:
     (part,) = learned(8, 17, noise).held
-    assert part.link == "arm" and learned(8, 17, noise).pieces() == []
+    assert (part.link, learned(8, 17, noise).pieces()) == ("arm", [])
     assert part.start_ns == pytest.approx(7.5 * PERIOD, abs=PERIOD)
     assert part.end_ns == pytest.approx(16.5 * PERIOD, abs=PERIOD)
     assert off_box(part.triangles) < VOXEL

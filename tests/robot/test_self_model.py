@@ -194,7 +194,7 @@ def test_a_self_model_is_read_as_it_was_written_and_refused_for_another_robot(tm
     savez(path, learned().arrays())
     found = SelfModel.from_arrays(read_arrays(path, most=2**30))
     assert np.array_equal(found.pieces()[0][1], learned().pieces()[0][1])
-    assert found.unknown == learned().unknown and found.learned[0].since == learned().learned[0].since
+    assert (found.unknown, found.learned[0].since) == (learned().unknown, learned().learned[0].since)
     found.check_robot(ROBOT, LINKS, path)
     expect_refusal("another robot: one of the two lacks gripper", found.check_robot, ROBOT, (*LINKS, "gripper"), path)
     expect_refusal(

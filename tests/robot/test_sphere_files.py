@@ -148,7 +148,7 @@ def test_spheres_of_a_carried_box_cover_it_and_stick_out_by_millimetres() -> Non
     box = Box(lower=np.array([-0.025, -0.03, 0.07]), upper=np.array([0.025, 0.05, 0.12]))
     alone = SphereSet(links=("arm",), centers=np.zeros((1, 3)), radii=np.array([0.1]))
     spheres = with_boxes(alone, [("hand", box)])
-    assert spheres.links[0] == "arm" and set(spheres.links[1:]) == {"hand"}
+    assert (spheres.links[0], set(spheres.links[1:])) == ("arm", {"hand"})
     centers, radii = spheres.centers[1:], spheres.radii[1:]
     corners = np.array(list(product(*zip(box.lower, box.upper, strict=True))))
     points = np.concatenate([np.random.default_rng(0).uniform(box.lower, box.upper, (2000, 3)), corners])

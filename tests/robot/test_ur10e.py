@@ -34,7 +34,7 @@ def test_the_flange_is_where_the_published_parameters_say(tmp_path: Path) -> Non
 
 def test_curobos_spheres_fit_its_links(tmp_path: Path, spheres: Path) -> None:
     model = RobotModel.from_urdf(written(tmp_path, ur10e_urdf()), spheres)
-    assert len(model.sphere_set.radii) == 19 and read_sphere_file(spheres).num_off == 1
+    assert (len(model.sphere_set.radii), read_sphere_file(spheres).num_off) == (19, 1)
     assert model.left_out == ("camera_mount",) and not model.are_links_renamed
     still = [link for link, moves in zip(model.sphere_set.links, model.moving_spheres, strict=True) if not moves]
     assert still == ["shoulder_link"]  # its sphere is centred on the first axis

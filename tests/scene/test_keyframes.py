@@ -34,7 +34,7 @@ def test_a_camera_that_stands_still_makes_no_keyframes() -> None:
     window = Window(CONFIG)
     for k in range(6):
         window.advance([view(k), view(k, x=0.3, camera="cam1")])
-    assert window.keyframes == [] and stamps(window.newest) == [5, 5]
+    assert (window.keyframes, stamps(window.newest)) == ([], [5, 5])
     window.advance([view(6)])
     assert sorted(stamps(window.newest)) == [5, 6]
 

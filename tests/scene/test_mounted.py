@@ -31,16 +31,16 @@ def views(depth: float = 0.1, *, is_flat: bool = False) -> list[RgbdFrame]:
 def test_what_the_camera_carries_is_found_and_the_world_is_not() -> None:
     """Surface at the depth of the world is not mounted."""
     mask, none = (mounted_pixels(views(depth), MIN_RANGE) for depth in (0.1, 0.8))
-    assert mask is not None and mask[2:18, 2:20].all()
+    assert mask[2:18, 2:20].all()
     assert not mask[30:].any() and not mask[:, 40:].any()
-    assert none is not None and not none.any()
+    assert not none.any()
 
 
 def test_a_flat_colour_without_depth_is_background_not_mounted() -> None:
     """The background is black where everything has a depth."""
     flat, counted = views(0.0, is_flat=True), [np.ones((60, 80), bool)] * 9
     mask = mounted_pixels(flat, MIN_RANGE)
-    assert mask is not None and not mask[2:18, 2:18].any()
+    assert not mask[2:18, 2:18].any()
     assert background_color(flat, counted) == pytest.approx((60 / 255,) * 3)
     assert background_color([frame()], counted[:1]) == (0.0, 0.0, 0.0)
 

@@ -125,7 +125,7 @@ def test_beyond_the_most_time_steps_the_evidence_is_never_said_to_be_younger_tha
     grid.last_seen.ravel()[-6:] = [0, 1, 2, 3, 65_518, 65_519]
     grid.take_in([replace(blind, depth=np.zeros_like(blind.depth))])
     stamps_ns = np.concatenate([[-1], grid.step_stamps_ns])[grid.last_seen.ravel()[-6:]]
-    assert stamps_ns.tolist() == [-1, 0, 0, 2, 65_516, 65_518] and grid.step_stamps_ns[-1] == 65_535
+    assert (stamps_ns.tolist(), grid.step_stamps_ns[-1]) == ([-1, 0, 0, 2, 65_516, 65_518], 65_535)
 
 
 def test_thread_count_does_not_change_a_bit() -> None:

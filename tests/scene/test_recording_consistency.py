@@ -92,7 +92,7 @@ def poses(*xs: float, period_ns: int = 100_000_000, camera: str = "a") -> list[t
 
 def test_the_largest_jump_of_a_camera_is_found() -> None:
     jump = largest_jump([*poses(0.0, 0.1, 3.1, 3.2), *poses(9.0, 9.1, camera="b")])
-    assert jump is not None and jump.distance == pytest.approx(3.0)
+    assert jump.distance == pytest.approx(3.0)
     assert (jump.camera, jump.before_ns, jump.after_ns) == ("a", 100_000_000, 200_000_000)
 
 

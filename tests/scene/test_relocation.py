@@ -40,7 +40,7 @@ def test_the_one_dimensional_rule_would_lose_opacity() -> None:
 
 def test_sources_of_clones_are_drawn_in_proportion_to_opacity() -> None:
     counts = np.bincount(clone_sources(np.array([0.0, 0.1, 0.3]), 4000, np.random.default_rng(0)), minlength=3)
-    assert counts[0] == 0 and counts[2] / counts[1] == pytest.approx(3.0, rel=0.15)
+    assert (counts[0], counts[2] / counts[1]) == (0, pytest.approx(3.0, rel=0.15))
     assert len(clone_sources(np.zeros(3), 10, np.random.default_rng(0))) == 0
 
 

@@ -87,7 +87,7 @@ def test_the_noise_of_depth_is_found_on_slanted_surfaces_and_beside_edges(noise:
     assert depth_noise([slanted(noise, seed) for seed in range(3)]) == pytest.approx(noise, rel=0.15)
     frames = [replace(frame(camera=f"{each}"), depth=slanted(each)) for each in (0.0003, noise)]
     depth = RecordedDepth.of(frames)
-    assert depth is not None and depth.noise == pytest.approx(noise, rel=0.15)
+    assert depth.noise == pytest.approx(noise, rel=0.15)
 
 
 def test_noise_that_neighbouring_pixels_share_is_found_though_a_narrow_fit_takes_it_away() -> None:

@@ -146,7 +146,7 @@ def test_a_doubted_pixel_is_not_confirmed_by_a_view_of_its_neighbour_behind() ->
     mask = replace(masked(depth), kinds=kinds)
     other, seen = np.where(depth == 1.2, depth, 0.0), np.where(depth == 1.2, kinds, 0).astype(np.uint8)
     decided = settle_pieces(frame(depth), mask, [(frame(other), replace(mask, kinds=seen))], CONFIG).kinds
-    assert decided[near] == PixelKind.MIXED and decided[far] == PixelKind.OBJECT
+    assert (decided[near], decided[far]) == (PixelKind.MIXED, PixelKind.OBJECT)
 
 
 def test_depths_that_lie_between_the_robot_and_what_is_behind_are_no_part_of_either() -> None:

@@ -94,7 +94,6 @@ def test_pixels_that_are_not_valid_show_nothing_beyond_although_they_have_depth(
 def test_a_splat_of_the_shell_that_comes_within_reach_is_removed() -> None:
     """Also on the floor, which no view sees through."""
     target = run(fitter(), [0.0])
-    assert target.shell is not None
     moved = np.flatnonzero(target.shell.buffer.is_alive)[:5]
     target.shell.buffer.centers[moved] = np.column_stack([np.linspace(-0.15, 0.15, 5), np.zeros(5), np.zeros(5)])
     assert len(shell_of(run(target, [0.0]))) > 30

@@ -66,6 +66,23 @@ def shown_of(world: World, fault: Fault, model: RobotModel, folder: Path) -> Sho
     return Recorder(world, fault, model, (0, 0)).write(folder / "log.mcap")
 
 
+Recorded = Callable[[Fault], tuple[Shown, Path]]
+
+
+@pytest.fixture(scope="module")
+def recorded(model: RobotModel, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """What images show of the target in view under a fault, and the folder of their log; each is recorded once."""
+    found: dict[str, tuple[Shown, Path]] = {}
+
+    def record_once(fault: Fault) -> tuple[Shown, Path]:
+        if str(fault) not in found:
+            folder = tmp_path_factory.mktemp("recorded")
+            found[str(fault)] = shown_of(world_of(in_view()), fault, model, folder), folder
+        return found[str(fault)]
+
+    return record_once
+
+
 def read(folder: Path) -> tuple[list[JointState], list[RgbdFrame]]:
     records = list(open_source(folder / "log.mcap").records())
     return (
@@ -153,33 +170,29 @@ def test_a_tool_that_no_model_has_counts(model: RobotModel) -> None:
 # --- the faults are in the data ---
 
 
-def test_a_scale_and_a_bias_are_in_the_depth_of_their_camera_alone(model: RobotModel, tmp_path: Path) -> None:
-    world = world_of(in_view())
-    shown_of(world, Fault(), model, tmp_path)
-    exact = {(f.camera, f.stamp_ns): f.depth for f in read(tmp_path)[1]}
-    shown_of(world, Fault(depth_scale={"cam0": 1.05}, depth_bias={"cam0": -0.02}), model, tmp_path)
-    for frame in read(tmp_path)[1]:
+def test_a_scale_and_a_bias_are_in_the_depth_of_their_camera_alone(recorded: Recorded) -> None:
+    exact = {(f.camera, f.stamp_ns): f.depth for f in read(recorded(Fault())[1])[1]}
+    for frame in read(recorded(Fault(depth_scale={"cam0": 1.05}, depth_bias={"cam0": -0.02}))[1])[1]:
         before = exact[frame.camera, frame.stamp_ns]
         expected = np.where(before > 0, before * 1.05 - 0.02, 0) if frame.camera == "cam0" else before
         assert np.abs(frame.depth - expected).max() < 2e-3
 
 
-def test_a_pose_error_is_in_the_recorded_pose_and_not_in_the_image(model: RobotModel, tmp_path: Path) -> None:
-    world = world_of(in_view())
+def test_a_pose_error_is_in_the_recorded_pose_and_not_in_the_image(recorded: Recorded) -> None:
     error = np.array([0.03, 0.0, -0.04, 0.0, 0.02, 0.0])
-    shown_of(world, Fault(pose={"cam1": error}), model, tmp_path)
-    frame = next(f for f in read(tmp_path)[1] if f.camera == "cam1")
-    true = world.cameras[1].T_world_camera
+    _, folder = recorded(Fault(pose={"cam1": error}))
+    frame = next(f for f in read(folder)[1] if f.camera == "cam1")
+    true = world_of(in_view()).cameras[1].T_world_camera
     assert np.allclose(frame.T_world_camera[:3, 3] - true[:3, 3], error[:3], atol=1e-6)
     assert np.isclose(np.arccos((np.trace(frame.T_world_camera[:3, :3].T @ true[:3, :3]) - 1) / 2), 0.02, atol=1e-4)
 
 
-def test_late_stamps_are_late_and_lost_frames_lost(model: RobotModel, tmp_path: Path) -> None:
+def test_late_stamps_are_late_and_lost_frames_lost(recorded: Recorded) -> None:
     fault = Fault(
         clock={"cam2": 0.3}, lost=frozenset({("cam0", 4)}), blind=frozenset({("cam1", 5)}), lost_states=(1.0, 1.5)
     )
-    shown = shown_of(world_of(in_view()), fault, model, tmp_path)
-    states, frames = read(tmp_path)
+    shown, folder = recorded(fault)
+    states, frames = read(folder)
     assert min(f.stamp_ns for f in frames if f.camera == "cam2") == at_s(0.3)
     stamps = {(f.camera, f.stamp_ns) for f in frames}
     assert ("cam0", at_s(0.8)) not in stamps
@@ -188,11 +201,11 @@ def test_late_stamps_are_late_and_lost_frames_lost(model: RobotModel, tmp_path: 
     assert max(np.diff([state.stamp_ns for state in states])) > 0.45e9
 
 
-def test_a_dark_target_returns_no_depth_and_keeps_its_outline(model: RobotModel, tmp_path: Path) -> None:
-    shown = shown_of(world_of(in_view()), Fault(dark=1.0), model, tmp_path)
+def test_a_dark_target_returns_no_depth_and_keeps_its_outline(recorded: Recorded) -> None:
+    shown, _ = recorded(DARK)
     assert shown.target.sum() == 0
     assert shown.target_outline.sum() > 50
-    assert shown_of(world_of(in_view()), Fault(), model, tmp_path).target.sum() > 50
+    assert recorded(Fault())[0].target.sum() > 50
 
 
 def test_logged_joints_and_commands_are_each_others_inverse() -> None:
@@ -238,7 +251,9 @@ def test_repeated_frames_have_new_stamps_and_the_depth_of_the_last_one(
     assert len({frame.stamp_ns for frame in mine}) == NUM_FRAMES
     assert all((frame.depth == mine[5].depth).all() for frame in mine[6:])
     assert all((frame.color == mine[5].color).all() == repeats_color for frame in mine[9:])
-    assert shown.target[:, :6].any() and not shown.target[:, 6:].any() and not shown.depth[:, 6:].any()
+    assert shown.target[:, :6].any()
+    assert not shown.target[:, 6:].any()
+    assert not shown.depth[:, 6:].any()
 
 
 @pytest.mark.parametrize("fault", [Fault(beyond=0.4), Fault(instead=4.0)])
@@ -246,7 +261,8 @@ def test_a_target_measured_behind_its_place_is_seen_where_its_rays_meet_the_tabl
     fault: Fault, model: RobotModel, tmp_path: Path
 ) -> None:
     shown = shown_of(world_of(in_view()), fault, model, tmp_path)
-    assert shown.target.any() and (shown.target <= shown.target_outline).all()
+    assert shown.target.any()
+    assert (shown.target <= shown.target_outline).all()
     (frame, *_) = [r for r in open_source(tmp_path / "log.mcap").records() if isinstance(r, RgbdFrame)]
     assert fault.instead is None or np.isclose(frame.depth.max(), 4.0, atol=1e-3)
     high = world_of(ball(np.array([0.55, 0.1, 0.6])))
@@ -269,7 +285,6 @@ def test_a_small_motion_is_small_and_its_ball_behind_the_arm(model: RobotModel) 
 def test_a_box_ends_before_the_plate(model: RobotModel) -> None:
     trial = drawn(model, "box")
     (plate,) = trial.world.targets
-    assert trial.draft.box_gap is not None
     assert box_of(trial).upper[0] == pytest.approx(
         plate.T_world_shape[0, 3] - plate.size[0] / 2 - trial.draft.box_gap
     )
@@ -348,7 +363,7 @@ def test_the_same_seed_records_the_same_bytes(model: RobotModel, tmp_path: Path)
 
 
 def test_drawn_targets_are_in_contact_or_clear_as_wished(model: RobotModel) -> None:
-    trials: list[Trial] = [draw(11, index, model) for index in range(1, 6)]
+    trials: list[Trial] = [draw(11, index, model) for index in range(1, 5)]
     stamps = np.linspace(at_s(0), at_s(DURATION_S), 60).astype(np.int64)
     clearance = [
         TrueArm(model, t.world.tool).clearances(t.world.targets, stamps, positions_of(t.world.motion, stamps)).min()
@@ -427,6 +442,7 @@ def emptied(*names: str, frames: slice = slice(None), value: int = 0) -> Edit:
 )
 def test_a_fault_or_target_is_observable_where_images_show_it(
     model: RobotModel,
+    recorded: Recorded,
     tmp_path: Path,
     fault: Fault,
     world: dict[str, Any],
@@ -435,7 +451,7 @@ def test_a_fault_or_target_is_observable_where_images_show_it(
     """A target narrower than half a pixel is disclaimed; where no rule is given, it is not judged."""
     made = world_of(ball(np.array([0.55, 0.1, 0.05]), world.get("radius", 0.05)))
     made = replace(made, cameras=made.cameras[: world.get("num_cameras", 3)], body=world.get("body", Body()))
-    shown = shown_of(made, fault, model, tmp_path)
+    shown = shown_of(made, fault, model, tmp_path) if world else recorded(fault)[0]
     for edit, expected in edits:
         holds, rule = judged(draft_of(drawn_as(fault)), made, edit(shown), model)
         assert (holds, rule if expected[1] else "") == expected
@@ -462,7 +478,9 @@ def test_what_moves_is_disclaimed_in_closed_loop_alone(model: RobotModel, tmp_pa
     assert driven == (False, "moves between two frame sets")
 
 
-def test_a_dark_target_measured_in_free_space_is_disclaimed(model: RobotModel, tmp_path: Path) -> None:
-    world = world_of(in_view())
-    beside = emptied("target_hole")(shown_of(world, DARK, model, tmp_path))
-    assert judged(draft_of(Fault(beyond=0.3)), world, beside, model) == (False, "measured in free space")
+def test_a_dark_target_measured_in_free_space_is_disclaimed(model: RobotModel, recorded: Recorded) -> None:
+    beside = emptied("target_hole")(recorded(DARK)[0])
+    assert judged(draft_of(Fault(beyond=0.3)), world_of(in_view()), beside, model) == (
+        False,
+        "measured in free space",
+    )

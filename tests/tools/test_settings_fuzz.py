@@ -43,8 +43,8 @@ def test_a_command_refuses_its_settings_before_it_reads_anything(
     for case in [case for case in cases() if case.section == section and case.text in {"nan", "bogus", "-1e308"}][:6]:
         done = here.splatctrl(*words, "-o", tmp_path / "out", "--set", f"{section}.{case.key}={case.text}")
         left = [path.name for path in tmp_path.iterdir()]
-        assert fault_of(case, done.returncode, done.stderr, left) == "" and done.returncode == 2
-        assert done.stderr.count("\n") == 1 and done.stdout == ""
+        assert (fault_of(case, done.returncode, done.stderr, left), done.returncode) == ("", 2)
+        assert (done.stderr.count("\n"), done.stdout) == (1, "")
 
 
 @pytest.mark.parametrize(

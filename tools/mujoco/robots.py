@@ -127,6 +127,7 @@ class Robot:
         return frozenset(found)
 
 
+@cache
 def robots_folder() -> Path:
     """The folder of the distribution that holds the robots. Raises LookupError where it is not installed."""
     for file in files(DISTRIBUTION) or ():

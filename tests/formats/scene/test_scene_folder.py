@@ -88,7 +88,7 @@ def test_occupancy_comes_back_bit_by_bit_also_without_lost_edges(tmp_path: Path)
     del header["edges"]
     savez(path, {**arrays, "header": np.array(json.dumps(header))})
     for found in (read_seen(path), read_known_occupancy(path)):
-        assert found is not None and len(found.edges.radii) == 0
+        assert len(found.edges.radii) == 0
 
 
 def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
     for thresholds in ((0.3, 0.7), (0.01, 0.99)):
         assert (again.states(*thresholds) == states).all()
     seen = read_seen(tmp_path / "a.npz")
-    assert seen is not None and seen.is_free is not None
+    assert seen.is_free is not None
     assert (seen.is_free == (states == VoxelState.FREE)).all()
 
 
@@ -169,18 +169,17 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
     write_states(tmp_path / "a.npz", want, want.grid.states(0.3, 0.7))
     write_occupancy(tmp_path / "b.npz", want)
     again = read_known_occupancy(tmp_path / "b.npz")
-    assert again is not None
     assert (again.last_seen == want.last_seen).all()
     assert [each.tolist() for each in again.seen.look(points)] == wanted
     assert (again.edges.centers.tolist(), again.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
     for balls in (again.unrepresented, *(read_unrepresented(tmp_path / name) for name in ("a.npz", "b.npz"))):
-        assert balls is not None and balls.centers.tolist() == want.unrepresented.centers.tolist()
+        assert balls.centers.tolist() == want.unrepresented.centers.tolist()
         assert balls.labels.tolist() == [Label.HUMAN]
         assert balls.radius == pytest.approx(0.025 * 3**0.5)
         assert balls.volume == pytest.approx(0.05**3)
     for name in ("a.npz", "b.npz"):
         seen = read_seen(tmp_path / name)
-        assert seen is not None and seen.last_seen.dtype == (np.uint8 if num_steps < 240 else np.uint16)
+        assert seen.last_seen.dtype == (np.uint8 if num_steps < 240 else np.uint16)
         assert [each.tolist() for each in seen.look(points)] == wanted
         assert (seen.edges.centers.tolist(), seen.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
 
@@ -192,7 +191,6 @@ def test_the_largest_number_of_an_older_file_is_looked_at_in_vain(tmp_path: Path
     last_seen, steps = np.array([[[num_steps, 0, 0xFF]]], np.uint8), {"step_stamps_ns": list(range(num_steps))}
     np.savez(path, header=np.array(json.dumps(header | steps)), last_seen=last_seen)
     seen = read_seen(path)
-    assert seen is not None
     stamps_ns, classes = seen.look(np.array([[0.0, 0.0, 0.1 * k] for k in range(3)]))
     assert stamps_ns.tolist() == [num_steps - 1, -1, -1]
     assert classes.tolist() == [EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW, EvidenceClass.UNANSWERED]

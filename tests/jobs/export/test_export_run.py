@@ -103,7 +103,6 @@ def test_every_link_is_where_the_robot_has_it_and_our_own_reader_reads_it_too(ru
     assert max(entity.triangles[0].indices) < len(entity.triangles[0].points)
     with folder.with_name("out.mcap").open("rb") as stream:
         schema, _, message = next(iter(make_reader(stream).iter_messages(topics=["/tf"])))
-    assert schema is not None
     ros = read_foxglove(schema.name, "protobuf", schema.data.decode("latin-1"), message.data)
     assert ros.transforms[0].header.frame_id == "world"
 

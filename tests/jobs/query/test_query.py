@@ -65,9 +65,9 @@ def test_a_scene_answers_with_its_field_its_nearest_splat_and_the_surface(scene:
     assert [row["label"] for row in rows[:3]] == ["object", "human", "object"]
     assert [row["splat"] for row in rows[:3]] == ["0", "1", "0"]
     assert {row["observed"] for row in rows[:4]} == {"free"} and rows[4]["observed"] == "never_seen"
-    assert result.metrics["num_points"] == 5 and result.metrics["num_never_seen"] == 1
+    assert (result.metrics["num_points"], result.metrics["num_never_seen"]) == (5, 1)
     assert result.metrics["min_distance"] == pytest.approx(distance.min(), abs=1e-6)
-    assert result.metrics["num_in_collision"] == 1 and result.kind == "scene"
+    assert (result.metrics["num_in_collision"], result.kind) == (1, "scene")
 
 
 def test_the_bound_of_a_scene_is_never_above_the_exact_distance_and_hardly_below(scene: Path) -> None:
@@ -90,7 +90,7 @@ def test_the_probability_is_that_of_the_distance_and_a_label_that_is_left_out_is
 def test_an_occupied_voxel_without_a_splat_is_an_obstacle_without_an_index(tmp_path: Path) -> None:
     lone = write_scene(tmp_path / "lone", (START_NS, splats_of(BALLS[0])), unrepresented=[(0.5, 0.0, 0.0)])
     _, rows = asked(lone, config=HARD)
-    assert rows[1]["splat"] == "" and rows[1]["label"] == "object"
+    assert (rows[1]["splat"], rows[1]["label"]) == ("", "object")
     assert float(rows[1]["distance"]) == pytest.approx(0.2 - 0.05 * math.sqrt(3), abs=2e-3)
 
 
@@ -119,7 +119,7 @@ def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the
         assert [row[name] for row in both] == [row[name] for row in of_grid]
     for name in ("label", "splat", "observed", "surface_x", "surface_rest"):
         assert [row[name] for row in both] == [row[name] for row in of_scene]
-    assert both[4]["probability"] == "" and result.kind == "field and scene"
+    assert (both[4]["probability"], result.kind) == ("", "field and scene")
     other = write_scene(tmp_path / "other", (START_NS, splats_of(BALLS[0])))
     with pytest.raises(UsageError, match=r"field: was not baked from the splats of .*other; .* as --scene"):
         asked(field, scene=other)

@@ -273,7 +273,7 @@ def test_views_that_meet_in_another_unit_only_are_refused(
     said = refusal(folder)
     assert re.search(rf"(do at|multiplied by) {factor}\b", said)
     unit = re.search(r"give --depth-scale (\S+) \(it is (\S+) m per count\), or correct the poses' unit", said)
-    assert unit is not None and float(unit[1]) == pytest.approx(float(unit[2]) * float(factor))
+    assert float(unit[1]) == pytest.approx(float(unit[2]) * float(factor))
     found = check(CheckRequest(paths=(folder,)))[0].findings
     assert any(finding.code == "views-scale" and unit[0].partition(",")[0] in finding.remedy for finding in found)
 

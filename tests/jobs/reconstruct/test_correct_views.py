@@ -174,7 +174,7 @@ def metrics(short_sample: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
     tabletop, out = short_sample / "tabletop", tmp_path_factory.mktemp("corrected") / "scene"
     words = [word for name, value in PERTURB.items() for word in ("--perturb", f"{name}={value}")]
     robot = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
-    log = ["reconstruct", str(tabletop / "log.mcap"), *words]
+    log = ["reconstruct", str(tabletop / "log.mcap"), "--cameras", "cam0,cam1", *words]
     assert main([*log, *robot, "-o", str(out), *FAST]) in (0, 3)
     found: dict[str, Any] = json.loads((out / "run.json").read_text())["metrics"]
     return found

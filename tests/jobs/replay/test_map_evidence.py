@@ -110,7 +110,7 @@ def test_the_bound_is_that_of_what_the_map_misses(desk: Desk, scene: list[str]) 
 def test_a_lower_confidence_takes_a_lower_score(desk: Desk, scene: list[str]) -> None:
     assert desk.replay(*scene, "--evidence", "cam9", "--set", "verdict.confidence=0.5") == 0
     expected, metrics = conformal_bound(MISSES, 0.5), desk.metrics()
-    assert expected is not None and expected.bound < MISSES.max()
+    assert expected.bound < MISSES.max()
     assert metrics["map_error_bound"] == pytest.approx(expected.bound, abs=1e-4)
     assert metrics["map_error_confidence"] == 0.5
 
@@ -126,7 +126,7 @@ def test_a_bound_larger_than_the_clearance_alone_turns_the_verdict(
     verdict = desk.verdict()
     assert verdict["label"] == "not evaluable"
     (broken,) = [reason for reason in verdict["reasons"] if reason["outcome"] != "passed"]
-    assert broken["criterion"] == "map error" and broken["time_s"] == pytest.approx(0.6)
+    assert (broken["criterion"], broken["time_s"]) == ("map error", pytest.approx(0.6))
     assert broken["place"] == pytest.approx([*BALL[0][:2], BALL[0][2] + BALL[1] + misses[6]], abs=2e-3)
     assert broken["value"] == pytest.approx(-0.02, abs=1e-3)
     misses[6] = least - 0.005
@@ -138,7 +138,7 @@ def test_a_contact_outranks_it(desk: Desk, scene: list[str], arm: RobotModel) ->
     splats = splats_of(BALL, ((x, y, z), 0.02))
     touched = write_scene(desk.folder / "touched", (0, splats), (SECOND, splats))
     assert desk.replay("--scene", str(touched), *scene[2:], "--evidence", "cam9", is_judged=True) == 1
-    assert desk.verdict()["label"] == "contact" and reason(desk)["outcome"] == "not evaluable"
+    assert (desk.verdict()["label"], reason(desk)["outcome"]) == ("contact", "not evaluable")
 
 
 def test_without_evidence_the_sentence_says_so_and_a_request_can_ask_for_it(desk: Desk, scene: list[str]) -> None:
@@ -264,7 +264,6 @@ def test_frame_sets_that_are_evidence_are_not_fed_to_the_fitter(
 ) -> None:
     asked = request(recording, tmp_path, evidence="3")
     evidence = open_evidence(asked, arm)
-    assert evidence is not None
     shown = [step.stamp_ns for step in evidence.frame_sets()]
     scene = from_log(asked, arm, tmp_path, SILENT)
     scene.at(2**62)
@@ -273,7 +272,7 @@ def test_frame_sets_that_are_evidence_are_not_fed_to_the_fitter(
     assert {round((stamp - scene.stamps_ns[0]) / 1e9 * 8) for stamp in shown} == {2, 5}
     scene.finish()
     run = json.loads((tmp_path / "scene" / "run.json").read_text())
-    assert run["metrics"]["held_out_every"] == 3 and run["metrics"]["time_steps"] == 6
+    assert (run["metrics"]["held_out_every"], run["metrics"]["time_steps"]) == (3, 6)
 
 
 def test_every_set_either_trains_or_is_evidence(recording: Path) -> None:

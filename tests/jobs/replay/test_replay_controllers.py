@@ -122,7 +122,7 @@ def test_a_motion_of_its_own_is_judged_by_every_criterion(stage: Stage) -> None:
 def test_commands_above_the_velocity_limits_fail(stage: Stage, mode: str) -> None:
     fast = ("--controller", "own:Fast", "--set", "control.max_time=0.2")
     code, verdict = stage.judged(*fast, mode=mode)
-    assert code == 1 and decisive(verdict)["velocity limits"] == "failed"
+    assert (code, decisive(verdict)["velocity limits"]) == (1, "failed")
     (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "velocity limits"]
     assert reason["value"] == pytest.approx(2.5 / 2.175, abs=1e-3) and "joint1" in reason["sentence"]
 

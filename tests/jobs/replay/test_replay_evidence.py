@@ -230,7 +230,7 @@ def test_states_that_share_stamps_are_missed_not_dropped_in_silence(
     names = tuple(f"joint{i}" for i in range(1, 8))
     log = write_mcap(stage.desk.folder / "x.mcap", states_of(positions, names, stamps=stamps))
     code, verdict = replayed_log(stage, log)
-    assert code == 5 and decisive(verdict)["judged states"] == "not evaluable"
+    assert (code, decisive(verdict)["judged states"]) == (5, "not evaluable")
     dropped = next(r for r in verdict["reasons"] if r["criterion"] == "judged states")
     assert dropped["value"] == len(stamps) - len(set(stamps))
 

@@ -69,7 +69,7 @@ def test_a_replay_says_what_the_spheres_leave_uncovered(desk: Desk, arm: RobotMo
     assert desk.replay(*scene_of(desk, BALL), "-q") == 0
     report = coverage_deficit(arm.urdf, shrunk(arm.sphere_set))
     assert desk.metrics()["coverage_deficit"] == pytest.approx(report.max_deficit, abs=1e-9)
-    assert report.worst is not None and report.worst.link in about(desk)
+    assert report.worst.link in about(desk)
     assert f"up to {1e3 * report.worst.deficit.proven:.2f} mm" in about(desk)  # type: ignore[union-attr]
     assert "where they keep 20 mm the surface keeps" in about(desk)
 

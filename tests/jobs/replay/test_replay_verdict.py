@@ -269,7 +269,7 @@ def test_a_map_may_be_as_old_and_as_much_time_unjudged_as_is_said(
 ) -> None:
     broken(stage)
     scene = stage.scene()
-    assert stage.judged(allowed, scene=scene)[0] == 0 and stage.judged(too_little, scene=scene)[0] == 5
+    assert (stage.judged(allowed, scene=scene)[0], stage.judged(too_little, scene=scene)[0]) == (0, 5)
 
 
 def test_states_of_another_hour_are_not_judged_by_a_scene_or_a_field(stage: Stage) -> None:
@@ -285,7 +285,7 @@ def test_a_margin_that_only_the_grids_bound_breaks_is_a_matter_of_the_grid(stage
     code, verdict = stage.judged_by_field(FAR, ball, voxel=0.08, moment_ns=moment)
     assert (code, decisive(verdict)) == (5, {"certified clearance": "not evaluable"})
     found = re.search(r"bake again with --voxel at most ([\d.]+)", verdict["sentence"])
-    assert found is not None and 0.005 < float(found[1]) < 0.08
+    assert 0.005 < float(found[1]) < 0.08
 
 
 def test_a_field_that_does_not_say_of_what_time_it_is_is_no_evidence(stage: Stage) -> None:
@@ -338,9 +338,9 @@ def test_a_goal_that_is_not_reached_fails_alone(stage: Stage) -> None:
 def test_a_scene_that_comes_into_the_driven_arm_is_a_hit(stage: Stage) -> None:
     stage.states, stage.later = passing(), [ball_beside(stage.arm, START + 0.3 * MOVE, -0.02)]
     code, verdict = stage.judged(mode="closed-loop")
-    assert code == 1 and decisive(verdict)["scene hits"] == "failed"
+    assert (code, decisive(verdict)["scene hits"]) == (1, "failed")
     (hit,) = [r for r in verdict["reasons"] if r["criterion"] == "scene hits"]
-    assert hit["value"] == 1 and hit["time_s"] == pytest.approx(0.5, abs=0.02)
+    assert (hit["value"], hit["time_s"]) == (1, pytest.approx(0.5, abs=0.02))
 
 
 def test_what_came_while_the_arm_was_driven_and_the_next_map_shows_is_a_hit(stage: Stage) -> None:

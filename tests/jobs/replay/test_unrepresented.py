@@ -50,7 +50,6 @@ def test_a_persons_voxels_count_as_people() -> None:
     balls = Balls.of_voxels(np.float32([PLACE]), 0.1, np.array([Label.HUMAN], np.uint8))
     config = Config(control=ControlConfig(margin=0.02, human_margin=0.12))
     fields = splat_fields(splats_of(((0.0, 0.0, 0.0), 0.05)), config, 1, balls)
-    assert fields.human is not None
     assert fields.human.query(POINTS)[0][0] == pytest.approx(0.3 - RADIUS, abs=1e-6)
     assert fields.barrier.query(POINTS)[0][0] == pytest.approx(0.3 - RADIUS - 0.1, abs=1e-3)
     assert fields.balls is None  # the spheres keep the margin of people

@@ -100,7 +100,6 @@ def test_a_log_that_describes_its_robot_needs_no_urdf(tmp_path: Path, kind: str)
         message = as_parameter(robot()) if kind == "parameter" else described(robot(), topic)
         path = log_with(tmp_path / "run.mcap", message)
     found = logged_urdf([path])
-    assert found is not None
     assert found.text == robot()
     request = ReplayRequest(log=path, out=tmp_path / "out")
     assert open_log(request)[0].joint_names == ("joint_a", "joint_b")
@@ -164,7 +163,7 @@ def test_a_model_of_the_command_line_that_differs_as_a_mechanism_is_said(
 ) -> None:
     path, file, said = log_with(tmp_path / "run.mcap", described(changed)), written(tmp_path, robot()), Said()
     found = urdf_of(file, [path], said)
-    assert found is not None and found.path == file
+    assert found.path == file
     if not words:
         assert said.lines == []
         return
@@ -204,7 +203,7 @@ def test_a_robot_of_the_log_that_is_asked_for_is_used_or_refused(tmp_path: Path)
     path = log_with(tmp_path / "run.mcap", described(robot(shape=MESH)))
     request = ReconstructRequest(source=open_source(path), out=tmp_path / "out", recording=path, spheres=spheres)
     model = _robot(request, Said())
-    assert model is not None and model.sphere_set.links == ("tip",)
+    assert model.sphere_set.links == ("tip",)
     other = log_with(tmp_path / "other.mcap", described(robot(root="base")))
     with pytest.raises(InputError, match=r"give --world-frame base, or --urdf where both frames are one"):
         _robot(replace(request, source=open_source(other), recording=other), Said())
@@ -243,6 +242,6 @@ def test_a_capture_keeps_the_description(tmp_path: Path) -> None:
     assert is_capture(capture)
     assert (capture / "robot_description.urdf").read_text() == robot()
     found = logged_urdf([capture])
-    assert found is not None and found.text == robot()
+    assert found.text == robot()
     (capture / "robot_description.urdf").write_text(robot(shift=0.3))
     expect_refusal("its checksum differs from SHA256SUMS", logged_urdf, [capture])

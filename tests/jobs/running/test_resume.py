@@ -28,15 +28,16 @@ pytestmark = pytest.mark.usefixtures("unchecked")
 
 DTU = Path(__file__).parents[3] / "sample_data" / "dtu"
 FAST = [
-    *("--max-splats", "600", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4"),
-    *("--set", "scene.refine_iterations=30", "--set", "scene.checkpoint_period=0", "-q"),
+    *("--max-splats", "400", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4"),
+    *("--set", "scene.refine_iterations=30", "--set", "scene.checkpoint_period=0"),
+    *("--set", "occupancy.voxel=0.04", "-q"),
 ]
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "small"
-    size = ["--duration", "1.2", "--width", "96", "--height", "72", "-q"]
+    size = ["--duration", "1.2", "--width", "64", "--height", "48", "-q"]
     assert main(["simulate", "-o", str(folder), *size]) == 0
     return folder
 
@@ -94,17 +95,17 @@ def test_a_run_stopped_while_it_writes_goes_on_to_the_same_bytes(
 def test_a_budget_left_at_its_default_grows_to_what_the_first_frames_show(
     recording: Path, whole: dict[str, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A default of 400 was left alone; four times as many at most. A stopped run keeps it; what is asked for, too."""
-    assert whole["log"]["run.json"]["config"]["scene"]["max_splats"] == 600
-    monkeypatch.setattr(reconstruction, "SceneConfig", lambda: SceneConfig(max_splats=400))
-    given = [*command(recording, "log", tmp_path / "scene"), "--max-splats", "400"]
+    """A default of 200 was left alone; four times as many at most. A stopped run keeps it; what is asked for, too."""
+    assert whole["log"]["run.json"]["config"]["scene"]["max_splats"] == 400
+    monkeypatch.setattr(reconstruction, "SceneConfig", lambda: SceneConfig(max_splats=200))
+    given = [*command(recording, "log", tmp_path / "scene"), "--max-splats", "200"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_writer, "savez", failing(scene_writer.savez, 2, KeyboardInterrupt()))
         assert main(given) == 130
     assert main([*given, "--resume"]) == 0
     document = json.loads((tmp_path / "scene" / "run.json").read_text())
-    assert document["config"]["scene"]["max_splats"] == 1600
-    assert main([*command(recording, "log", tmp_path / "whole"), "--max-splats", "400"]) == 0
+    assert document["config"]["scene"]["max_splats"] == 800
+    assert main([*command(recording, "log", tmp_path / "whole"), "--max-splats", "200"]) == 0
     assert contents(tmp_path / "scene") == contents(tmp_path / "whole")
 
 
@@ -222,7 +223,7 @@ def test_a_run_goes_on_only_as_what_it_was(
         given[given.index("--urdf") + 1] = str(other)
         changed = []
     elif changed == ["LOG"]:
-        few = ["--duration", "0.6", "--width", "64", "--height", "48"]
+        few = ["--duration", "0.6", "--width", "32", "--height", "24"]
         assert main(["simulate", "-o", str(tmp_path / "b"), *few]) == 0
         given[1], changed = str(tmp_path / "b" / "log.mcap"), []
         capsys.readouterr()
@@ -271,7 +272,7 @@ def test_snapshots_are_taken_by_count_by_time_and_of_new_obstacles(
     """news: steps with a new obstacle."""
     monkeypatch.setattr(KeptMaps, "shows_news", lambda _, fitter: fitter.num_steps - 1 in news)
     given = [word for setting in settings for word in ("--set", setting)]
-    assert main([*command(recording, "log", tmp_path / "scene"), *given]) == 0
+    assert main([*command(recording, "log", tmp_path / "scene"), "--cameras", "cam0", *given]) == 0
     scene = open_scene(tmp_path / "scene")
     rows = [json.loads(line) for line in (tmp_path / "scene" / "audit.jsonl").read_text().splitlines()]
     assert len(rows) == 6

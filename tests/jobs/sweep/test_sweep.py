@@ -117,7 +117,7 @@ def test_two_keys_together_flip_before_either_alone(tmp_path: Path) -> None:
     assert alone[0]["latency"] == pytest.approx(0.8, abs=0.02) and alone[1]["margin"] == pytest.approx(
         0.08, abs=0.002
     )
-    assert result.least is not None and result.least.length == pytest.approx(0.8 / 2**0.5, abs=0.04)
+    assert result.least.length == pytest.approx(0.8 / 2**0.5, abs=0.04)
     assert (result.least.last.outcome, result.least.first.outcome) == ("passed", "failed")
 
 
@@ -178,7 +178,7 @@ def test_a_sweep_with_other_settings_does_not_go_on_in_the_folder(tmp_path: Path
 def test_a_value_that_a_command_refuses_is_a_flip_of_its_own(tmp_path: Path) -> None:
     run = run_of(tmp_path, refuses=0.6)
     flip = swept(run, "latency=0:1").flips[0]
-    assert flip.first is not None and (flip.first.label, flip.first.folder) == ("refused", "")
+    assert (flip.first.label, flip.first.folder) == ("refused", "")
     assert "SAFE up to 0.59375 s, REFUSED at 0.609375" in flip.sentence and "not so" in flip.first.sentence
     expect_refusal(r"latency=0\.7: is refused: replay: not so; begin at", swept, run, "latency=0.7:0", out="other")
 

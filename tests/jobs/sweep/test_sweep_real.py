@@ -67,22 +67,20 @@ def test_the_margin_flips_at_the_clearance_of_the_run(
     run = open_run(recorded.folder / "audit")
     clearance = min(float(run.metrics[name]) for name in ("min_clearance", "min_clearance_true"))
     request = SweepRequest(
-        replay=run.path, over=("margin=0.02:0.06",), out=tmp_path / "sweep", tolerance=1 / 8, workers=2
+        replay=run.path, over=("margin=0.02:0.06",), out=tmp_path / "sweep", tolerance=1 / 4, workers=2
     )
     flip = sweep(request, PROGRAM).flips[0]
-    assert flip.last is not None
-    assert flip.first is not None
     assert flip.last.values["margin"] <= clearance + TOLERATED < flip.first.values["margin"]
-    assert flip.first.values["margin"] - flip.last.values["margin"] <= 0.04 / 8 * (1 + 1e-9)
+    assert flip.first.values["margin"] - flip.last.values["margin"] <= 0.04 / 4 * (1 + 1e-9)
     assert (flip.last.label, flip.first.label) == ("safe", "margin broken")
     again = open_run(tmp_path / "sweep" / flip.start.folder)  # 0.02 is what the run had: the same comes out again
     assert (again.metrics, again.verdict["reasons"]) == (run.metrics, run.verdict["reasons"])
     assert (again.path / "steps.csv").read_bytes() == (run.path / "steps.csv").read_bytes()
-    words = ["sweep", str(run.path), "--over", "margin=0.02:0.06", "--tolerance", "0.125", "-o", str(request.out)]
+    words = ["sweep", str(run.path), "--over", "margin=0.02:0.06", "--tolerance", "0.25", "-o", str(request.out)]
     assert main([*words, "-v"]) == 0
     said = capsys.readouterr().out
     assert flip.sentence in said
-    assert "6 runs, 0 of them new" in said
+    assert "5 runs, 0 of them new" in said
     assert main([*words, "--over", "margin=0.1:0.1"]) == 2
 
 
@@ -172,7 +170,9 @@ def bisected(judge: Callable[[float], str], low: float, high: float, tolerance: 
 def test_a_flip_is_told_to_the_tolerance_from_either_side(start: float, end: float, is_monotone: bool) -> None:
     judge = Counted((0.4371, 9.0))
     found = find_flip(judge, start, end, tolerance=0.001, is_monotone=is_monotone)
-    assert found.last is not None and found.first is not None and found.is_monotone
+    assert found.last is not None
+    assert found.first is not None
+    assert found.is_monotone
     assert min(found.last, found.first) < 0.4371 <= max(found.last, found.first)
     assert 0 < abs(found.first - found.last) <= 0.001 * (1 + 1e-9)
     assert judge.outcome(found.last) == judge.outcome(start) != judge.outcome(found.first)
@@ -193,7 +193,8 @@ def test_a_verdict_that_turns_back_fools_bisection_and_is_caught() -> None:
     judge = Counted((0.2, 0.3), (0.8, 9.0))
     assert bisected(judge.outcome, 0.0, 1.0, 0.001) == pytest.approx(0.8, abs=0.001)
     found = find_flip(judge, 0.0, 1.0, tolerance=0.001, is_monotone=True)
-    assert found.first == pytest.approx(0.2, abs=0.001) and not found.is_monotone
+    assert found.first == pytest.approx(0.2, abs=0.001)
+    assert not found.is_monotone
     assert find_flip(Counted((0.2, 0.3), (0.8, 9.0)), 0.0, 1.0, tolerance=0.001, is_monotone=True) == found
 
 
@@ -219,8 +220,9 @@ def test_what_is_not_declared_monotone_is_searched_and_what_may_be_missed_is_tol
     narrow = (0.51, 0.55)
     declared = find_flip(Counted(narrow), 0.0, 1.0, tolerance=0.01, is_monotone=True)
     searched = find_flip(Counted((0.51, 0.64)), 0.0, 1.0, tolerance=0.01)
-    assert declared.first is None and declared.spacing == pytest.approx(0.25)
-    assert searched.first == pytest.approx(0.51, abs=0.01) and searched.spacing == pytest.approx(1 / 8)
+    assert declared.first is None
+    assert declared.spacing == pytest.approx(0.25)
+    assert (searched.first, searched.spacing) == (pytest.approx(0.51, abs=0.01), pytest.approx(1 / 8))
     assert find_flip(Counted(narrow), 0.0, 1.0, tolerance=0.01).spacing > narrow[1] - narrow[0]
 
 
@@ -244,10 +246,10 @@ def test_the_least_change_of_several_is_near_that_of_a_plane(slope: tuple[float,
 
 def test_what_only_all_together_flip_is_found_at_the_corner() -> None:
     found = find_least(beyond(0.51, 0.51), [None, None], tolerance=0.01)
-    assert found is not None and min(found.first) > 0.9
+    assert min(found.first) > 0.9
     assert find_least(beyond(0.4, 0.4), [None, None], tolerance=0.01) is None
 
 
 def test_a_flip_of_one_value_alone_stands_where_nothing_is_nearer() -> None:
     found = find_least(beyond(4.0, 0.0), [0.25, None], tolerance=0.01)
-    assert found is not None and found.first == (0.25, 0.0)
+    assert found.first == (0.25, 0.0)

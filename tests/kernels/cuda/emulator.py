@@ -6,8 +6,9 @@ import shutil
 import subprocess
 from collections.abc import Sequence
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -22,17 +23,20 @@ KERNELS = Path(splatctrl_cli.kernels.__file__).parent
 
 @cache
 def library() -> ctypes.CDLL:
-    """Built once a process; a test that needs it is skipped where there is no compiler."""
+    """Built once for its sources, whatever the process; a test is skipped where there is no compiler."""
     compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++")
     if compiler is None:
         pytest.skip("no C++ compiler to build the kernels for the processor with")
-    target = Path(mkdtemp(prefix="splatctrl_emulator_")) / "emulator.so"
     folders = [HERE, KERNELS / "cuda" / "src", KERNELS / "src"]
-    subprocess.run(
-        [compiler, "-std=c++17", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "-Wl,-Bsymbolic", "-w",
-         *(f"-I{folder}" for folder in folders), "-o", str(target), str(HERE / "emulator.cpp")],
-        check=True,
-    )  # fmt: skip
+    words = [compiler, "-std=c++17", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "-Wl,-Bsymbolic", "-w"]
+    sources = (path.read_bytes() for folder in folders for path in sorted(folder.glob("*.[ch]*")))
+    recipe = sha256(b"".join([*map(str.encode, words), *sources])).hexdigest()[:16]
+    target = Path(gettempdir()) / f"splatctrl_emulator_{os.getuid()}_{recipe}.so"
+    if not target.exists():
+        made = target.with_suffix(f".{os.getpid()}")
+        includes = [f"-I{folder}" for folder in folders]
+        subprocess.run([*words, *includes, "-o", str(made), str(HERE / "emulator.cpp")], check=True)
+        made.replace(target)
     return ctypes.CDLL(str(target))
 
 

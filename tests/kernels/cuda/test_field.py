@@ -54,7 +54,7 @@ def span_of(of: Spheres, box: Box, voxel: float, first: int = 0, last: int | Non
 
 NEAR = Box(lower=np.array([-0.17, -0.2, -0.11]), upper=np.array([0.16, 0.05, 0.13]))
 FAR = Box(lower=np.array([0.6, 0.5, 0.7]), upper=np.array([0.9, 0.7, 0.9]))
-BOXES = {"among the spheres": (NEAR, 0.02), "far from them": (FAR, 0.02), "coarse": (NEAR, 0.06)}
+BOXES = {"among the spheres": (NEAR, 0.03), "far from them": (FAR, 0.04), "coarse": (NEAR, 0.06)}
 
 
 def by_processor(of: Spheres, config: FieldConfig, span: GridSpan, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -141,7 +141,6 @@ def test_the_smaller_distance_is_taken_with_its_gradient_and_what_was_asked_is_c
     np.testing.assert_array_equal(baked.distance, np.minimum(baked.hard, baked.kernels["se"]))
     clear = (np.abs(np.nan_to_num(smooth, nan=9.0) - hard) > 1e-4) & ~(smooth < 0.0)
     expected = np.where(is_smooth[..., None], smooth_slope, slope)
-    assert baked.gradient is not None
     assert np.abs(baked.gradient - expected)[clear].max() < 5e-4
     without = int(np.isnan(smooth).sum())
     assert abs(baked.counts["se"][0] - without) <= 2
@@ -167,7 +166,6 @@ def test_points_are_answered_as_by_the_processor(num: int, device: Memory) -> No
         np.testing.assert_allclose(found.kernels[name], raw, rtol=1e-5, atol=2e-6)
         single = device_field(device, of, config, (name,), is_single=True).query(points, of.anchor)
         clear = np.abs(raw - hard) > 1e-5
-        assert single.gradient is not None
         assert away(single.gradient[clear], raw_slope[clear]) < 3e-4
 
 

@@ -72,7 +72,7 @@ def test_a_capture_gives_the_same_records(tmp_path: Path, recipe: LogRecipe) -> 
     if recipe.mask_every:
         assert [frame.human is not None for frame in frames] == [True, False, True, False, True]
     if recipe is PINCUSHION:  # what the lens did not see is stored once
-        assert frames[0].valid is not None and not frames[0].valid.all()
+        assert not frames[0].valid.all()
         assert len(list((folder / "valid/cam0").iterdir())) == 1
 
 
@@ -124,7 +124,7 @@ def test_an_image_of_another_size_than_its_camera_is_left_out_and_counted(tmp_pa
     pixels = np.full((5, 6), 1250, np.uint16) if kind == "depth" else np.zeros((5, 6, 3), np.uint8)
     replace_file(folder, f"{kind}/cam0/000002.{suffix}", bytes(cv2.imencode(f".{suffix}", pixels)[1]))
     source = open_source(folder)
-    assert len(frames_of(source)) == 4 and source.loss.damaged == 1
+    assert (len(frames_of(source)), source.loss.damaged) == (4, 1)
     assert "expected images of 32x24 as capture.json says" in source.loss.notes[-1]
 
 
@@ -325,7 +325,7 @@ def test_rows_are_those_of_the_cameras(tmp_path: Path) -> None:
     lines = [line("a", 0), "\n", line("b", 1), line("a", 2, '"two\nlines, é"'), line("a", 3).rstrip("\n")]
     rows = list(FrameRows(frames(tmp_path, *lines), ("a",)))
     assert [row["stamp_ns"] for row in rows] == ["0", "2", "3"]
-    assert rows[1]["source"] == "two\nlines, é" and rows[2]["depth"] == "depth/a/3.png"
+    assert (rows[1]["source"], rows[2]["depth"]) == ("two\nlines, é", "depth/a/3.png")
     assert rows[0]["camera"] == "a"
 
 
@@ -419,7 +419,7 @@ def test_what_an_interrupted_ingest_left_is_named_and_without_resume_begun_again
     (partial / "color/cam0/000000.jpg").write_bytes(b"wrong")
     assert main(["ingest", str(log), "-o", str(out), "-q"]) == 0
     source = open_source(out)
-    assert len(list(source.records())) == 10 and source.loss.damaged == 0
+    assert (len(list(source.records())), source.loss.damaged) == (10, 0)
 
 
 def test_going_on_with_other_options_or_frames_is_refused(

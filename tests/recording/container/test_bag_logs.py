@@ -64,7 +64,7 @@ def test_a_whole_bag_gives_what_rosbags_gives(
     bag = make_bag1(tmp_path / "x.bag", compression)
     found, damage = read(bag)
     assert plain(found) == by_rosbags(bag)
-    assert len(found) == 60 and damage.notes == []
+    assert (len(found), damage.notes) == (60, [])
     assert {topic.name for topic in open_raw_log(bag).topics()} == {"/a", "/b"}
     assert plain(read(bag, {"/b"})[0]) == plain(found[1::2])
 

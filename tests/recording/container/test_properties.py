@@ -55,7 +55,7 @@ def test_a_moving_frame_is_rigid_at_all_times_and_where_it_was_seen(samples: Any
         tree.add("world", "camera", stamp, np.array(position), unit, static=False)
     for stamp, (_, position, _) in zip(stamps, samples, strict=True):
         T = tree.lookup("world", "camera", stamp)
-        assert T is not None and T[:3, 3] == pytest.approx(position, abs=1e-12)
+        assert T[:3, 3] == pytest.approx(position, abs=1e-12)
     between = stamps[0] + int(share * (stamps[-1] - stamps[0]))
     T, back = tree.lookup("world", "camera", between), tree.lookup("camera", "world", between)
     assert T is not None and back is not None
@@ -101,7 +101,7 @@ def test_arrays_come_back_from_a_file(tmp_path_factory: pytest.TempPathFactory, 
     assert list(found) == list(arrays)
     assert list(read_arrays(path, list(arrays)[:1], most=sum(a.nbytes for a in found.values()))) == list(arrays)[:1]
     for name, array in arrays.items():
-        assert found[name].dtype == array.dtype and found[name].shape == array.shape
+        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
         assert np.array_equal(found[name], array)
         stream = BytesIO()
         np.save(stream, array)

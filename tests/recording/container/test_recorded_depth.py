@@ -98,7 +98,7 @@ def test_a_file_that_cannot_be_kept_costs_its_frame(tmp_path: Path, wrong: str, 
     change = {2: odd if wrong == "of another size" else b"\x89PNG\r\n\x1a\n" + bytes(40)}
     source = open_source(with_png_depth(tmp_path, change=change)[0])
     frames = [item for item in (source.stored() if lazily else source.records()) if not isinstance(item, JointState)]
-    assert len(frames) == 4 and source.loss.damaged == 1
+    assert (len(frames), source.loss.damaged) == (4, 1)
     words = "expected an image of 32x24, got 5x5" if wrong == "of another size" else "not an image file"
     assert words in source.loss.notes[-1]
 
@@ -111,7 +111,7 @@ def test_a_frame_that_was_left_undecoded_is_refused_where_it_does_not_decode(tmp
     frames = [item for item in source.stored() if not isinstance(item, JointState)]
     said = "/cam0/depth/image_raw#2: compressed image .* not an image file; copy"
     expect_refusal(said, lambda: frames[2].frame)
-    assert len(frames_of(source)) == 4 and source.loss.damaged == 1  # and counted where it is decoded
+    assert (len(frames_of(source)), source.loss.damaged) == (4, 1)  # and counted where it is decoded
 
 
 def test_depth_in_another_unit_than_its_cameras_is_counted_again(tmp_path: Path) -> None:

@@ -167,7 +167,7 @@ def test_a_pose_that_windows_writes_as_infinite_is_lost(tmp_path: Path) -> None:
     folder = make_frames(tmp_path, "data")
     (folder / "data/frame-000001.pose.txt").write_text("-1.#INF -1.#INF00 1.#QNAN -1.#IND\n" * 4)
     source = open_source(folder, GIVEN)
-    assert len(list(source.records())) == 2 and source.loss.without_pose == 1
+    assert (len(list(source.records())), source.loss.without_pose) == (2, 1)
 
 
 def test_depth_in_a_pgm_is_read_as_sensreader_writes_it(tmp_path: Path) -> None:
@@ -253,7 +253,7 @@ def test_depth_of_nerfstudio_may_be_smaller_or_float(tmp_path: Path) -> None:
 )
 def test_lens_models_of_nerfstudio_are_those_of_opencv(tmp_path: Path, changed: dict[str, Any], model: str) -> None:
     camera = layout_nerfstudio.read(of_transforms(tmp_path, **changed), SourceOptions()).listed[0].camera
-    assert camera is not None and camera.distortion_model == model
+    assert camera.distortion_model == model
     values = [value for key, value in changed.items() if key.startswith("k")]
     assert camera.distortion[: len(values)] == values
 

@@ -34,7 +34,7 @@ COUNTS = np.array([[0, 1, 500], [1000, 40000, 65534]], dtype=np.uint16)
 @pytest.mark.parametrize("padding", [0, 5])
 def test_color_encodings_give_the_same_rgb(encoding: str, pixels: np.ndarray[Any, Any], padding: int) -> None:
     read = of_image(encoding, pixels, padding=padding)
-    assert read.kind == "color" and of_image("p010", pixels).kind == "other"
+    assert (read.kind, of_image("p010", pixels).kind) == ("color", "other")
     assert np.array_equal(color_of(read), np.repeat(RGB[..., 1:2], 3, axis=2) if encoding == "mono8" else RGB)
 
 
@@ -215,9 +215,9 @@ def test_a_turned_camera_keeps_the_pixels_that_its_lens_is_of(color: bool) -> No
     """OpenCV alone would turn the image, and with it leave the intrinsics behind."""
     jpeg = with_orientation(bytes(cv2.imencode(".jpg", RGB)[1]))
     turned = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert turned is not None and turned.shape == (6, 4, 3)
+    assert turned.shape == (6, 4, 3)
     pixels = decode_file(jpeg, color=color)
-    assert pixels is not None and pixels.shape == (4, 6, 3)
+    assert pixels.shape == (4, 6, 3)
 
 
 def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_memory_is_taken(

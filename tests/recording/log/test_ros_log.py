@@ -134,7 +134,7 @@ def test_an_image_that_does_not_decode_is_left_out_and_counted(tmp_path: Path) -
         yield time, topic, kind, content
 
     source = open_source(broken_log(tmp_path / "log.mcap", spoil, LogRecipe()))
-    assert len(frames_of(source)) == 4 and source.loss.damaged == 1
+    assert (len(frames_of(source)), source.loss.damaged) == (4, 1)
     next(source.records())
     assert source.loss.damaged == 1, "a second pass that ends early forgets nothing"
     words = "compressed image (jpeg): 738 bytes that are not an image file"
