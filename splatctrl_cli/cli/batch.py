@@ -14,7 +14,7 @@ from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean
+from splatctrl_cli.errors import UsageError, did_you_mean, refuse_if
 from splatctrl_cli.jobs.batch.batch import (
     BatchRequest,
     BatchResult,
@@ -141,8 +141,7 @@ def _action(parser: Parser, command: str, name: str) -> argparse.Action:
 def _words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> list[str]:
     name = max(action.option_strings, key=len, default="")
     if action.nargs == 0:
-        if not isinstance(value, bool):
-            raise UsageError(f"{where}: expected true or false, got {value!r}")
+        refuse_if(not isinstance(value, bool), f"{where}: expected true or false, got {value!r}", error=UsageError)
         return [name] * value
     if isinstance(value, Mapping):
         texts = [f"{key}={text_of(each)}" for key, each in _flat(value)]
@@ -191,8 +190,7 @@ def _list_runs(console: Console, args: argparse.Namespace, request: BatchRequest
     if not folder.is_dir():
         _, nodes, folder = planned(request, command_line)
         order = {node.name: number for number, node in enumerate(select_shard(nodes, request.shard))}
-    if not (folder / NAME).is_file():
-        raise InputError(f"{folder}: has no {NAME}", remedy="run the batch first")
+    refuse_if(not (folder / NAME).is_file(), f"{folder}: has no {NAME}", remedy="run the batch first")
     conditions = [*args.where, *(["state!=done"] if args.failed else [])]
     with Ledger(folder) as ledger:
         runs = list(ledger.runs(conditions))

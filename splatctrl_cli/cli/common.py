@@ -14,7 +14,7 @@ from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several,
 from splatctrl_cli.cli.reports import report_command, wrap_result
 from splatctrl_cli.config import PRESETS, fixed
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Verdict, gate
 from splatctrl_cli.files.output import plain
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
@@ -60,8 +60,9 @@ def locked_joints(args: argparse.Namespace) -> dict[str, float]:
 def _number_of(option: str, assignment: str, what: str = "NAME") -> tuple[str, float]:
     name, _, text = assignment.partition("=")
     value = several(text)
-    if len(value) != 1:
-        raise UsageError(f"{option} {assignment}: expected {what}=VALUE, got {text!r} for the value")
+    refuse_if(
+        len(value) != 1, f"{option} {assignment}: expected {what}=VALUE, got {text!r} for the value", error=UsageError
+    )
     return name, value[0]
 
 
@@ -69,8 +70,7 @@ def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: st
     """Names in a comma list. Raises UsageError for an unknown name or none."""
     names = tuple(dict.fromkeys(_names(text) or ()))
     unknown = [name for name in names if name not in choices]
-    if unknown or not names:
-        raise UsageError(f"{option} {text}: expected some of: {', '.join(choices)}")
+    refuse_if(unknown or not names, f"{option} {text}: expected some of: {', '.join(choices)}", error=UsageError)
     return names
 
 
@@ -82,25 +82,30 @@ def pose(text: str) -> tuple[float, ...]:
 
 
 def _device(text: str) -> str:
-    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
-        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {format_value(text)}")
+    refuse_if(
+        not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text),
+        f"expected auto, cpu, cuda or cuda:N, got {format_value(text)}",
+        error=argparse.ArgumentTypeError,
+    )
     return text
 
 
 def numbers(text: str) -> tuple[float, ...]:
     """Finite numbers joined by commas, for argparse."""
     values = several(text)
-    if not values:
-        raise argparse.ArgumentTypeError(
-            f"expected finite numbers joined by commas, up to 1e6, got {format_value(text)}"
-        )
+    refuse_if(
+        not values,
+        f"expected finite numbers joined by commas, up to 1e6, got {format_value(text)}",
+        error=argparse.ArgumentTypeError,
+    )
     return values
 
 
 def _split_list(name: str, text: str) -> str:
     names = _names(text)
-    if not names:
-        raise UsageError(f"{name} {text!r}: expected names, got none", remedy="leave the option out")
+    refuse_if(
+        not names, f"{name} {text!r}: expected names, got none", remedy="leave the option out", error=UsageError
+    )
     return ",".join(names)
 
 
@@ -111,15 +116,17 @@ def _names(text: str | None) -> tuple[str, ...] | None:
 def _topics(text: str) -> CameraTopics:
     name, equals, rest = text.partition("=")
     topics = rest.split(",")
-    if not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)):
-        raise UsageError(f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO")
+    refuse_if(
+        not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)),
+        f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO",
+        error=UsageError,
+    )
     return CameraTopics(name=name, color=topics[0], depth=topics[1], info=topics[2] if len(topics) == 3 else "")
 
 
 def _human_topic(text: str) -> tuple[str, str]:
     name, _, topic = text.partition("=")
-    if not name or not topic:
-        raise UsageError(f"--human-topic {text}: expected NAME=TOPIC")
+    refuse_if(not name or not topic, f"--human-topic {text}: expected NAME=TOPIC", error=UsageError)
     return name, topic
 
 
@@ -128,16 +135,22 @@ def _pose(text: str) -> tuple[str, tuple[float, ...]]:
     if name and rest == "identity":
         return name, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     values = several(rest)
-    if not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
-        raise UsageError(f"--camera-pose {text}: expected NAME={POSE} with a unit quaternion, or NAME=identity")
+    refuse_if(
+        not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0,
+        f"--camera-pose {text}: expected NAME={POSE} with a unit quaternion, or NAME=identity",
+        error=UsageError,
+    )
     return name, values
 
 
 def _pose_topic(text: str) -> tuple[str, tuple[str, str]]:
     name, _, rest = text.partition("=")
     topic, at, frame = rest.partition("@")
-    if not name or not topic or bool(at) != bool(frame):
-        raise UsageError(f"--camera-pose {text}: expected NAME=TOPIC or NAME=TOPIC@FRAME")
+    refuse_if(
+        not name or not topic or bool(at) != bool(frame),
+        f"--camera-pose {text}: expected NAME=TOPIC or NAME=TOPIC@FRAME",
+        error=UsageError,
+    )
     return name, (topic, frame.strip("/"))
 
 
@@ -151,8 +164,11 @@ def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
 
 
 def _preset(text: str) -> str:
-    if text not in PRESETS:
-        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {format_value(text)}")
+    refuse_if(
+        text not in PRESETS,
+        f"expected {' or '.join(PRESETS)}, got {format_value(text)}",
+        error=argparse.ArgumentTypeError,
+    )
     return f"preset={text}"
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from splatctrl_cli.cli.commands import build_parser, function_of, judges
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.reports import tell_of_failure, wrap_result
-from splatctrl_cli.errors import SplatCtrlError, UsageError
+from splatctrl_cli.errors import SplatCtrlError, UsageError, refuse_if
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
 from splatctrl_cli.report.junit import check_replaceable
 
@@ -143,8 +143,12 @@ def _check_outputs(args: argparse.Namespace) -> None:
         if report is not None:
             _check_output(report, inputs, "--junit")
             check_replaceable(report)
-            if out is not None and _places(out) & {*_places(report), *report.absolute().parents}:
-                raise UsageError(f"--junit {report}: is in --out, which appears whole", remedy="put it beside that")
+            refuse_if(
+                out is not None and _places(out) & {*_places(report), *report.absolute().parents},
+                f"--junit {report}: is in --out, which appears whole",
+                remedy="put it beside that",
+                error=UsageError,
+            )
     except UsageError:
         args.junit = None
         raise
@@ -157,8 +161,12 @@ def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
     targets = _places(out)
     for given in inputs:
         source = Path(os.path.realpath(given))
-        if targets & {source, *source.parents}:
-            raise UsageError(f"{out}: would replace the input {given}", remedy=f"give another {option}")
+        refuse_if(
+            targets & {source, *source.parents},
+            f"{out}: would replace the input {given}",
+            remedy=f"give another {option}",
+            error=UsageError,
+        )
 
 
 def _places(output: Path) -> set[Path]:

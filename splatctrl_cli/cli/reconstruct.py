@@ -6,7 +6,7 @@ from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, request_of, source_options, table
 from splatctrl_cli.config import load_config
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
 from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
@@ -22,8 +22,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     config = load_config(args.config, args.set)  # refused before the source is opened
     if args.max_splats is not None:
         config = replace(config, scene=replace(config.scene, max_splats=args.max_splats))
-    if (args.source is None) == (args.dtu is None):
-        raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
+    refuse_if(
+        (args.source is None) == (args.dtu is None),
+        "reconstruct: expected a SOURCE or --dtu ROOT, and not both",
+        error=UsageError,
+    )
     allowed = {"views-agreement", "views-scale"} if args.allow_disagreement or args.refine_poses else set()
     request = request_of(
         ReconstructRequest,

@@ -5,14 +5,18 @@ from pathlib import Path
 
 from splatctrl_cli.cli.common import BASE, LOCK, OF_FOLDERS, PACKAGES, SEVERAL_LOGS, numbers, output, seed
 from splatctrl_cli.cli.parser import group, option, real, whole
+from splatctrl_cli.errors import refuse_if
 
 ROOT = "folder in which the scene and robot of a replay's command line are looked for, if they were moved"
 
 
 def _shard(text: str) -> tuple[int, int]:
     index, _, count = text.partition("/")
-    if not (index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)):
-        raise argparse.ArgumentTypeError(f"expected I/N with I from 1 to N, got {text!r}")
+    refuse_if(
+        not (index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)),
+        f"expected I/N with I from 1 to N, got {text!r}",
+        error=argparse.ArgumentTypeError,
+    )
     return int(index), int(count)
 
 

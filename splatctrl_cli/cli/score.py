@@ -7,7 +7,7 @@ from typing import Any
 
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.reconstruct import recording_of
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.score_report import PREFIX
 from splatctrl_cli.evaluate.verdict import counted
 from splatctrl_cli.jobs.score.score import ScoreRequest, score
@@ -54,8 +54,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
     if args.cloud is None:
         for name in ("unit", "masks"):
-            if getattr(args, f"cloud_{name}") is not None:
-                raise UsageError(f"--cloud-{name}: only with --cloud", remedy="leave it out")
+            refuse_if(
+                getattr(args, f"cloud_{name}") is not None,
+                f"--cloud-{name}: only with --cloud",
+                remedy="leave it out",
+                error=UsageError,
+            )
         return None
     if args.dtu is None and (args.cloud_masks is not None or args.cloud.is_dir()):
         what = "--cloud-masks" if args.cloud_masks is not None else f"--cloud {args.cloud}"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.evaluate.views import psnr
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
@@ -102,12 +102,14 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
 
 
 def _refuse_unusable(data: Path, out: Path) -> None:
-    if missing := [name for name in INPUTS if not (data / name).is_file()]:
-        raise InputError(
-            f"{data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
-        )
-    if out.resolve() == data.resolve():
-        raise UsageError(f"{out}: is the input folder", remedy="give another --out")
+    refuse_if(
+        missing := [name for name in INPUTS if not (data / name).is_file()],
+        f"{data}: has no {', '.join(missing)}",
+        remedy="make a recording with 'splatctrl simulate -o DIR'",
+    )
+    refuse_if(
+        out.resolve() == data.resolve(), f"{out}: is the input folder", remedy="give another --out", error=UsageError
+    )
 
 
 def _reason(words: Sequence[str], expected: str, label: str) -> Reason:

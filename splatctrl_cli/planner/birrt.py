@@ -12,7 +12,7 @@ import numpy as np
 
 from splatctrl_cli.config import PlannerConfig, fixed
 from splatctrl_cli.control.preconditions import checked_posture
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
 from splatctrl_cli.records import Float64, Index
 
@@ -187,18 +187,19 @@ def check_postures(clearance: Clearance, start: Float64, goals: Float64, config:
     for name, q in zip(names, rows, strict=True):
         outside = np.maximum(q - model.upper, model.lower - q)
         joint = int(np.argmax(outside))
-        if outside[joint] > config.limit_tolerance:
-            raise InputError(
-                f"{name}: joint {model.joint_names[joint]}: expected within [{model.lower[joint]:.4f}, "
-                f"{model.upper[joint]:.4f}] rad, got {q[joint]:.4f}",
-                remedy="give a posture within the limits, or check that the URDF is of this robot",
-            )
+        refuse_if(
+            outside[joint] > config.limit_tolerance,
+            f"{name}: joint {model.joint_names[joint]}: expected within [{model.lower[joint]:.4f}, "
+            f"{model.upper[joint]:.4f}] rad, got {q[joint]:.4f}",
+            remedy="give a posture within the limits, or check that the URDF is of this robot",
+        )
         row, distance = clearance.worst(q)
-        if distance < config.contact:
-            raise NotEvaluableError(
-                f"{name}: expected a posture {config.contact:g} m clear of its margin, got {row} at {distance:.4f} m",
-                remedy="give another posture or a smaller margin, or check the scene and --base",
-            )
+        refuse_if(
+            distance < config.contact,
+            f"{name}: expected a posture {config.contact:g} m clear of its margin, got {row} at {distance:.4f} m",
+            remedy="give another posture or a smaller margin, or check the scene and --base",
+            error=NotEvaluableError,
+        )
     return np.array(rows)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import Bool, DistanceGrid, Float64
 from splatctrl_cli.report.pictures import (
@@ -204,8 +204,7 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
 
     Raises NotEvaluableError without points, UsageError for a probability outside [0, 1].
     """
-    if not len(probability):
-        raise NotEvaluableError("reliability: expected at least one point, got none")
+    refuse_if(not len(probability), "reliability: expected at least one point, got none", error=NotEvaluableError)
     if not ((probability >= 0) & (probability <= 1)).all():
         i = int(np.argmin((probability >= 0) & (probability <= 1)))
         raise UsageError(f"reliability: point {i}: expected a probability in [0, 1], got {probability[i]}")

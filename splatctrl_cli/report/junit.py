@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 from xml.etree import ElementTree
 
-from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError
+from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError, refuse_if
 from splatctrl_cli.files.output import output_path
 
 
@@ -176,8 +176,12 @@ def check_replaceable(path: Path) -> None:
         return  # `output_path` says what is wrong with the others
     except OSError as error:
         raise UsageError(f"{path}: cannot be replaced: {error.strerror}", remedy="give another --junit") from None
-    if start not in (b"", HEAD.encode()):
-        raise UsageError(f"{path}: exists, and is no JUnit report of splatctrl", remedy="give another --junit")
+    refuse_if(
+        start not in (b"", HEAD.encode()),
+        f"{path}: exists, and is no JUnit report of splatctrl",
+        remedy="give another --junit",
+        error=UsageError,
+    )
 
 
 def junit_text(suites: Sequence[Suite]) -> str:

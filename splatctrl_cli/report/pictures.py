@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import Bool, DistanceGrid, Float32, Float64, UInt8
@@ -58,8 +58,7 @@ class ComparisonRow:
 
 def comparison_picture(path: Path, rows: Sequence[ComparisonRow]) -> None:
     """Write photo | render | depth error [cm], one row per view."""
-    if not rows:
-        raise NotEvaluableError(f"{path}: no view to draw: expected at least one, got 0")
+    refuse_if(not rows, f"{path}: no view to draw: expected at least one, got 0", error=NotEvaluableError)
     height, width = rows[0].photo.shape[:2]
     row_height = (WIDTH - 1.2) / 3 * height / width + 0.42
     with drawn_figure(path, len(rows) * row_height + 0.15) as figure:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import COMPARED_CELLS, FAR_GRID
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.evaluate.field_accuracy import (
     compare_with_mesh,
     compare_with_truth,
@@ -59,8 +59,7 @@ def accuracy_of(
 def check_references(request: BakeRequest, source: BakeSource) -> None:
     """Raise for unusable references before a long bake."""
     for path in (request.truth, request.seen_by, request.reference_mesh):
-        if path is not None and not path.exists():
-            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+        refuse_if(path is not None and not path.exists(), f"{path}: no such file or folder", remedy="check the path")
     if request.held_out is not None:
         _held_out_cameras(open_source(request.held_out), request, source.cameras)
 
@@ -128,8 +127,9 @@ def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, re
             state = record
         elif record.camera in cameras:
             newest[record.camera] = record, state
-    if not newest:
-        raise NotEvaluableError(f"{log}: no frame of {', '.join(cameras)} up to the time of the scene")
+    refuse_if(
+        not newest, f"{log}: no frame of {', '.join(cameras)} up to the time of the scene", error=NotEvaluableError
+    )
     urdf, names = request.urdf, recording.joint_names
     robot = None if urdf is None else RobotModel.from_urdf(urdf, request.spheres).moved_by(names)
     counted = []
@@ -153,8 +153,12 @@ def _held_out_cameras(
     if also := [name for name in names if trained is not None and name in trained]:
         raise UsageError(f"--held-out: camera {also[0]} trained the scene", remedy="name one that did not")
     chosen = names or tuple(name for name in known if trained is None or name not in trained)
-    if not chosen:
-        raise UsageError(f"--held-out: every camera of {log} trained the scene", remedy="give another log")
+    refuse_if(
+        not chosen,
+        f"--held-out: every camera of {log} trained the scene",
+        remedy="give another log",
+        error=UsageError,
+    )
     return chosen
 
 

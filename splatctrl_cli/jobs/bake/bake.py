@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
@@ -214,10 +214,17 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
 def check_request(request: BakeRequest) -> None:
     """Raise UsageError for too coarse cells, incomplete options, and gates on unknown figures."""
     check_loss(request.config.field.voxel, request.config.field.max_loss)
-    if (request.truth is None) != (request.seen_by is None):
-        raise UsageError("--truth and --seen-by: expected both or neither")
-    if request.previous_scene is not None and request.update is None:
-        raise UsageError("--previous-scene: belongs to --update", remedy="give the field folder to --update as well")
+    refuse_if(
+        (request.truth is None) != (request.seen_by is None),
+        "--truth and --seen-by: expected both or neither",
+        error=UsageError,
+    )
+    refuse_if(
+        request.previous_scene is not None and request.update is None,
+        "--previous-scene: belongs to --update",
+        remedy="give the field folder to --update as well",
+        error=UsageError,
+    )
     of_truth = () if request.truth is None else field_accuracy.metric_scales(FIELDS)
     check_gate_names(request.require, (*SUMMARY_METRICS, *of_truth))
 
@@ -270,17 +277,19 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
     names = {"sdf", *wanted, *(("probability",) if request.with_probability else ())}
     chosen = (*(name for name in CHANNELS if name in names), *sorted(names - set(CHANNELS)))
     for option in ("truth", "reference_mesh", "held_out"):
-        if getattr(request, option) is not None and not {"bound", "hard"} & names:
-            raise UsageError(
-                f"--{option.replace('_', '-')}: needs the exact distance",
-                remedy="bake the channel bound or hard as well",
-            )
-    unknown = request.config.field.unknown
-    if unknown != "free" and "observed" not in names:
-        raise UsageError(
-            f"field.unknown = {unknown}: needs to know which cells were seen",
-            remedy="bake the channel observed as well",
+        refuse_if(
+            getattr(request, option) is not None and not {"bound", "hard"} & names,
+            f"--{option.replace('_', '-')}: needs the exact distance",
+            remedy="bake the channel bound or hard as well",
+            error=UsageError,
         )
+    unknown = request.config.field.unknown
+    refuse_if(
+        unknown != "free" and "observed" not in names,
+        f"field.unknown = {unknown}: needs to know which cells were seen",
+        remedy="bake the channel observed as well",
+        error=UsageError,
+    )
     return chosen
 
 

@@ -10,7 +10,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, Protocol
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table, jobs_for
 
 RECORDING, NAME = "recording", "name"  # placeholders {…} in an option, besides job names
@@ -117,17 +117,24 @@ def _fill(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str
     if len(makers) > 1:
         example = " or ".join(f"'{{{name}}}'" for name in makers)
         raise UsageError(f"{where}: {len(makers)} jobs of {role} come before it", remedy=f"say {example}")
-    if not makers and role == SCENE:
-        raise UsageError(f"{where}: expected a job of {SCENE} before it", remedy="or give scene = PATH")
+    refuse_if(
+        not makers and role == SCENE,
+        f"{where}: expected a job of {SCENE} before it",
+        remedy="or give scene = PATH",
+        error=UsageError,
+    )
     return f"{{{makers[0] if makers else RECORDING}}}"
 
 
 def _sort_jobs(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
     needs = {name: _needs(job, jobs, recording) for name, job in jobs.items()}
-    try:
+    with refuse_faults(
+        lambda error: f"[jobs]: {' needs '.join(error.args[1][::-1])}",
+        CycleError,
+        remedy="break the circle",
+        error=UsageError,
+    ):
         TopologicalSorter(needs).prepare()
-    except CycleError as error:
-        raise UsageError(f"[jobs]: {' needs '.join(error.args[1][::-1])}", remedy="break the circle") from None
     ordered: dict[str, None] = {}
 
     def add(name: str) -> None:
@@ -202,8 +209,12 @@ def _nodes_of(
     nodes = [node for each in made.values() for node in each]
     by_name: dict[str, Node] = {}
     for node in nodes:
-        if by_name.setdefault(node.name.lower(), node) is not node:
-            raise UsageError(f"two outputs are called {node.name}", remedy="rename a job, or a value of its matrix")
+        refuse_if(
+            by_name.setdefault(node.name.lower(), node) is not node,
+            f"two outputs are called {node.name}",
+            remedy="rename a job, or a value of its matrix",
+            error=UsageError,
+        )
     return nodes
 
 

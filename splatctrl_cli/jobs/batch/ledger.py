@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from uuid import uuid4
 
 import splatctrl_cli
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PACKAGES, sha256, write_durably, write_table
 from splatctrl_cli.jobs.batch.graph import Node
@@ -107,10 +107,11 @@ class Ledger(AbstractContextManager["Ledger"]):
         base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
         base.row_factory = sqlite3.Row
         version = int(base.execute("PRAGMA user_version").fetchone()[0])
-        if version > VERSION:
-            raise InputError(
-                f"{self.path}: is of version {version}, expected {VERSION}", remedy="use a newer splatctrl"
-            )
+        refuse_if(
+            version > VERSION,
+            f"{self.path}: is of version {version}, expected {VERSION}",
+            remedy="use a newer splatctrl",
+        )
         until = time.monotonic() + BUSY_S
         while base.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
             try:
@@ -273,14 +274,12 @@ def _deciding_words(words: Sequence[str], named: Mapping[str, str]) -> list[str]
 
 def _digest(path: Path, ledger: Ledger) -> str:
     """Digest of an input and what it names: images, a URDF's meshes."""
-    try:
+    with refuse_faults(
+        lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy="check the suite's paths"
+    ):
         digest = ledger.digest(path.parent if path.suffix == ".toml" and path.parent != Path() else path)
-        if path.suffix != ".urdf":
-            return digest
-        meshes = [place for place in _meshes(path) if place.is_file()]
+        meshes = [place for place in _meshes(path) if place.is_file()] if path.suffix == ".urdf" else []
         return " ".join([digest, *(ledger.digest(place) for place in meshes)])
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the suite's paths") from None
 
 
 def _meshes(urdf: Path) -> Iterator[Path]:

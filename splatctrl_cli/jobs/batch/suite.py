@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config.ranges import format_value
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if
 
 Table = Mapping[str, Any]
 
@@ -113,8 +113,9 @@ def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str])
 
 def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = None) -> Job:
     where = f"[jobs.{name}]"
-    if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {format_value(table)}")
+    refuse_if(
+        not isinstance(table, Mapping), f"{where}: expected a table, got {format_value(table)}", error=UsageError
+    )
     _check_name(where, name)
     command = _worded(where, "command", table.get("command", base.command if base else name))
     if command not in commands:
@@ -122,11 +123,13 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
             f"{where}: no job is called {command!r}", remedy=_suggest(command, commands, "give command = one of")
         )
     own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
-    if own is not None:
-        raise UsageError(f"{where}: a batch gives {own} itself", remedy="leave it out")
+    refuse_if(own is not None, f"{where}: a batch gives {own} itself", remedy="leave it out", error=UsageError)
     matrix = table.get("matrix", {})
-    if not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()):
-        raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {format_value(matrix)}")
+    refuse_if(
+        not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()),
+        f"{where} matrix: expected OPTION = [VALUE, ...] each, got {format_value(matrix)}",
+        error=UsageError,
+    )
     expect = _worded(where, "expect", table.get("expect", base.expect if base else "passed"))
     if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
         raise UsageError(
@@ -149,19 +152,30 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
 
 def _recordings(folder: Path, table: Table) -> list[Recording]:
     where = "[[recordings]]"
-    if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {format_value(table)}", remedy="give it paths = [...]")
+    refuse_if(
+        not isinstance(table, Mapping),
+        f"{where}: expected a table, got {format_value(table)}",
+        remedy="give it paths = [...]",
+        error=UsageError,
+    )
     _check_keys(where, table, ("name", "paths", "session", "only", "jobs"))
     only = tuple(_worded(where, "only", name) for name in _list(where, table, "only"))
-    if ("paths" in table) == ("session" in table):
-        raise UsageError(f"{where}: expected paths or session, and not both")
+    refuse_if(
+        ("paths" in table) == ("session" in table),
+        f"{where}: expected paths or session, and not both",
+        error=UsageError,
+    )
     key = "paths" if "paths" in table else "session"
     paths = list(
         dict.fromkeys(path for each in _list(where, table, key) for path in _find_files(folder, where, each))
     )
     name = _worded(where, "name", table.get("name", ""))
-    if name and key == "paths" and len(paths) > 1:
-        raise UsageError(f"{where} name = {name!r}: {len(paths)} recordings match", remedy="leave the name out")
+    refuse_if(
+        name and key == "paths" and len(paths) > 1,
+        f"{where} name = {name!r}: {len(paths)} recordings match",
+        remedy="leave the name out",
+        error=UsageError,
+    )
     each = [tuple(paths)] if key == "session" else [(path,) for path in paths]
     jobs = _tables(where, table, "jobs")
     return [Recording(name=name, paths=files, only=only, overrides=jobs) for files in each]
@@ -169,8 +183,7 @@ def _recordings(folder: Path, table: Table) -> list[Recording]:
 
 def _find_files(folder: Path, where: str, pattern: object) -> list[Path]:
     places = sorted(glob.glob(_worded(where, "paths", pattern), root_dir=folder, recursive=True))  # noqa: PTH207
-    if not places:
-        raise InputError(f"{where}: nothing matches {pattern!r} in {folder}", remedy="check the pattern")
+    refuse_if(not places, f"{where}: nothing matches {pattern!r} in {folder}", remedy="check the pattern")
     return [folder / place for place in places]
 
 
@@ -229,8 +242,12 @@ def _suggest(word: str, known: Sequence[str], otherwise: str = "known here") -> 
 
 
 def _check_name(where: str, name: str) -> None:
-    if not re.fullmatch(r"\w[\w.+-]*", name):
-        raise UsageError(f"{where}: {name!r} is no name of a folder", remedy="use letters, digits, . _ + -")
+    refuse_if(
+        not re.fullmatch(r"\w[\w.+-]*", name),
+        f"{where}: {name!r} is no name of a folder",
+        remedy="use letters, digits, . _ + -",
+        error=UsageError,
+    )
 
 
 def _worded(where: str, key: str, value: object) -> str:

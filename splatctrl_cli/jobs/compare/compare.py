@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
 from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, note, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
@@ -139,8 +139,11 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
     Raises UsageError for another request, InputError for unreadable or unlike runs.
     """
     num_needed = 1 if request.against is not None else 2
-    if len(request.runs) != num_needed and not (len(request.runs) == 1 and request.update_baseline is not None):
-        raise UsageError(f"compare: expected two runs, or one and --against, got {len(request.runs)}")
+    refuse_if(
+        len(request.runs) != num_needed and not (len(request.runs) == 1 and request.update_baseline is not None),
+        f"compare: expected two runs, or one and --against, got {len(request.runs)}",
+        error=UsageError,
+    )
     after = read_judged(request.runs[-1])
     before = read_baseline(request.against) if request.against is not None else read_judged(request.runs[0])
     _check_alike(before, after)
@@ -152,8 +155,9 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
 
 
 def _check_alike(before: Judged, after: Judged) -> None:
-    if before.kind != after.kind:
-        raise InputError(f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}")
+    refuse_if(
+        before.kind != after.kind, f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}"
+    )
     if before.kind == "run" and before.runs.keys() != after.runs.keys():
         expected, got = (", ".join(judged.runs) for judged in (before, after))
         raise InputError(f"{after.path}: expected a run of {expected}, as {before.path} is, got one of {got}")
@@ -166,14 +170,16 @@ def _check_alike(before: Judged, after: Judged) -> None:
         )
     for name in common:
         old, new = before.runs[name], after.runs[name]
-        if old.command != new.command:
-            raise InputError(f"{after.path}: {name}: expected a run of {old.command}, got one of {new.command}")
+        refuse_if(
+            old.command != new.command,
+            f"{after.path}: {name}: expected a run of {old.command}, got one of {new.command}",
+        )
         lost = sorted(old.metrics.keys() - new.metrics.keys())
-        if before.is_baseline and new.outcome and lost:
-            raise InputError(
-                f"{before.path}: {name}: has figures that this run has not: {_list_names(lost)}",
-                remedy="run it with the options of then, or write the baseline anew with --update-baseline",
-            )
+        refuse_if(
+            before.is_baseline and new.outcome and lost,
+            f"{before.path}: {name}: has figures that this run has not: {_list_names(lost)}",
+            remedy="run it with the options of then, or write the baseline anew with --update-baseline",
+        )
 
 
 def _compare(before: Judged, after: Judged) -> CompareResult:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_TABLE, MARCH_STEPS
 from splatctrl_cli.control.audit import observed_at
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import OnDevice, SphereField, field_over, march
 from splatctrl_cli.field.grid_cells import GridField, check_room
@@ -79,11 +79,12 @@ class SceneAnswers:
 
         Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
         """
-        if config.field.unknown != "free":
-            raise UsageError(
-                f"field.unknown = {config.field.unknown}: only a baked field has it",
-                remedy="bake it with sdf-bake and query that",
-            )
+        refuse_if(
+            config.field.unknown != "free",
+            f"field.unknown = {config.field.unknown}: only a baked field has it",
+            remedy="bake it with sdf-bake and query that",
+            error=UsageError,
+        )
         splats = obstacles.splats
         self._spheres = Spheres.of(splats.centers, splats.radii)
         self._exact: SphereField | OnDevice
@@ -148,10 +149,11 @@ class GridAnswers:
         self._cells = {}
         for name in _NAMES.keys() & grid.channels.keys():
             values, most = grid.channels[name].astype(np.uint8), len(_NAMES[name]) - 2
-            if values.max() > most:
-                raise InputError(
-                    f"{where}: {name}: expected 0 to {most}, got {values.max()}", remedy="bake the field again"
-                )
+            refuse_if(
+                values.max() > most,
+                f"{where}: {name}: expected 0 to {most}, got {values.max()}",
+                remedy="bake the field again",
+            )
             self._cells[name] = partial(observed_at, values, grid.origin, grid.voxel)
 
     def at(self, points: Float64) -> Answers:
@@ -277,22 +279,32 @@ Answering = tuple[str, Callable[[Float64], Answers], Box | None, Device | None]
 def _open_source(request: QueryRequest, progress: Progress) -> Answering:
     file = _grid_file(request.source)
     if file is None:
-        if request.scene is not None:
-            raise UsageError(
-                f"--scene: belongs to a field, and {request.source} is a scene", remedy="leave --scene out"
-            )
+        refuse_if(
+            request.scene is not None,
+            f"--scene: belongs to a field, and {request.source} is a scene",
+            remedy="leave --scene out",
+            error=UsageError,
+        )
         source = read_bake_source(request.source, request.at)
         device = choose_device(request.device, _is_enough(request.points), progress)
         scene = _scene(source, request, request.labels, request.config, device)
         return "scene", scene.at, source.workspace, device
-    if request.at is not None:
-        raise UsageError(f"--at: {request.source} is a field of one time", remedy="give the scene, or leave --at out")
+    refuse_if(
+        request.at is not None,
+        f"--at: {request.source} is a field of one time",
+        remedy="give the scene, or leave --at out",
+        error=UsageError,
+    )
     check_room(str(file), file.stat().st_size, "bake a smaller --box or a larger --voxel")
     grid = read_npz(Parts.beside(file).checked(file))
     of_grid = GridAnswers(grid, str(file))
     if request.scene is None:
-        if request.device.startswith(CUDA):
-            raise UsageError(f"--device {request.device}: a baked field is read on the processor", remedy=TO_CPU)
+        refuse_if(
+            request.device.startswith(CUDA),
+            f"--device {request.device}: a baked field is read on the processor",
+            remedy=TO_CPU,
+            error=UsageError,
+        )
         return "field", of_grid.at, of_grid.box, None
     where = str(request.source)
     labels = run_value(
@@ -320,8 +332,9 @@ def _grid_file(source: Path) -> Path | None:
     file = source / "field.npz"
     if file.is_file():
         return file
-    if (source / "field.json").is_file():
-        raise InputError(f"{source}: a field without field.npz", remedy="bake it with --formats npz")
+    refuse_if(
+        (source / "field.json").is_file(), f"{source}: a field without field.npz", remedy="bake it with --formats npz"
+    )
     return None
 
 
@@ -340,10 +353,10 @@ def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
                 yield block
                 bar.update(len(block))
         return
-    try:
+    with refuse_faults(
+        lambda _: f"{points}: no such file", FileNotFoundError, remedy="give a CSV file with the columns x,y,z [m]"
+    ):
         raw = points.open("rb")
-    except FileNotFoundError:
-        raise InputError(f"{points}: no such file", remedy="give a CSV file with the columns x,y,z [m]") from None
     size = points.stat().st_size
     text = TextIOWrapper(raw, encoding="utf-8", newline="")
     with text, tqdm(total=size, unit="B", unit_scale=True, disable=hidden) as bar:

@@ -16,7 +16,7 @@ from splatctrl_cli.calibration.pose_refinement import (
     unbent,
 )
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_if, require
 from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT
@@ -42,11 +42,12 @@ class Corrections:
 
     def check(self, source: RecordSource) -> None:
         """Raise UsageError for a recording over time."""
-        if self and source.has_clock:
-            raise UsageError(
-                f"{self.options}: {source.name} is recorded over time; only views of a still scene are corrected",
-                remedy="leave it out; 'splatctrl calibrate' places the cameras of a log",
-            )
+        refuse_if(
+            self and source.has_clock,
+            f"{self.options}: {source.name} is recorded over time; only views of a still scene are corrected",
+            remedy="leave it out; 'splatctrl calibrate' places the cameras of a log",
+            error=UsageError,
+        )
 
     def of(
         self, frames: Sequence[RgbdFrame], name: str, console: Progress, *, has_robot: bool = False
@@ -57,9 +58,10 @@ class Corrections:
         """
         if not self:
             return list(frames), {}
-        depth = RecordedDepth.of(frames)
-        if depth is None:
-            raise InputError(f"{name}: {self.options}: no view has depth, which alone says what views have in common")
+        depth = require(
+            RecordedDepth.of(frames),
+            f"{name}: {self.options}: no view has depth, which alone says what views have in common",
+        )
         scale, told = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
         rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
         moved = list(frames)

@@ -11,7 +11,7 @@ import numpy as np
 from splatctrl_cli.calibration.displacement import displaced_cameras, placed
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names, counted
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.formats.arrays import savez
@@ -169,14 +169,18 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     urdf = urdf_of(request.urdf, [request.recording] if request.recording else [], progress)
     if urdf is None:
         for option, path in (("spheres", request.spheres), ("self-model", request.self_model)):
-            if path not in (None, NO_SELF_MODEL):
-                raise UsageError(f"--{option} {path}: needs the robot", remedy="give --urdf as well")
+            refuse_if(
+                path not in (None, NO_SELF_MODEL),
+                f"--{option} {path}: needs the robot",
+                remedy="give --urdf as well",
+                error=UsageError,
+            )
         return None
-    if guess := guessed_unit(request.source):
-        raise InputError(
-            f"{request.source.name}: {guess}; a robot needs lengths in metres that nobody guessed",
-            remedy="write poses and depth in metres, or leave the robot out",
-        )
+    refuse_if(
+        guess := guessed_unit(request.source),
+        f"{request.source.name}: {guess}; a robot needs lengths in metres that nobody guessed",
+        remedy="write poses and depth in metres, or leave the robot out",
+    )
     try:
         model = RobotModel.from_urdf(urdf, request.spheres)
         if request.source.joint_names:
@@ -200,12 +204,14 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
 
 
 def _check_fits(urdf: UrdfFile, source: RecordSource) -> None:
-    if words := other_frame(urdf, source):
-        raise InputError(
-            f"{urdf.path}: {words}", remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one"
-        )
-    if not source.joint_names:
-        raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")
+    refuse_if(
+        words := other_frame(urdf, source),
+        f"{urdf.path}: {words}",
+        remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one",
+    )
+    refuse_if(
+        not source.joint_names, f"{source.name}: expected joint states, got none", remedy="record /joint_states"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,8 +235,9 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
     model = request.posed(urdf, own_spheres(urdf))
     with output_path(request.out, force=request.force, is_folder=False) as partial:
         source = open_source(request.log, request.options)
-        if not source.joint_names:
-            raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")
+        refuse_if(
+            not source.joint_names, f"{source.name}: expected joint states, got none", remedy="record /joint_states"
+        )
         arm = arm_of(model.moved_by(source.joint_names), source)
         frames = frames_of(arm, source, progress)
         off = displaced_cameras(arm, frames)
@@ -273,8 +280,7 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
     stamps = {camera: its for camera, its in stamps.items() if camera in training_cameras(source)}
     found = [(stamp, arm.surface_poses(stamp)) for stamp in spread(min(stamps.values(), key=len), 2000)]
     posed = [(stamp, T) for stamp, T in found if T is not None]
-    if not posed:
-        raise InputError(f"{source.name}: no frame has a joint state within {1e-9 * STATES_CLOSE_NS:g} s")
+    refuse_if(not posed, f"{source.name}: no frame has a joint state within {1e-9 * STATES_CLOSE_NS:g} s")
     order = choose_moments(arm.surface, np.array([T for _, T in posed]))
     chosen = frames_nearest(stamps, [posed[number][0] for number in order])
     frames = [

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config import SceneConfig, fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.formats.ply import read_points
 from splatctrl_cli.formats.scene.scene_folder import FORMAT
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, SceneWriter
@@ -39,8 +39,12 @@ KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes a c
 def training_cameras(source: RecordSource) -> list[str]:
     """Cameras that may train. Raises UsageError without any."""
     cameras = [camera for camera in source.cameras if camera != "holdout"]
-    if not cameras:
-        raise UsageError(f"{source.name}: no camera is left to train on", remedy="camera 'holdout' is kept for score")
+    refuse_if(
+        not cameras,
+        f"{source.name}: no camera is left to train on",
+        remedy="camera 'holdout' is kept for score",
+        error=UsageError,
+    )
     return cameras
 
 
@@ -147,11 +151,11 @@ class Reconstruction:
                 f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
                 remedy="'splatctrl info' says what the input lacks",
             )
-        if not any(row.alive for row in self.rows):
-            raise InputError(
-                f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
-                remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
-            )
+        refuse_if(
+            not any(row.alive for row in self.rows),
+            f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
+            remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
+        )
 
     def _step_through(self, console: Progress) -> None:
         steps = tqdm(self.time_steps(), disable=True if console.is_quiet else None, unit=" steps")

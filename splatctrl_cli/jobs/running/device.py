@@ -8,7 +8,7 @@ from typing import Any
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_WORK
-from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError
+from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError, refuse_if
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.fit import DeviceFit, bytes_needed
@@ -78,12 +78,10 @@ def automatic(
 ) -> Device:
     """Choose a usable card with `needed` bytes, if the work is enough; log why."""
     try:
-        if too_little:
-            raise DeviceError(too_little)
+        refuse_if(too_little, too_little, error=DeviceError)
         device = open_device(name, source)
         assert device.memory is not None
-        if needed > device.memory.available():
-            raise DeviceError("too little memory is free on the card")
+        refuse_if(needed > device.memory.available(), "too little memory is free on the card", error=DeviceError)
     except DeviceError as error:
         progress.log(f"computes on cpu: {error}")
         return Device()

@@ -7,7 +7,7 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
 from splatctrl_cli.evaluate.score_report import (
     AVERAGING,
@@ -60,8 +60,12 @@ class ScoreRequest:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        if self.images == "all" and self.out is None:
-            raise UsageError("--images all: expected a folder for them", remedy="give -o")
+        refuse_if(
+            self.images == "all" and self.out is None,
+            "--images all: expected a folder for them",
+            remedy="give -o",
+            error=UsageError,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,11 +114,12 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
     else:
         field_splats(scene.splats())
     reference = open_reference(recording, progress)
-    if request.cloud is not None and not scene.names_its_views:
-        raise UsageError(
-            f"--cloud: the surface is looked at from the views that trained, which {request.scene} does not name",
-            remedy="leave it out, or give a folder that reconstruct wrote",
-        )
+    refuse_if(
+        request.cloud is not None and not scene.names_its_views,
+        f"--cloud: the surface is looked at from the views that trained, which {request.scene} does not name",
+        remedy="leave it out, or give a folder that reconstruct wrote",
+        error=UsageError,
+    )
     cloud = None if request.cloud is None else request.cloud.of_scan(reference.scan)
     wanted, allow_training = recording.options.cameras, request.allow_training
     scorer = Scorer(
@@ -297,6 +302,8 @@ def select_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
     Raises InputError without them: masks of one scan fit no other.
     """
     masks = None if recording.masks is None else recording.masks / scan
-    if masks is not None and not masks.is_dir():
-        raise InputError(f"{recording.masks}: expected a folder {scan} with this scan's masks, got none")
+    refuse_if(
+        masks is not None and not masks.is_dir(),
+        f"{recording.masks}: expected a folder {scan} with this scan's masks, got none",
+    )
     return replace(recording, scan=scan, masks=masks)
