@@ -5,9 +5,10 @@ import importlib
 import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
@@ -66,18 +67,17 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return code
 
 
+@dataclass(frozen=True, kw_only=True)
 class OfThisProgram:
     """Command line of nodes that run this program; `threads` for each."""
 
-    entry = "splatctrl_cli.cli.batch:run_words"
-
-    def __init__(self, threads: int) -> None:
-        self._threads = threads
+    entry: ClassVar[str] = "splatctrl_cli.cli.batch:run_words"
+    threads: int
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
         """Words for options by long name, and files among them. Raises UsageError for unknown ones."""
         parser, places, words = _parser_of(command), list[str](), [command]
-        given = {"threads": self._threads, **options}
+        given = {"threads": self.threads, **options}
         known = [name for name in given if name not in OWN or f"--{name}" in parser._option_string_actions]
         for name, action in {name: _action(parser, command, name) for name in known}.items():
             made = _words_of(name, action, given[name], folder)
@@ -106,8 +106,7 @@ class OfThisProgram:
 
 
 def run_words(words: list[str]) -> int:
-    code: int = importlib.import_module("splatctrl_cli.cli.main").main(words)
-    return code
+    return int(importlib.import_module("splatctrl_cli.cli.main").main(words))
 
 
 def preload() -> None:

@@ -14,8 +14,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from pkgutil import resolve_name
 
-from splatctrl_cli.cli.commands import build_parser, function_of, judges
+from splatctrl_cli.cli.commands import build_parser, judges
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.reports import tell_of_failure, wrap_result
 from splatctrl_cli.errors import SplatCtrlError, UsageError, refuse_if
@@ -51,7 +52,7 @@ def _run(argv: Sequence[str] | None) -> int:
         args = build_parser(words[0] if words else "").parse_args(words)
         args.began = start
         _check_outputs(args)
-        code = function_of(args.run)(args, Console(args))
+        code: int = resolve_name(f"splatctrl_cli.cli.{args.run}")(args, Console(args))
         sys.stdout.flush()
         return code
     except BrokenPipeError:

@@ -5,7 +5,7 @@ import difflib
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn, TypeVar
 
 from splatctrl_cli.config.ranges import MAX_PLACE, OneOf, Section, Within, format_value
@@ -140,11 +140,16 @@ def option(
     meaning: str,
     kind: Callable[[str], Any] | Sequence[str] | None = None,
     default: Any = None,
+    *,
+    fields: Mapping[str, Callable[[Any], Any] | str] | None = None,
+    sets: str = "",
     **more: Any,
 ) -> Adds:
     """Declare ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
 
-    kind: converts the text, or a tuple of choices. default: the help shows it if given. more: as in argparse.
+    kind: converts the text, or a tuple of choices. default: the help shows it if given. fields: of a request, by name
+    what makes them of the option's value, a function or MODULE:NAME of a heavy one (default: the field of its name).
+    sets: a key of the configuration. more: as in argparse.
     """
     flags, _, metavar = name.partition(" ")
     is_place, repeats = not flags.startswith("-"), metavar.endswith(" ...")
@@ -164,7 +169,13 @@ def option(
     if default is not None and default != [] and more.get("action") != "count":
         meaning += f" (default: {default:g})" if isinstance(default, int | float) else f" (default: {default})"
     names = [flags.lower()] if is_place else flags.split("/")
-    return lambda container: container.add_argument(*names, help=meaning.replace("%", "%%"), **more)
+
+    def add(container: Any) -> None:
+        action = container.add_argument(*names, help=meaning.replace("%", "%%"), **more)
+        same = tuple if repeats or more.get("nargs") == "+" else lambda value: value
+        action.fields, action.sets = fields or {action.dest: same}, sets
+
+    return add
 
 
 def group(title: str, *options: Adds) -> Adds:

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
@@ -40,14 +39,8 @@ FORMS = {  # by the start of a figure's name: factor and format
 
 def run(args: argparse.Namespace, console: Console) -> int:
     first, *beside = args.reference or [None]
-    request = request_of(
-        ScoreRequest,
-        args,
-        recording=replace(recording_of(args, first, args.masks), beside=tuple(beside)),
-        newest=args.snapshots == "newest",
-        cloud=_cloud(args),
-    )
-    result = score(request, console)
+    recording = recording_of(args, first, tuple(beside))
+    result = score(request_of(ScoreRequest, args, recording=recording, cloud=_cloud(args)), console)
     return console.concluded(result.verdict, result.report, lines_of(result.report))
 
 

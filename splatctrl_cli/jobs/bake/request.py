@@ -37,7 +37,7 @@ class BakeRequest(RunOptions):
     """
 
     scene: Path
-    out: Path
+    out: Path = Path("field")
     at: float | None = None
     labels: frozenset[Label] = DEFAULT_LABELS
     box: Box | None = None

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
-from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table, jobs_for
+from splatctrl_cli.jobs.batch.suite import Job, Recording, Suite, Table, jobs_for
 
 RECORDING, NAME = "recording", "name"  # placeholders {…} in an option, besides job names
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
@@ -53,7 +53,7 @@ class CommandLine(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """One command on one recording; name: RECORDING/JOB.
+    """One job on one recording; name: RECORDING/JOB.
 
     variant: matrix choices so far, by JOB.OPTION. words: the command line. inputs: files that decide the result.
     needs: nodes before it. out: None for a command that only prints.
@@ -61,15 +61,12 @@ class Node:
 
     name: str
     recording: str
-    job: str
-    command: str
+    job: Job
     words: tuple[str, ...]
     variant: Variant = field(default_factory=dict)
     inputs: tuple[Path, ...] = ()
     needs: tuple[str, ...] = ()
     out: Path | None = None
-    expect: str = "passed"
-    limits: Limits = field(default_factory=Limits)
 
 
 def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
@@ -179,7 +176,7 @@ def _nodes_of(
                 only_prints = job.command in ("check", "info")
                 its = None if only_prints else out / recording.name / (place + ENDINGS.get(job.command, ""))
                 values: dict[str, Any] = {
-                    **{each.job: str(each.out) for each in before},
+                    **{each.job.name: str(each.out) for each in before},
                     RECORDING: [str(path) for path in recording.paths],
                     NAME: recording.name,
                 }
@@ -195,15 +192,12 @@ def _nodes_of(
                     Node(
                         name=f"{recording.name}/{place}",
                         recording=recording.name,
-                        job=job.name,
-                        command=job.command,
+                        job=job,
                         words=words,
                         variant=variant,
                         inputs=tuple(inputs),
                         needs=tuple(each.name for each in before),
                         out=its,
-                        expect=job.expect,
-                        limits=job.limits,
                     )
                 )
     nodes = [node for each in made.values() for node in each]

@@ -246,7 +246,7 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
         named[str(node.out)] = "out"
         inputs = [digests[path] for path in node.inputs] + [keys[need] for need in node.needs]
         keys[node.name] = hashlib.sha256(
-            json.dumps([entry, code, node.command, *inputs, *_deciding_words(node.words, named)]).encode()
+            json.dumps([entry, code, node.job.command, *inputs, *_deciding_words(node.words, named)]).encode()
         ).hexdigest()
     return keys
 

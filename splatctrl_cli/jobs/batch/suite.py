@@ -15,6 +15,7 @@ from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if
 
 Table = Mapping[str, Any]
 
+OF_JOB = ("command", "matrix", "expect", "timeout", "memory", "retries")  # keys of a job that are no options
 _ODD = re.compile(r"[^\w.+-]")  # in no name of a folder
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 SECONDS = {"s": 1, "m": 60, "min": 60, "h": 3600}
@@ -25,19 +26,10 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Limits of a job: wall time [s], memory [bytes] (0: none), and retries."""
-
-    timeout: float = 0.0
-    memory: int = 0
-    retries: int = 1
-
-
-@dataclass(frozen=True, kw_only=True)
 class Job:
     """One command of a suite. options: by long name; matrix: values by option, each combination a variant.
 
-    expect: a verdict's label or outcome, or "exit N".
+    expect: a verdict's label or outcome, or "exit N". timeout [s], memory [bytes]: 0 for no limit.
     """
 
     name: str
@@ -45,7 +37,9 @@ class Job:
     options: Table = field(default_factory=dict)
     matrix: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     expect: str = "passed"
-    limits: Limits = field(default_factory=Limits)
+    timeout: float = 0.0
+    memory: int = 0
+    retries: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,12 +106,12 @@ def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str])
 
 
 def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = None) -> Job:
-    where = f"[jobs.{name}]"
+    where, base = f"[jobs.{name}]", base or Job(name=name, command=name)
     refuse_if(
         not isinstance(table, Mapping), f"{where}: expected a table, got {format_value(table)}", error=UsageError
     )
     _check_name(where, name)
-    command = _worded(where, "command", table.get("command", base.command if base else name))
+    command = _worded(where, "command", table.get("command", base.command))
     if command not in commands:
         raise UsageError(
             f"{where}: no job is called {command!r}", remedy=_suggest(command, commands, "give command = one of")
@@ -130,23 +124,20 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
         f"{where} matrix: expected OPTION = [VALUE, ...] each, got {format_value(matrix)}",
         error=UsageError,
     )
-    expect = _worded(where, "expect", table.get("expect", base.expect if base else "passed"))
+    expect = _worded(where, "expect", table.get("expect", base.expect))
     if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
         raise UsageError(
             f"{where} expect: no verdict is called {expect!r}", remedy=_suggest(expect, (*EXPECTED, "exit N"))
         )
-    limits = base.limits if base else Limits()
     return Job(
         name=name,
         command=command,
         matrix=matrix,
         expect=expect,
-        limits=Limits(
-            timeout=_amount(where, table, "timeout", SECONDS, limits.timeout),
-            memory=int(_amount(where, table, "memory", UNITS, limits.memory)),
-            retries=int(_amount(where, table, "retries", {}, limits.retries)),
-        ),
-        options={key: v for key, v in table.items() if key not in {"command", "matrix", "expect", *vars(limits)}},
+        timeout=_amount(where, table, "timeout", SECONDS, base.timeout),
+        memory=int(_amount(where, table, "memory", UNITS, base.memory)),
+        retries=int(_amount(where, table, "retries", {}, base.retries)),
+        options={key: value for key, value in table.items() if key not in OF_JOB},
     )
 
 

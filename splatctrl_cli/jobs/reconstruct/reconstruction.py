@@ -58,7 +58,7 @@ class ReconstructRequest(RunOptions):
     """
 
     source: RecordSource
-    out: Path
+    out: Path = Path("scene")
     recording: Path | None = None
     urdf: Path | None = None
     spheres: Path | None = None

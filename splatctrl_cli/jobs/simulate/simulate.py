@@ -45,7 +45,7 @@ class SimulateRequest:
     in place of the options' table.
     """
 
-    out: Path
+    out: Path = Path("simulated")
     urdf: Path | None = None
     spheres: Path | None = None
     packages: tuple[Path, ...] = ()
