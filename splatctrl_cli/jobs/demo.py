@@ -19,7 +19,8 @@ from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.score.views import render_with_shell
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import JointState, RgbdFrame
-from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
+from splatctrl_cli.report.field_pictures import field_slice_picture
+from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture
 from splatctrl_cli.robot.model import RobotModel
 
 TRAINED, SCORED = "--cameras cam0,cam1,cam2", "cam3"
@@ -72,7 +73,17 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
     stopwatch, out = Stopwatch(), request.out
     recorded = request.data or (SAMPLE if SAMPLE.is_dir() else None)
     if recorded is not None:
-        _refuse_unusable(recorded, out)
+        refuse_if(
+            missing := [name for name in INPUTS if not (recorded / name).is_file()],
+            f"{recorded}: has no {', '.join(missing)}",
+            remedy="make a recording with 'splatctrl simulate -o DIR'",
+        )
+        refuse_if(
+            out.resolve() == recorded.resolve(),
+            f"{out}: is the input folder",
+            remedy="give another --out",
+            error=UsageError,
+        )
     with output_path(out, force=request.force, is_folder=True) as folder:
         data = recorded or folder / "recording"
         simulated = {} if recorded else {"simulate -o {data}": "done"}  # the same scene, with the arm of primitives
@@ -99,17 +110,6 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
             verdict=verdict.as_dict(),
         )
     return verdict
-
-
-def _refuse_unusable(data: Path, out: Path) -> None:
-    refuse_if(
-        missing := [name for name in INPUTS if not (data / name).is_file()],
-        f"{data}: has no {', '.join(missing)}",
-        remedy="make a recording with 'splatctrl simulate -o DIR'",
-    )
-    refuse_if(
-        out.resolve() == data.resolve(), f"{out}: is the input folder", remedy="give another --out", error=UsageError
-    )
 
 
 def _reason(words: Sequence[str], expected: str, label: str) -> Reason:

@@ -1,7 +1,6 @@
 """Conversion of recordings into capture folders."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -17,6 +16,8 @@ from splatctrl_cli.recording.capture.capture_writer import JOURNAL, read_identit
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.recording.source import logged_descriptions, open_session
 from splatctrl_cli.recording.source_options import SourceOptions
+
+DECIDING_PACKAGES = ("numpy", "opencv-python-headless")  # whose versions may change a byte of a capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,9 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
             f"warning: {len(robots)} robots are described, by {said}: none is kept; give --urdf to each command"
         )
     progress.log(f"{source.name}: cameras {', '.join(source.cameras)}; {len(source.joint_names)} joints")
-    identity = _identity(options, source.digests())
+    inputs = dict(source.digests())
+    versions = {"splatctrl": __version__, **{name: metadata.version(name) for name in DECIDING_PACKAGES}}
+    identity = json.loads(json.dumps({**versions, "options": asdict(options), "sha256": inputs}, default=str))
     journal = partial_path(out) / JOURNAL
     with (
         advise_resumption(journal, journal.parent),
@@ -81,18 +84,8 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
             partial,
             command="ingest",
             config=asdict(options),
-            inputs=source.digests(),
+            inputs=inputs,
             metrics=metrics,
             stopwatch=stopwatch,
         )
     return out, metrics
-
-
-def _identity(options: SourceOptions, inputs: Mapping[str, str]) -> dict[str, Any]:
-    versions = {name: metadata.version(name) for name in ("numpy", "opencv-python-headless")}
-    plain: dict[str, Any] = json.loads(
-        json.dumps(
-            {"splatctrl": __version__, **versions, "options": asdict(options), "sha256": dict(inputs)}, default=str
-        )
-    )
-    return plain

@@ -247,9 +247,10 @@ def _skip_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) 
 
 
 def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float64:
-    places = np.sort(_places(path, random.random((num, 2))), axis=1)
+    along, numbers = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))], np.arange(len(path))
+    places = np.sort(np.interp(random.random((num, 2)) * along[-1], along, numbers), axis=1)
     places = places[np.floor(places[:, 0]) < np.floor(places[:, 1])]
-    way = np.interp(places, np.arange(len(path)), _lengths(path))
+    way = np.interp(places, numbers, along)
     saved = way[:, 1] - way[:, 0] - np.linalg.norm(_points(path, places[:, 1]) - _points(path, places[:, 0]), axis=1)
     order = np.argsort(-saved, kind="stable")
     return np.asarray(places[order[saved[order] > fixed.SHORTCUT_WORTH]])
@@ -261,15 +262,6 @@ def _cut(path: Float64, cut: Float64) -> Float64:
     cut_path = rows[np.r_[True, np.linalg.norm(np.diff(rows, axis=0), axis=1) > 1e-12]]
     cut_path[-1] = path[-1]
     return cut_path
-
-
-def _lengths(path: Float64) -> Float64:
-    return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-
-
-def _places(path: Float64, share: Float64) -> Float64:
-    along = _lengths(path)
-    return np.asarray(np.interp(share * along[-1], along, np.arange(len(path))))
 
 
 def _points(path: Float64, places: Float64) -> Float64:

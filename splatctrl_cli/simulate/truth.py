@@ -128,33 +128,29 @@ def load_truth(path: Path) -> Truth:
         *(KeyError, TypeError, ValueError),
         remedy="write it anew with simulate",
     ):
-        return _parse(path, document)
-
-
-def _parse(path: Path, document: dict[str, Any]) -> Truth:
-    robot, clearance = document["robot"], document["clearance"]
-    cameras = tuple(
-        Camera(
-            name=entry["name"],
-            intrinsics=Intrinsics(**entry["intrinsics"]),
-            T_world_camera=_pose(entry["T_world_camera"]),
-            is_training=entry["role"] == "training",
+        robot, clearance = document["robot"], document["clearance"]
+        cameras = tuple(
+            Camera(
+                name=entry["name"],
+                intrinsics=Intrinsics(**entry["intrinsics"]),
+                T_world_camera=_pose(entry["T_world_camera"]),
+                is_training=entry["role"] == "training",
+            )
+            for entry in document["cameras"]
         )
-        for entry in document["cameras"]
-    )
-    return Truth(
-        path=path,
-        primitives=tuple(_primitive(entry) for entry in document["primitives"]),
-        cameras=cameras,
-        luminance_std={entry["name"]: float(entry["luminance_std"]) for entry in document["cameras"]},
-        joint_names=tuple(robot["joint_names"]),
-        robot_urdf=path.parent / robot["urdf"],
-        robot_spheres=path.parent / robot["spheres"],
-        T_world_base=_pose(robot["T_world_base"]),
-        stamps=np.array(clearance["stamps"], dtype=np.int64),
-        clearance=np.array(clearance["distance"], dtype=np.float64),
-        unmodelled=tuple(robot.get("unmodelled", ())),
-    )
+        return Truth(
+            path=path,
+            primitives=tuple(_primitive(entry) for entry in document["primitives"]),
+            cameras=cameras,
+            luminance_std={entry["name"]: float(entry["luminance_std"]) for entry in document["cameras"]},
+            joint_names=tuple(robot["joint_names"]),
+            robot_urdf=path.parent / robot["urdf"],
+            robot_spheres=path.parent / robot["spheres"],
+            T_world_base=_pose(robot["T_world_base"]),
+            stamps=np.array(clearance["stamps"], dtype=np.int64),
+            clearance=np.array(clearance["distance"], dtype=np.float64),
+            unmodelled=tuple(robot.get("unmodelled", ())),
+        )
 
 
 def _primitive_document(primitive: Primitive) -> dict[str, Any]:

@@ -101,21 +101,19 @@ class Scheduler:
                 self._settle(node, run, clock)
             else:
                 Path(self._place(node, ".end")).unlink(missing_ok=True)
-                futures[self.executor.submit(run_task, self._task(node))] = node
+                task = Task(
+                    entry=self.entry,
+                    words=[*node.words],
+                    key=self.keys[node.name],
+                    out="" if node.out is None else str(node.out.absolute()),
+                    result=self._place(node, ".json"),
+                    log=self._place(node, ".log"),
+                    end=self._place(node, ".end"),
+                    timeout=node.job.timeout,
+                    memory=node.job.memory,
+                )
+                futures[self.executor.submit(run_task, task)] = node
         return is_busy
-
-    def _task(self, node: Node) -> Task:
-        return Task(
-            entry=self.entry,
-            words=[*node.words],
-            key=self.keys[node.name],
-            out="" if node.out is None else str(node.out.absolute()),
-            result=self._place(node, ".json"),
-            log=self._place(node, ".log"),
-            end=self._place(node, ".end"),
-            timeout=node.job.timeout,
-            memory=node.job.memory,
-        )
 
     def _reuse_run(self, node: Node, before: Run | None) -> Run | None:
         """The run that stands for a node: skipped, kept, or ended unrecorded; None if it is to run."""

@@ -168,19 +168,13 @@ def corrected_among(
         return frame
     scale, free = depth.median / fixed.SCALE_DEPTH, np.arange(len(others) + 1) == 0
     respects = next(iter(corrections.values()))
-    bend = _bend_of(frame, others, corrections)
+    # of the frame's camera, or of the only one with its intrinsics
+    cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
+    camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
+    bend = next((row.bend for (name, _), row in corrections.items() if name == camera), None)
     frame = frame if bend is None else unbent(frame, bend)
     if respects.T_world_camera is not None:
         frame = replace(frame, T_world_camera=refined_poses([frame, *others], scale, free).T_world_camera[0])
     if respects.gain is not None:
         frame = exposed(frame, exposure_gains([frame, *others], scale, free)[0])
     return frame
-
-
-def _bend_of(
-    frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
-) -> Float64 | None:
-    """Bend of the frame's camera, or of the only one with its intrinsics."""
-    cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
-    camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
-    return next((row.bend for (name, _), row in corrections.items() if name == camera), None)

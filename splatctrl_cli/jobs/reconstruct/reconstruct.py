@@ -35,7 +35,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_fusion import REACH, choose_moments, learn
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import own_spheres
-from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from splatctrl_cli.robot.urdf import read_urdf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +188,12 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
             model.joint_columns(request.source.joint_names)
         model = add_self_model(model, request.self_model)
         if request.urdf is None:
-            _check_fits(urdf, request.source)
+            refuse_if(
+                words := other_frame(urdf, request.source),
+                f"{urdf.path}: {words}",
+                remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one",
+            )
+            _check_has_states(request.source)
             progress.log(f"the robot is the log's own: {urdf.path}")
         notes = model.surface.notes
     except InputError as error:
@@ -203,12 +208,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     return model
 
 
-def _check_fits(urdf: UrdfFile, source: RecordSource) -> None:
-    refuse_if(
-        words := other_frame(urdf, source),
-        f"{urdf.path}: {words}",
-        remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one",
-    )
+def _check_has_states(source: RecordSource) -> None:
     refuse_if(
         not source.joint_names, f"{source.name}: expected joint states, got none", remedy="record /joint_states"
     )
@@ -235,9 +235,7 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
     model = request.posed(urdf, own_spheres(urdf))
     with output_path(request.out, force=request.force, is_folder=False) as partial:
         source = open_source(request.log, request.options)
-        refuse_if(
-            not source.joint_names, f"{source.name}: expected joint states, got none", remedy="record /joint_states"
-        )
+        _check_has_states(source)
         arm = arm_of(model.moved_by(source.joint_names), source)
         frames = frames_of(arm, source, progress)
         off = displaced_cameras(arm, frames)
