@@ -43,7 +43,7 @@ def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
     for name, made_by in left.items():
         if made_by is Config:
             found[name] = config_of(args)
-        elif is_dataclass(made_by):
+        elif isinstance(made_by, type) and is_dataclass(made_by):
             found[name] = request_of(made_by, args)
     return kind(**found)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.jobs.batch.suite import Job, Recording, Suite, Table, jobs_for
@@ -37,7 +37,7 @@ Variant = Mapping[str, Any]
 class CommandLine(Protocol):
     """Command line of a batch's nodes; `entry` is MODULE:FUNCTION, from words to exit code."""
 
-    entry: str
+    entry: ClassVar[str]
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
         """Words for options, whose paths are relative to `folder`, and the files they read.

@@ -201,21 +201,6 @@ def _compare(before: Judged, after: Judged) -> CompareResult:
         "num_worse": len(alone) + sum(one.change is Change.WORSE for one in jobs),
         "num_better": sum(one.change is Change.BETTER for one in found),
     }
-    weighed = [
-        *((-one.share, one.metric, _figure_reason(one, after.kind)) for one in alone),
-        *((-one.worst.share, one.metric, _job_reason(one)) for one in jobs if one.change is Change.WORSE),
-    ]
-    ordered = sorted(weighed, key=lambda one: one[:2])
-    single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
-    more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
-    notes = {
-        "single recordings": [f"{one.metric} of {one.worst.run}: {one.worst.sentence}{more}" for one in single[:1]],
-        "runs": [
-            f"only in {side.path}: {_list_names(names)}"
-            for side, names in ((before, only_before), (after, only_after))
-            if names
-        ],
-    }
     num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
     counted = f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
     reasons = [
@@ -223,8 +208,12 @@ def _compare(before: Judged, after: Judged) -> CompareResult:
         if num_figures or num_verdicts
         else lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides"),
         *_verdict_reasons(verdicts, after),
-        *(reason for *_, reason in ordered),
-        *(note(criterion=name, sentence=sentence) for name, sentences in notes.items() for sentence in sentences),
+        *_regressions(alone, jobs, after.kind),
+        *(
+            note(criterion="runs", sentence=f"only in {side.path}: {_list_names(names)}")
+            for side, names in ((before, only_before), (after, only_after))
+            if names
+        ),
     ]
     return CompareResult(
         verdict=verdict_of(
@@ -336,6 +325,21 @@ def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: Judged) -> It
             cause="" if why is None else why["cause"],
             remedy="" if why is None else why["remedy"],
             label=REGRESSION,
+        )
+
+
+def _regressions(figures: Sequence[FigureChange], jobs: Sequence[JobChange], kind: str) -> Iterator[Reason]:
+    """Reasons for figures and jobs that got worse, the most tolerances first; a note on single recordings."""
+    weighed = [
+        *((-one.share, one.metric, _figure_reason(one, kind)) for one in figures),
+        *((-one.worst.share, one.metric, _job_reason(one)) for one in jobs if one.change is Change.WORSE),
+    ]
+    yield from (reason for *_, reason in sorted(weighed, key=lambda one: one[:2]))
+    single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
+    more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
+    for one in single[:1]:
+        yield note(
+            criterion="single recordings", sentence=f"{one.metric} of {one.worst.run}: {one.worst.sentence}{more}"
         )
 
 

@@ -19,7 +19,7 @@ from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT
 from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_camera
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest, training_cameras
-from splatctrl_cli.jobs.reconstruct.verdict import GATED, Reconstructed, reconstruct_verdict
+from splatctrl_cli.jobs.reconstruct.verdict import GATED, reconstruct_verdict
 from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, RobotOptions, add_self_model, other_frame, urdf_of
 from splatctrl_cli.jobs.running.device import FitDevice
@@ -90,21 +90,12 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
                 fitted.run(progress)
             with stopwatch.stage("write"):
                 fitted.finish()
-        for table, index in declared.unused():
-            if table == "carried":
-                progress.log(
-                    f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it; check its"
-                    " link and box, or leave it out"
-                )
-        learned = [] if robot is None or robot.self_model is None else robot.self_model.parts
-        made = Reconstructed(
-            metrics=fitted.metrics(),
-            rows=fitted.rows,
-            config=fitted.config,
-            loss=request.source.loss,
-            is_seeded=request.points is not None,
-            learned=[part.words(fitted.rows[0].stamp_ns) for part in learned],
-        )
+        for index in [index for table, index in declared.unused() if table == "carried"]:
+            progress.log(
+                f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it; check its"
+                " link and box, or leave it out"
+            )
+        made = fitted.result()
         verdict = reconstruct_verdict(made, request.require)
         write_run(
             partial,

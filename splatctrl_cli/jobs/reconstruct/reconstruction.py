@@ -18,6 +18,7 @@ from splatctrl_cli.formats.scene.scene_folder import FORMAT
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, SceneWriter
 from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
 from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
+from splatctrl_cli.jobs.reconstruct.verdict import Reconstructed
 from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, guessed_unit
 from splatctrl_cli.jobs.recordings.provenance import first_frame
 from splatctrl_cli.jobs.running.device import CPU, Device, FitDevice, RunOptions
@@ -294,6 +295,18 @@ class Reconstruction:
             "first_frames": list(self.first_frames.values()),
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }
+
+    def result(self) -> Reconstructed:
+        """What the criteria of the verdict take."""
+        learned = () if self.robot is None or self.robot.self_model is None else self.robot.self_model.parts
+        return Reconstructed(
+            metrics=self.metrics(),
+            rows=self.rows,
+            config=self.config,
+            loss=self.source.loss,
+            is_seeded=self.cloud is not None,
+            learned=[part.words(self.rows[0].stamp_ns) for part in learned],
+        )
 
     def _record(self, row: AuditRow) -> None:
         self.rows.append(row)
