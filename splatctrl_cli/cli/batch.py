@@ -24,7 +24,7 @@ from splatctrl_cli.jobs.batch.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, select_shard, text_of
+from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, text_of
 from splatctrl_cli.jobs.batch.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batch.run import DONE, FAILED, describe_run
 from splatctrl_cli.jobs.batch.suite import Table
@@ -187,8 +187,8 @@ def _cell(run: Run | None) -> str:
 def _list_runs(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
     folder, order = request.suite, dict[str, int]()
     if not folder.is_dir():
-        _, nodes, folder = planned(request, command_line)
-        order = {node.name: number for number, node in enumerate(select_shard(nodes, request.shard))}
+        *_, nodes, folder = planned(request, command_line)
+        order = {node.name: number for number, node in enumerate(nodes)}
     refuse_if(not (folder / NAME).is_file(), f"{folder}: has no {NAME}", remedy="run the batch first")
     conditions = [*args.where, *(["state!=done"] if args.failed else [])]
     with Ledger(folder) as ledger:

@@ -167,9 +167,12 @@ def _pose_topic(text: str) -> tuple[str, tuple[str, str]]:
 def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
     name, _, rest = text.partition("=")
     values = several(rest)
-    if not name or len(values) - 4 not in (0, *NUM_COEFFICIENTS) or not min(values[:2]) > 0:
-        counts = ", ".join(map(str, NUM_COEFFICIENTS))
-        raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels, then 0, {counts} coefficients")
+    refuse_if(
+        not name or len(values) - 4 not in (0, *NUM_COEFFICIENTS) or not min(values[:2]) > 0,
+        f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels, then 0, {', '.join(map(str, NUM_COEFFICIENTS))}"
+        " coefficients",
+        error=UsageError,
+    )
     return name, values
 
 

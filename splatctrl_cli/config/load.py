@@ -133,10 +133,13 @@ def _convert(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]
     for key, value in values.items():
         _check_known(key, declared, where, f"{section}.")
         typed[key] = _has_type(value, hints[key])
-        if type(typed[key]) not in [get_origin(option) or option for option in _options(hints[key])]:
-            expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
-            expected += declared[key].expected
-            raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {format_value(value)}")
+        kinds = [get_origin(option) or option for option in _options(hints[key])]
+        expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
+        refuse_if(
+            type(typed[key]) not in kinds,
+            f"{where}: {section}.{key}: expected {expected}{declared[key].expected}, got {format_value(value)}",
+            error=UsageError,
+        )
     return typed
 
 

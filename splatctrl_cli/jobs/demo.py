@@ -95,7 +95,15 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
                 progress.log(f"\n$ splatctrl {shlex.join(shown)}")
                 with _record_label(shown):
                     label = perform(words, folder)
-                reasons.append(_reason(words, expected, label))
+                mode = " --mode closed-loop" if "closed-loop" in words else ""
+                reasons.append(
+                    Reason(
+                        criterion=words[0] + mode,
+                        outcome=Outcome.PASSED if label in expected.split(" or ") else Outcome.FAILED,
+                        sentence=f"expected '{expected}', got '{label}'",
+                        label="not as expected",
+                    )
+                )
                 progress.log(f"demo: {reasons[-1]}")
         with stopwatch.stage("pictures"):
             _draw(data, folder, request.threads)
@@ -110,16 +118,6 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
             verdict=verdict.as_dict(),
         )
     return verdict
-
-
-def _reason(words: Sequence[str], expected: str, label: str) -> Reason:
-    mode = " --mode closed-loop" if "closed-loop" in words else ""
-    return Reason(
-        criterion=words[0] + mode,
-        outcome=Outcome.PASSED if label in expected.split(" or ") else Outcome.FAILED,
-        sentence=f"expected '{expected}', got '{label}'",
-        label="not as expected",
-    )
 
 
 @contextmanager

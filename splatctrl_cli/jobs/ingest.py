@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import advise_resumption, check_same_run
@@ -44,9 +44,12 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
     with stopwatch.stage("survey"):
         source = open_session(request.paths, options)
         topics = source.joint_topics if isinstance(source, LOGGED) else None
-    if set(source.cameras) == {HOLDOUT}:
-        given = ",".join(options.cameras or ())
-        raise UsageError(f"--cameras {given}: leaves no camera to train with", remedy="name another, or leave it out")
+    refuse_if(
+        set(source.cameras) == {HOLDOUT},
+        f"--cameras {','.join(options.cameras or ())}: leaves no camera to train with",
+        remedy="name another, or leave it out",
+        error=UsageError,
+    )
     robots = logged_descriptions(request.paths)
     if len(robots) > 1:
         said = ", ".join(where for _, where, _ in robots)

@@ -108,14 +108,6 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
     )
 
 
-def skipped_case(group: str, why: str) -> Case:
-    return Case(name="skipped", group=group, kind=Kind.SKIPPED, sentence=why, text=why)
-
-
-def notes_of(verdict: Mapping[str, Any]) -> list[str]:
-    return [verdict["sentence"], *verdict["notes"]]
-
-
 def worst_first(suites: Iterable[Suite]) -> list[tuple[Suite, Case]]:
     """Cases not passed, with suites: failed, error, not evaluable, skipped."""
     found = [(suite, case) for suite in suites for case in suite.cases if case.kind is not Kind.PASSED]

@@ -124,13 +124,13 @@ def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], form
     copies = sum(per_cell if size is None else size for size in sizes)
     needed = (per_cell + copies) * layout.num_cells + (1 << 26)  # bytes for what is small
     free = shutil.disk_usage(folder).free
-    if needed > free:
-        size = " x ".join(str(n) for n in layout.shape)
-        raise UsageError(
-            f"grid of {size} cells: needs {needed / 2**30:.1f} GiB of disk ({needed} bytes), "
-            f"{free / 2**30:.1f} GiB ({free} bytes) is free at {folder.parent}",
-            remedy="give a larger --voxel, a smaller --box, fewer --channels or --formats, or another --out",
-        )
+    refuse_if(
+        needed > free,
+        f"grid of {' x '.join(map(str, layout.shape))} cells: needs {needed / 2**30:.1f} GiB of disk ({needed} bytes),"
+        f" {free / 2**30:.1f} GiB ({free} bytes) is free at {folder.parent}",
+        remedy="give a larger --voxel, a smaller --box, fewer --channels or --formats, or another --out",
+        error=UsageError,
+    )
 
 
 def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:

@@ -188,12 +188,14 @@ def check_same(
         "labels": (grid.header.get("labels"), labels),
         **{f"field.{name}": (used.get(name), value) for name, value in settings.items()},
     }
-    if differing := [f"{name} was {then}, is {now}" for name, (then, now) in then_and_now.items() if then != now]:
-        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
-        raise UsageError(
-            f"--update {previous.path}: that field was baked with other settings: {', '.join(differing[:3])}{more}",
-            remedy="give the same settings, or bake without --update",
-        )
+    differing = [f"{name} was {then}, is {now}" for name, (then, now) in then_and_now.items() if then != now]
+    more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+    refuse_if(
+        differing,
+        f"--update {previous.path}: that field was baked with other settings: {', '.join(differing[:3])}{more}",
+        remedy="give the same settings, or bake without --update",
+        error=UsageError,
+    )
 
 
 def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
@@ -208,12 +210,13 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
         snapshots = open_scene(scene).snapshots
         if snapshots and stamp_ns >= snapshots[0].stamp_ns:
             source = read_bake_source(scene, (stamp_ns - snapshots[0].stamp_ns) * 1e-9)
-    if next(iter(source.digests.values())) != wanted:
-        option = "--previous-scene" if where.startswith("--update") else "--scene"
-        raise UsageError(
-            f"{where}: was not baked from the splats of {scene}",
-            remedy=f"give the scene that it was baked from as {option}",
-        )
+    option = "--previous-scene" if where.startswith("--update") else "--scene"
+    refuse_if(
+        next(iter(source.digests.values())) != wanted,
+        f"{where}: was not baked from the splats of {scene}",
+        remedy=f"give the scene that it was baked from as {option}",
+        error=UsageError,
+    )
     return source
 
 

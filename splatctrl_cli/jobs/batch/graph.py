@@ -111,9 +111,13 @@ def _where(job: Job, recording: Recording) -> str:
 def _fill(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
     where = _where(job, recording)
     makers = [other.name for other in jobs if other.command == role and other.name != job.name]
-    if len(makers) > 1:
-        example = " or ".join(f"'{{{name}}}'" for name in makers)
-        raise UsageError(f"{where}: {len(makers)} jobs of {role} come before it", remedy=f"say {example}")
+    example = " or ".join(f"'{{{name}}}'" for name in makers)
+    refuse_if(
+        len(makers) > 1,
+        f"{where}: {len(makers)} jobs of {role} come before it",
+        remedy=f"say {example}",
+        error=UsageError,
+    )
     refuse_if(
         not makers and role == SCENE,
         f"{where}: expected a job of {SCENE} before it",
@@ -148,9 +152,13 @@ def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str
     texts = json.dumps([job.options, job.matrix], ensure_ascii=False, default=str)
     found = dict.fromkeys(_PLACE.findall(texts))
     for place in found:
-        if place not in {RECORDING, NAME, *jobs}:
-            known = ", ".join((RECORDING, NAME, *jobs))
-            raise UsageError(f"{_where(job, recording)}: {{{place}}} is no job", remedy=f"known here: {known}")
+        known = (RECORDING, NAME, *jobs)
+        refuse_if(
+            place not in known,
+            f"{_where(job, recording)}: {{{place}}} is no job",
+            remedy=f"known here: {', '.join(known)}",
+            error=UsageError,
+        )
     return tuple(place for place in found if place in jobs)
 
 

@@ -82,9 +82,11 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     jobs = tuple(_job(key, table, commands) for key, table in _tables(path.name, document, "jobs").items())
     tables = _list(path.name, document, "recordings")
     recordings = _check_names([one for table in tables for one in _recordings(folder, table)])
-    if not jobs or not recordings:
-        lacking = "the first" if jobs else "the second"
-        raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {lacking}")
+    refuse_if(
+        not jobs or not recordings,
+        f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of the {'first' if jobs else 'second'}",
+        error=UsageError,
+    )
     _check_recordings(recordings, [job.name for job in jobs])
     return Suite(
         name=name,
@@ -208,12 +210,12 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> N
     for recording in recordings:
         _check_name("[[recordings]] name", recording.name)
         other = by_name.setdefault(recording.name, recording)
-        if other is not recording:
-            both = f"{other.paths[0]} and {recording.paths[0]}"
-            raise UsageError(
-                f"two recordings are called {recording.name!r}: {both}",
-                remedy="give one a [[recordings]] of its own, with a name",
-            )
+        refuse_if(
+            other is not recording,
+            f"two recordings are called {recording.name!r}: {other.paths[0]} and {recording.paths[0]}",
+            remedy="give one a [[recordings]] of its own, with a name",
+            error=UsageError,
+        )
         for job in recording.only:
             if job not in jobs:
                 raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_suggest(job, jobs))
@@ -269,7 +271,10 @@ def _amount(where: str, table: Table, key: str, units: Mapping[str, int], defaul
         amount = float(match[1]) * units[match[2]] if match else float(value)
     except (KeyError, TypeError, ValueError):
         amount = -1.0
-    if isinstance(value, bool) or not 0 <= amount < 1e15:
-        example = f" or with one of {', '.join(units)}" if units else ""
-        raise UsageError(f"{where} {key}: expected a number, 0 or more{example}, got {format_value(value)}")
+    example = f" or with one of {', '.join(units)}" if units else ""
+    refuse_if(
+        isinstance(value, bool) or not 0 <= amount < 1e15,
+        f"{where} {key}: expected a number, 0 or more{example}, got {format_value(value)}",
+        error=UsageError,
+    )
     return amount

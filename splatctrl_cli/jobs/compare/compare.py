@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, UsageError, refuse_if
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
 from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, note, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
@@ -158,16 +158,18 @@ def _check_alike(before: Judged, after: Judged) -> None:
     refuse_if(
         before.kind != after.kind, f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}"
     )
-    if before.kind == "run" and before.runs.keys() != after.runs.keys():
-        expected, got = (", ".join(judged.runs) for judged in (before, after))
-        raise InputError(f"{after.path}: expected a run of {expected}, as {before.path} is, got one of {got}")
+    refuse_if(
+        before.kind == "run" and before.runs.keys() != after.runs.keys(),
+        f"{after.path}: expected a run of {', '.join(before.runs)}, as {before.path} is, got one of"
+        f" {', '.join(after.runs)}",
+    )
     common = [name for name in before.runs if name in after.runs]
-    if not common:
-        expected, got = (_list_names([*judged.runs]) or "none" for judged in (before, after))
-        raise InputError(
-            f"{after.path}: expected some of the runs of {before.path} ({expected}), got {got}",
-            remedy="compare runs of the same recordings",
-        )
+    expected, got = (_list_names([*judged.runs]) or "none" for judged in (before, after))
+    refuse_if(
+        not common,
+        f"{after.path}: expected some of the runs of {before.path} ({expected}), got {got}",
+        remedy="compare runs of the same recordings",
+    )
     for name in common:
         old, new = before.runs[name], after.runs[name]
         refuse_if(

@@ -92,9 +92,8 @@ def read_judged(path: Path) -> Judged:
     )
     if has_batch:
         return Judged(path=path, kind="batch", runs={run.name: run for run in _nodes_of(open_batch(path))})
-    if not has_run:
-        what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
-        raise InputError(f"{path}: expected the output folder of a command or a batch, got {what}")
+    what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
+    refuse_if(not has_run, f"{path}: expected the output folder of a command or a batch, got {what}")
     run = open_run(path)
     command = run.command
     refuse_if(

@@ -36,7 +36,7 @@ from splatctrl_cli.formats.splat.splats import (
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
+from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, beside, open_run
 from splatctrl_cli.jobs.score.views import render_splats
 from splatctrl_cli.recording.container.mcap_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
@@ -95,7 +95,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     errors above the format's rounding.
     """
     source = _splat_file(request.scene)
-    out = request.out or _beside(request.scene)
+    out = request.out or beside(request.scene, ".ply")
     kind = _format(out, request.layout)
     refuse_if(
         os.path.realpath(out) == os.path.realpath(source),
@@ -152,17 +152,13 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
         )
 
 
-def _beside(scene: Path) -> Path:
-    place = scene if scene.name.strip(".") else Path(os.path.realpath(scene))  # . and .. have no name of their own
-    suffix = "" if scene.is_dir() else scene.suffix
-    return place.with_name(f"{place.name.removesuffix(suffix)}.ply")
-
-
 def _splat_file(scene: Path) -> Path:
     file = scene / "splats.ply" if scene.is_dir() else scene
-    if not file.is_file():
-        said = "has no splats.ply" if scene.exists() else "no such scene"
-        raise InputError(f"{scene}: {said}", remedy="give a folder that reconstruct wrote, or a splat file")
+    refuse_if(
+        not file.is_file(),
+        f"{scene}: {'has no splats.ply' if scene.exists() else 'no such scene'}",
+        remedy="give a folder that reconstruct wrote, or a splat file",
+    )
     return file
 
 
@@ -287,8 +283,7 @@ class ExportRunResult(WrittenFile):
 def export_run(request: ExportRunRequest) -> ExportRunResult:
     """Write the MCAP. Raises InputError for another folder, UsageError for a missing library."""
     parts = sorted(_parts(open_run(request.path), request.roots), key=lambda part: part[:2])
-    name = request.path.absolute()
-    out = request.out or name.with_name(f"{name.name}.mcap")
+    out = request.out or beside(request.path.absolute(), ".mcap")
     with output_path(out, force=request.force, is_folder=False) as written:
         with foxglove_log(written) as log:
             for _, _, write in parts:

@@ -11,7 +11,7 @@ import numpy as np
 from splatctrl_cli.calibration.displacement import displaced_cameras, placed
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
-from splatctrl_cli.errors import InputError, UsageError, refuse_if
+from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names, counted
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.formats.arrays import savez
@@ -151,8 +151,7 @@ def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations
     """Read declarations, none without a file. Raises UsageError without a robot."""
     if path is None:
         return Declarations()
-    if robot is None:
-        raise UsageError(f"--declare {path}: needs the robot", remedy="give --urdf as well")
+    robot = require(robot, f"--declare {path}: needs the robot", remedy="give --urdf as well", error=UsageError)
     return read_declarations(path, robot.frame_names)
 
 

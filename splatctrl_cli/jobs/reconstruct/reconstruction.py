@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config import SceneConfig, fixed
-from splatctrl_cli.errors import InputError, UsageError, refuse_if
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.formats.ply import read_points
 from splatctrl_cli.formats.scene.scene_folder import FORMAT
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, SceneWriter
@@ -147,11 +147,11 @@ class Reconstruction:
         """Raise InputError if no splat was made so far."""
         if self._fitter is None and self._early is not None:
             self._workspace(self._early)  # raises: there is no depth
-        if self._fitter is None:
-            raise InputError(
-                f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
-                remedy="'splatctrl info' says what the input lacks",
-            )
+        refuse_if(
+            self._fitter is None,
+            f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
+            remedy="'splatctrl info' says what the input lacks",
+        )
         refuse_if(
             not any(row.alive for row in self.rows),
             f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",

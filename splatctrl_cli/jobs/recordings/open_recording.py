@@ -187,12 +187,13 @@ class CameraAgreement:
                 f"{self._name}: camera {name}: depths disagree by {1e3 * pair.median:.0f} mm (median of"
                 f" {pair.num_pixels} pixels that two views see; expected at most {1e3 * pair.limit:.0f} mm)"
             )
-            if not self._is_allowed:
-                others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
-                refine = " (--refine-poses)" if self._is_still else " (splatctrl calibrate)"
-                raise InputError(
-                    line, remedy=f"{CAUSES}: correct poses or depth{refine},{others} or give --allow-disagreement"
-                )
+            others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
+            refine = " (--refine-poses)" if self._is_still else " (splatctrl calibrate)"
+            refuse_if(
+                not self._is_allowed,
+                line,
+                remedy=f"{CAUSES}: correct poses or depth{refine},{others} or give --allow-disagreement",
+            )
             console.log(f"warning: {line}; {CAUSES}: correct poses or depth, or expect surfaces twice")
 
     def _check_scale(self, step: TimeStep, console: Progress) -> None:

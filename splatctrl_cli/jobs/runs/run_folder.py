@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -133,6 +134,12 @@ class WrittenFile:
 
     file: Path
     bytes: int
+
+
+def beside(path: Path, ending: str) -> Path:
+    """Output of the same name next to an input, with another ending."""
+    place = path if path.name.strip(".") else Path(os.path.realpath(path))  # . and .. have no name of their own
+    return place.with_name(f"{place.name if place.is_dir() else place.stem}{ending}")
 
 
 def open_run(path: Path) -> RunFolder:

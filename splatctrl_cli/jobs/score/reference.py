@@ -177,13 +177,12 @@ def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None
     if reference.protocol is None or reference.split is None or not scene.names_its_views:
         return
     trained, expected = scene.training_stamps_ns, reference.training_stamps_ns
-    if trained == expected:
-        return
-    lacks, others = len(expected - trained), len(trained - expected)
-    raise UsageError(
-        f"{path}: protocol {reference.protocol.name} trains on {len(expected)} views"
-        f" ({reference.split.words()}), of which {lacks} did not train the scene, and {others} others did",
+    refuse_if(
+        trained != expected,
+        f"{path}: protocol {reference.protocol.name} trains on {len(expected)} views ({reference.split.words()}), of"
+        f" which {len(expected - trained)} did not train the scene, and {len(trained - expected)} others did",
         remedy=f"reconstruct with --protocol {reference.protocol.name}",
+        error=UsageError,
     )
 
 
