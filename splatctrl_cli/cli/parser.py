@@ -138,15 +138,18 @@ def option(
     default: Any = None,
     *,
     fields: Mapping[str, Callable[[Any], Any] | str] | None = None,
-    sets: str = "",
+    sets: tuple[type[Section], str] | None = None,
     **more: Any,
 ) -> Adds:
     """Declare ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
 
     kind: converts the text, or a tuple of choices. default: the help shows it if given. fields: of a request, by name
     what makes them of the option's value, a function or MODULE:NAME of a heavy one (default: the field of its name).
-    sets: a key of the configuration. more: as in argparse.
+    sets: a key of the configuration, which says the kind. more: as in argparse.
     """
+    if sets is not None:
+        declared, of_default = sets[0].declared[sets[1]], type(getattr(*sets))
+        kind = declared.words if isinstance(declared, OneOf) else _parse_within(of_default, declared)
     flags, _, metavar = name.partition(" ")
     is_place, repeats = not flags.startswith("-"), metavar.endswith(" ...")
     if isinstance(kind, tuple):
@@ -169,7 +172,8 @@ def option(
     def add(container: Any) -> None:
         action = container.add_argument(*names, help=meaning.replace("%", "%%"), **more)
         same = tuple if repeats or more.get("nargs") == "+" else lambda value: value
-        action.fields, action.sets = fields or {action.dest: same}, sets
+        action.fields = fields or {action.dest: same}
+        action.sets = "" if sets is None else f"{sets[0].section}.{sets[1]}"
 
     return add
 
@@ -228,19 +232,6 @@ def real(low: float, high: float, unit: str = "") -> Callable[[str], float]:
 def whole(low: int, high: int, unit: str = "") -> Callable[[str], int]:
     """Parser of a whole number in [low, high]."""
     return _parse_within(int, Within(low, high, unit, ""))
-
-
-def setting(section: type[Section], key: str) -> Callable[[str], float]:
-    """Parser of a configuration key's number: its type and range."""
-    declared = section.declared[key]
-    assert isinstance(declared, Within)
-    return _parse_within(int if type(getattr(section, key)) is int else float, declared)
-
-
-def words(section: type[Section], key: str) -> tuple[str, ...]:
-    declared = section.declared[key]
-    assert isinstance(declared, OneOf)
-    return declared.words
 
 
 def several(text: str) -> tuple[float, ...]:

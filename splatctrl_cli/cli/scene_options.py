@@ -28,7 +28,7 @@ from splatctrl_cli.cli.common import (
     pose,
     settings,
 )
-from splatctrl_cli.cli.parser import MAX_SECONDS, either, group, option, real, setting, whole, words
+from splatctrl_cli.cli.parser import MAX_SECONDS, either, group, option, real, whole
 from splatctrl_cli.config import FieldConfig, SceneConfig
 
 SPLAT_FORMATS = (".ply", ".splat", ".spz", ".glb", ".usda", ".usdc")  # as the registries have them, which are not
@@ -58,8 +58,7 @@ RECONSTRUCT = (
     option(
         "--max-splats N",
         "budget of splats (default: 5000)",
-        setting(SceneConfig, "max_splats"),
-        sets="scene.max_splats",
+        sets=(SceneConfig, "max_splats"),
     ),
     *CONFIG,
     GATES,
@@ -123,7 +122,7 @@ SDF_BAKE = (
     option("--at SECONDS", "the scene as known that long after its start", real(-MAX_SECONDS, MAX_SECONDS, "s")),
     option(f"--box {BOX}", "what the grid covers [m]; write --box=-1,... for a negative start", fields=AS_BOX),
     option("--urdf URDF", "cover the reach of this robot around its base, without --box", Path),
-    option("--voxel M", "cell size (field.voxel)", setting(FieldConfig, "voxel"), sets="field.voxel"),
+    option("--voxel M", "cell size (field.voxel)", sets=(FieldConfig, "voxel")),
     option(
         "--formats NAME,...",
         f"of {', '.join(GRID_FORMATS)}",
@@ -155,33 +154,28 @@ SDF_BAKE = (
         option(
             "--distance",
             "what sdf is: min(se, hard), min(gpdf, hard), the exact distance, either kernel field (field.distance)",
-            words(FieldConfig, "distance"),
-            sets="field.distance",
+            sets=(FieldConfig, "distance"),
         ),
         option(
             "--weights",
             "of the kernel field: row sums, voxels, the full GP (field.weights)",
-            words(FieldConfig, "weights"),
-            sets="field.weights",
+            sets=(FieldConfig, "weights"),
         ),
         option(
             "--length-scale M",
             "l of the kernel (field.length_scale)",
-            setting(FieldConfig, "length_scale"),
-            sets="field.length_scale",
+            sets=(FieldConfig, "length_scale"),
         ),
         option(
             "--unknown",
             "what never-seen space counts as (field.unknown)",
-            words(FieldConfig, "unknown"),
-            sets="field.unknown",
+            sets=(FieldConfig, "unknown"),
         ),
         option(
             "--probability",
             "bake the channel probability, of collision, in this form (field.probability)",
-            words(FieldConfig, "probability"),
             fields={"with_probability": bool},
-            sets="field.probability",
+            sets=(FieldConfig, "probability"),
         ),
     ),
     group(

@@ -6,7 +6,6 @@ import pytest
 import trimesh
 
 from splatctrl_cli.cli import run_options, scene_options
-from splatctrl_cli.cli.parser import words
 from splatctrl_cli.cli.scene_options import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
@@ -150,10 +149,10 @@ def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) 
 
 
 def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
-    assert tuple(distance.KERNEL_OF) == words(FieldConfig, "distance")
-    assert tuple(weights.METHODS) == words(FieldConfig, "weights")
-    assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
-    assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
+    assert tuple(distance.KERNEL_OF) == FieldConfig.declared["distance"].words
+    assert tuple(weights.METHODS) == FieldConfig.declared["weights"].words
+    assert tuple(probability.PROBABILITIES) == FieldConfig.declared["probability"].words
+    assert tuple(qp.SOLVERS) == ControlConfig.declared["solver"].words
     assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
     assert tuple(FORMATS) == scene_options.SPLAT_FORMATS and tuple(grid_format.CHANNELS) == scene_options.CHANNELS
     assert scene_options.CHANNELS[:4] == baker.DEFAULT_CHANNELS

@@ -126,8 +126,8 @@ def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], form
     free = shutil.disk_usage(folder).free
     refuse_if(
         needed > free,
-        f"grid of {' x '.join(map(str, layout.shape))} cells: needs {needed / 2**30:.1f} GiB of disk ({needed} bytes),"
-        f" {free / 2**30:.1f} GiB ({free} bytes) is free at {folder.parent}",
+        f"grid of {' x '.join(map(str, layout.shape))} cells: needs {needed / 2**30:.1f} GiB of disk ({needed} bytes)"
+        f", {free / 2**30:.1f} GiB ({free} bytes) is free at {folder.parent}",
         remedy="give a larger --voxel, a smaller --box, fewer --channels or --formats, or another --out",
         error=UsageError,
     )
