@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -49,10 +50,9 @@ from splatctrl_cli.jobs.bake.request import (
     read_bake_source,
     read_previous,
 )
-from splatctrl_cli.jobs.running.device import Device, explain_fault
+from splatctrl_cli.jobs.running.device import Device, explain_faults
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, deciding_versions
-from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import (
     Reliability,
@@ -174,13 +174,8 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
         for path in partial.iterdir():  # all but the channels of an interrupted bake: it is written again
             if path.name != FOLDER:
                 remove(path)
-        with stopwatch.stage("bake"):
-            try:
-                grid, changes = _bake_grid(job, partial, progress)
-            except DeviceError as error:
-                raise explain_fault(error, job.device, checkpoint) from error
-            finally:
-                job.baker.close()
+        with stopwatch.stage("bake"), closing(job.baker), explain_faults(job.device, checkpoint):
+            grid, changes = _bake_grid(job, partial, progress)
         with stopwatch.stage("report"):
             statistics = grid_statistics(grid)
             document = field_document(grid, statistics, changes)

@@ -25,9 +25,9 @@ from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.ply import point_blocks
 from splatctrl_cli.formats.scene.scene_folder import run_value
 from splatctrl_cli.jobs.bake.request import BakeSource, read_bake_source, source_of_grid
-from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, choose_device, explain_fault
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, choose_device, explain_faults
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
-from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory
+from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.records import Bool, Box, DistanceField, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import VoxelState
 
@@ -244,10 +244,8 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
             kind, answer, box, device = _open_source(request, progress)
         with stopwatch.stage("answer"):
             for points in _blocks(request.points, progress):
-                try:
+                with explain_faults(device):
                     answers = answer(points)
-                except DeviceError as error:
-                    raise explain_fault(error, device) from error
                 figures.append(_figures_of(answers))
                 if out is not None:
                     out.write(rows_of(points, answers))

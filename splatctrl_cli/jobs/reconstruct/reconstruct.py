@@ -22,7 +22,7 @@ from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, Recons
 from splatctrl_cli.jobs.reconstruct.verdict import GATED, reconstruct_verdict
 from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, RobotOptions, add_self_model, other_frame, urdf_of
-from splatctrl_cli.jobs.running.device import FitDevice
+from splatctrl_cli.jobs.running.device import FitDevice, explain_faults
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, checkpoint_to_go_on_from, identity
 from splatctrl_cli.recording.calibrated import LOGGED
@@ -66,7 +66,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         output_path(
             request.out, force=request.force, is_folder=True, checkpoint=CHECKPOINT, resume=request.resume
         ) as partial,
-        device.told_how_to_go_on(checkpoint_file),
+        explain_faults(device, checkpoint_file),
     ):
         inputs = request.source.digests()
         run = _identity(request, inputs)

@@ -297,7 +297,7 @@ class Reconstruction:
         }
 
     def result(self) -> Reconstructed:
-        """What the criteria of the verdict take."""
+        """Input of the criteria of the verdict."""
         learned = () if self.robot is None or self.robot.self_model is None else self.robot.self_model.parts
         return Reconstructed(
             metrics=self.metrics(),
