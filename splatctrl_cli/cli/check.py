@@ -90,7 +90,6 @@ def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
 
 
 def _fact(value: object) -> str:
-    """Text of a float: six decimals, or more."""
     if not isinstance(value, float):
         return "-" if value is None else str(value)
     return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"

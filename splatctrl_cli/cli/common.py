@@ -28,9 +28,9 @@ SEVERAL_LOGS = "several logs of one session are read as one"
 
 
 def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
-    """Build a request from `given` fields, else options by their `fields`, else defaults.
+    """Build a request, its configuration and nested options: `given` fields, else options, else defaults.
 
-    So are its configuration, and fields that are made of options in turn. Raises UsageError for a wrong value.
+    Raises UsageError for a wrong value.
     """
     all_fields = fields(kind)  # type: ignore[arg-type]
     left: dict[str, Any] = {field.name: field.default_factory for field in all_fields if field.name not in given}
@@ -56,7 +56,6 @@ def config_of(args: argparse.Namespace) -> Config:
 
 
 def _pairs(read: Callable[[str], tuple[str, Any]]) -> Callable[[Iterable[str]], dict[str, Any]]:
-    """Reader of a repeatable NAME=... as a mapping."""
     return lambda texts: dict(map(read, texts))
 
 

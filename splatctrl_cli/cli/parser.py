@@ -143,9 +143,9 @@ def option(
 ) -> Adds:
     """Declare ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
 
-    kind: converts the text, or a tuple of choices. default: the help shows it if given. fields: of a request, by name
-    what makes them of the option's value, a function or MODULE:NAME of a heavy one (default: the field of its name).
-    sets: a key of the configuration, which says the kind. more: as in argparse.
+    kind: converts the text, or a tuple of choices. default: shown in the help. fields: of a request, each with a
+    function of the option's value, or its MODULE:NAME if heavy (default: the field of its name). sets: a key of the
+    configuration, which says the kind. more: as in argparse.
     """
     if sets is not None:
         declared, of_default = sets[0].declared[sets[1]], type(getattr(*sets))

@@ -144,7 +144,6 @@ def _cells(columns: Sequence[str], metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _cell(name: str, value: float | None, *, is_change: bool = False) -> str:
-    """A figure in its column's unit; changes have a sign."""
     if value is None:
         return "-"
     factor, form = next((of for start, of in FORMS.items() if name.startswith(start)), (1.0, ".4f"))

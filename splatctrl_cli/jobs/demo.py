@@ -122,7 +122,6 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
 
 @contextmanager
 def _record_label(words: Sequence[str]) -> Iterator[None]:
-    """Set the arguments that run.json records."""
     arguments = sys.argv
     sys.argv = [arguments[0], *words]
     try:

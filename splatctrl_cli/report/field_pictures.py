@@ -197,7 +197,6 @@ def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> No
 def _panels(
     path: Path, grid: DistanceGrid, point: Sequence[float]
 ) -> Iterator[tuple["mpl.figure.Figure", list[tuple[Any, Cut]]]]:
-    """Axes for slices across z, y and x, at one scale."""
     cuts = _cuts(grid, point, axes=(2, 1, 0))
     sides = np.array([[float(np.ptp(c)) + cut.voxel for c in cut.coordinates] for cut in cuts])
     height = float(np.clip((WIDTH - 3.2) * sides[:, 1].max() / sides[:, 0].sum() + 1.5, 3.2, 9.0))
@@ -236,7 +235,6 @@ def _label(axes: Any, cut: Cut) -> None:
 
 
 def _knows_seen(grid: DistanceGrid) -> bool:
-    """True with an occupancy grid."""
     return "observed" in grid.channels and "no occupancy" not in str(grid.header.get("observed"))
 
 

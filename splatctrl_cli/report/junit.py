@@ -295,7 +295,6 @@ def summary(suites: Sequence[Suite], room: int) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text in one line, escaped for Markdown."""
     escaped = "".join(f"&#{ord(mark)};" if mark in "&<>|`*_[]\\#~@" else mark for mark in text)
     return " ".join(escaped.split()).encode("utf-8", "backslashreplace").decode()
 
@@ -309,5 +308,4 @@ def _repository_path(path: str, environment: Mapping[str, str]) -> str:
 
 
 def _escape(text: str) -> str:
-    """Text escaped as in actions/toolkit."""
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")

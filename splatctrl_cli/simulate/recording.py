@@ -226,7 +226,6 @@ class Recording:
 
 
 def _add_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> RobotModel:
-    """The robot with balls along the capsules on its links."""
     balls = [(link, c.radius, x) for link, c in parts for x in np.linspace(c.start, c.end, NUM_BALLS)]
     links, radii, centers = zip(*balls, strict=True)
     own = robot.sphere_set

@@ -104,7 +104,6 @@ def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
 
 
 def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:
-    """Frames of training cameras, or all, up to a stamp."""
     for record in open_source(log).records():
         if record.stamp_ns > until_ns:
             return

@@ -263,7 +263,6 @@ def code_version() -> str:
 
 
 def _deciding_words(words: Sequence[str], named: Mapping[str, str]) -> list[str]:
-    """Words that change results, with paths replaced by digests."""
     left_out = ("--force", "--resume", "--quiet", "-q", "--json")
     pairs = zip(words, ("", *words), strict=False)
     kept = [w for w, before in pairs if w not in left_out and before != THREADS and not w.startswith(THREADS)]

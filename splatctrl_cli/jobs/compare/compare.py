@@ -378,7 +378,6 @@ def _job_reason(one: JobChange) -> Reason:
 
 
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
-    """Differing settings, versions and inputs, of the first such run."""
     found: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
         for name, value in old.settings.items():

@@ -66,11 +66,10 @@ class Answers:
 def scene_answers(
     source: BakeSource, obstacles: ObstacleSpheres, config: Config, threads: int, device: Memory | None = None
 ) -> Callable[..., Answers]:
-    """Make the answers of a scene's splats and balls around unrepresented voxels, as a field by `config`.
+    """Answers of a scene's splats, and balls around unrepresented voxels, as a field by `config`.
 
-    They are a function of points (Q, 3) [m], world, and of a grid's answers there, if any: it adds to these, with the
-    probability at the grid's distance. device: the card for the fields. Raises UsageError unless `field.unknown` is
-    free: only a grid knows unobserved space.
+    A function of points (Q, 3) [m], world, and perhaps a grid's answers, which it completes, with the probability at
+    the grid's distance. Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
     """
     refuse_if(
         config.field.unknown != "free",
@@ -128,7 +127,7 @@ def scene_answers(
 
 
 def grid_answers(grid: DistanceGrid, where: str) -> tuple[Box, Callable[[Float64], Answers]]:
-    """The box of a baked grid's cell centres, and its answers at points (Q, 3) [m], world: none outside.
+    """Box of a baked grid's cell centres, and its answers at points (Q, 3) [m], world, none outside.
 
     Distances are interpolated, labels and observations of the nearest cell. Raises InputError as `GridField` does,
     and for unknown labels or states.

@@ -213,7 +213,6 @@ def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Reason | None:
 
 
 def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
-    """Splats unlike their occupancy grid: rescaled, moved, or removed."""
     known = scene.known() if scene.parts.digests is not None else None
     if known is None:
         return

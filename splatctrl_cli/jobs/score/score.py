@@ -148,7 +148,6 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
 
 
 def _open_scorer(request: ScoreRequest, folder: Path | None, progress: Progress) -> Scorer:
-    """Open scene and reference, and choose the cameras. Raises SplatCtrlError where they do not fit."""
     scene = open_splats(request.scene)
     if scene.is_anisotropic:
         scene.gaussians()  # both raise if there is no splat to compare

@@ -168,7 +168,6 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
 
 
 def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
-    """Read a command's options with current paths."""
     options = command_line.options_of(run.arguments)
     found: list[Path] = []
 

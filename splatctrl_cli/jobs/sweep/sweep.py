@@ -170,7 +170,6 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
 
 
 def _check_same(out: Path, asked: Mapping[str, Any]) -> None:
-    """Raise unless `out` is empty, or a sweep of the same settings."""
     file = out / FILE
     if not file.is_file():
         refuse_if(
