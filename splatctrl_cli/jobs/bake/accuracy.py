@@ -112,9 +112,7 @@ def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator
 
 
 def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> dict[str, Any]:
-    """Compare with the newest held-out depth up to the scene's stamp. Pixels outside the scene's box or on the robot
-    do not count: the field has neither.
-    """
+    """Compare with the newest held-out depth up to the scene's stamp, without the robot and outside the box."""
     recording = open_source(log)
     cameras = _held_out_cameras(recording, request, source.cameras)
     newest: dict[str, tuple[RgbdFrame, JointState | None]] = {}

@@ -81,7 +81,7 @@ class Scheduler:
         latest: Mapping[str, Run],
         clock: "Clock",
     ) -> bool:
-        """Settle kept nodes, and submit due ones to free slots. True if another batch runs one of them."""
+        """Settle kept nodes and submit due ones; True if another batch runs one."""
         is_busy = False
         for node in list(waiting.values()):
             if len(futures) >= self.slots:
@@ -116,7 +116,7 @@ class Scheduler:
         return is_busy
 
     def _reuse_run(self, node: Node, before: Run | None) -> Run | None:
-        """The run that stands for a node: skipped, kept, or ended unrecorded; None if it is to run."""
+        """The run that stands for a node, kept or skipped; None if it is to run."""
         key, folder = self.keys[node.name], self.ledger.folder
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:

@@ -289,9 +289,7 @@ def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, fl
 
 
 def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
-    """Changes of figures with enough recordings: the whole interval is on one side, and the mean exceeds the mean
-    tolerance.
-    """
+    """Changes of figures over enough recordings, worse or better by interval and mean."""
     by_job: dict[tuple[str, str], list[FigureChange]] = {}
     for one in found:
         if one.better is not Better.NEITHER and one.after is not None:
@@ -331,7 +329,7 @@ def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: Judged) -> It
 
 
 def _regressions(figures: Sequence[FigureChange], jobs: Sequence[JobChange], kind: str) -> Iterator[Reason]:
-    """Reasons for figures and jobs that got worse, the most tolerances first; a note on single recordings."""
+    """Reasons for what got worse, the most first; a note on single recordings."""
     weighed = [
         *((-one.share, one.metric, _figure_reason(one, kind)) for one in figures),
         *((-one.worst.share, one.metric, _job_reason(one)) for one in jobs if one.change is Change.WORSE),

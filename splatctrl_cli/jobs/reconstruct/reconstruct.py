@@ -127,9 +127,7 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
 def _learn_self(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
 ) -> tuple[RobotModel | None, dict[str, dict[str, Any]]]:
-    """Add the self-model to the robot, and find `displaced_cameras`. It is the given one, the resumed run's, or what
-    the recording shows.
-    """
+    """Add the self-model, given, resumed or learned, to the robot; find `displaced_cameras`."""
     if robot is None:
         return None, {}
     seen = arm_seen(robot, request.source, progress)

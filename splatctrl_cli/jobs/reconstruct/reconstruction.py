@@ -230,9 +230,7 @@ class Reconstruction:
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Enlarge a default budget that the first step exceeded next to a robot: without a splat, a whole voxel is
-        occupied.
-        """
+        """Enlarge a default budget that the first step exceeded next to a robot."""
         least = SceneConfig().max_splats
         if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
             return False

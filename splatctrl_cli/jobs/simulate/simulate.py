@@ -251,9 +251,7 @@ def adapt_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Mot
 
 
 def _copy_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
-    """Copy a URDF's meshes, visual ones as STL, and return its text. A link with an unreadable visual mesh shows its
-    collision geometry.
-    """
+    """Copy a URDF's meshes, visual ones as STL; return its text, without unreadable visual ones."""
     root, copies = ElementTree.fromstring(urdf.text), dict[tuple[str, str], str]()
     parts = [(link, part) for link in root.iter("link") for tag in ("collision", "visual") for part in link.iter(tag)]
     for link, part in parts:
