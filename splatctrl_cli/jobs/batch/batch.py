@@ -95,10 +95,11 @@ def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, li
 
     Raises UsageError for a shard without a recording.
     """
-    suite, (index, count) = read_suite(request.suite, COMMANDS), request.shard
+    suite = read_suite(request.suite, COMMANDS)
     out = (request.out or suite.out).absolute()
     every = nodes_of(suite, out, command_line)
     nodes = select_shard(every, request.shard)
+    index, count = request.shard
     refuse_if(
         not nodes,
         f"--shard {index}/{count}: has none of the {len(suite.recordings)} recordings",

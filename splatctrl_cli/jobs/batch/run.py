@@ -46,9 +46,11 @@ class Scheduler:
     def run(self, nodes: Sequence[Node]) -> dict[str, Run]:
         """The run of each node by name, kept or new."""
         self.keys = keys_of(nodes, self.ledger, self.entry)
-        waiting, futures, tries = {node.name: node for node in nodes}, dict[Future[End], Node](), Counter[str]()
-        latest, clock = self.ledger.latest(), Clock(nodes, self.ledger.mean_seconds(), self.slots)
-        last = time.monotonic()
+        latest = self.ledger.latest()
+        waiting = {node.name: node for node in nodes}
+        futures: dict[Future[End], Node] = {}
+        tries: Counter[str] = Counter()
+        clock, last = Clock(nodes, self.ledger.mean_seconds(), self.slots), time.monotonic()
         while waiting or futures:
             is_busy = self._submit(waiting, futures, latest, clock)
             ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
@@ -69,9 +71,8 @@ class Scheduler:
                     self.progress.log(f"batch: {node.name}: {end.cause or 'disk full'}, once more")
                     waiting[node.name] = node
                 else:
-                    self._settle(
-                        node, self._record(run_of(node, self.keys[node.name], end, self.ledger.folder)), clock
-                    )
+                    run = run_of(node, self.keys[node.name], end, self.ledger.folder)
+                    self._settle(node, self._record(run), clock)
         return {node.name: self.runs[node.name] for node in nodes}
 
     def _submit(
