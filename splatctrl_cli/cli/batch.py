@@ -5,16 +5,17 @@ import importlib
 import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean
+from splatctrl_cli.errors import UsageError, did_you_mean, refuse_if
 from splatctrl_cli.jobs.batch.batch import (
     BatchRequest,
     BatchResult,
@@ -23,7 +24,7 @@ from splatctrl_cli.jobs.batch.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, select_shard, text_of
+from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, text_of
 from splatctrl_cli.jobs.batch.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batch.run import DONE, FAILED, describe_run
 from splatctrl_cli.jobs.batch.suite import Table
@@ -66,18 +67,17 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return code
 
 
+@dataclass(frozen=True, kw_only=True)
 class OfThisProgram:
     """Command line of nodes that run this program; `threads` for each."""
 
-    entry = "splatctrl_cli.cli.batch:run_words"
-
-    def __init__(self, threads: int) -> None:
-        self._threads = threads
+    entry: ClassVar[str] = "splatctrl_cli.cli.batch:run_words"
+    threads: int
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
         """Words for options by long name, and files among them. Raises UsageError for unknown ones."""
         parser, places, words = _parser_of(command), list[str](), [command]
-        given = {"threads": self._threads, **options}
+        given = {"threads": self.threads, **options}
         known = [name for name in given if name not in OWN or f"--{name}" in parser._option_string_actions]
         for name, action in {name: _action(parser, command, name) for name in known}.items():
             made = _words_of(name, action, given[name], folder)
@@ -106,8 +106,7 @@ class OfThisProgram:
 
 
 def run_words(words: list[str]) -> int:
-    code: int = importlib.import_module("splatctrl_cli.cli.main").main(words)
-    return code
+    return int(importlib.import_module("splatctrl_cli.cli.main").main(words))
 
 
 def preload() -> None:
@@ -141,8 +140,7 @@ def _action(parser: Parser, command: str, name: str) -> argparse.Action:
 def _words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> list[str]:
     name = max(action.option_strings, key=len, default="")
     if action.nargs == 0:
-        if not isinstance(value, bool):
-            raise UsageError(f"{where}: expected true or false, got {value!r}")
+        refuse_if(not isinstance(value, bool), f"{where}: expected true or false, got {value!r}", error=UsageError)
         return [name] * value
     if isinstance(value, Mapping):
         texts = [f"{key}={text_of(each)}" for key, each in _flat(value)]
@@ -189,10 +187,9 @@ def _cell(run: Run | None) -> str:
 def _list_runs(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
     folder, order = request.suite, dict[str, int]()
     if not folder.is_dir():
-        _, nodes, folder = planned(request, command_line)
-        order = {node.name: number for number, node in enumerate(select_shard(nodes, request.shard))}
-    if not (folder / NAME).is_file():
-        raise InputError(f"{folder}: has no {NAME}", remedy="run the batch first")
+        *_, nodes, folder = planned(request, command_line)
+        order = {node.name: number for number, node in enumerate(nodes)}
+    refuse_if(not (folder / NAME).is_file(), f"{folder}: has no {NAME}", remedy="run the batch first")
     conditions = [*args.where, *(["state!=done"] if args.failed else [])]
     with Ledger(folder) as ledger:
         runs = list(ledger.runs(conditions))

@@ -4,24 +4,13 @@ import argparse
 import math
 from collections.abc import Iterator
 
-from splatctrl_cli.calibration.board import board_of
-from splatctrl_cli.cli.common import Console, locked_joints, request_of, source_options, table
+from splatctrl_cli.cli.common import Console, request_of, table
 from splatctrl_cli.config import fixed
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    result = calibrate(
-        request_of(
-            CalibrateRequest,
-            args,
-            paths=tuple(args.source),
-            options=source_options(args),
-            locked=locked_joints(args),
-            board=None if args.board is None else board_of(args.board),
-        ),
-        console,
-    )
+    result = calibrate(request_of(CalibrateRequest, args), console)
     return console.result({"out": str(result.out), **result.metrics}, _lines(result))
 
 

@@ -5,26 +5,19 @@ import textwrap
 from collections.abc import Iterator, Mapping
 
 from splatctrl_cli.checks.finding import CheckReport
-from splatctrl_cli.cli.common import Console, format_cell, locked_joints, remarks, request_of, source_options, table
+from splatctrl_cli.cli.common import Console, format_cell, remarks, request_of, table
 from splatctrl_cli.errors import DAMAGED
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.ingest import IngestRequest, ingest
 from splatctrl_cli.recording.source import describe
+from splatctrl_cli.recording.source_options import SourceOptions
 
 WIDTH = 118  # columns of text
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    report, verdict = check(
-        request_of(
-            CheckRequest,
-            args,
-            paths=tuple(args.source),
-            options=source_options(args),
-            locked=locked_joints(args),
-        )
-    )
+    report, verdict = check(request_of(CheckRequest, args))
     code = 0 if args.fail_on == "never" else verdict.exit_code
     return console.concluded(verdict, report.as_dict(), _lines(report), code=code, has_findings=True)
 
@@ -67,7 +60,7 @@ def _needs(report: CheckReport) -> Iterator[str]:
 
 def run_info(args: argparse.Namespace, console: Console) -> int:
     """Print facts and tables, and what a reconstruction lacks."""
-    summary = describe(args.path, source_options(args))
+    summary = describe(args.path, request_of(SourceOptions, args))
     lines = _describe(summary, is_long=args.verbose > 0)
     return console.result(summary.as_dict(), lines, code=DAMAGED if summary.damaged else 0)
 
@@ -97,16 +90,13 @@ def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
 
 
 def _fact(value: object) -> str:
-    """Text of a float: six decimals, or more."""
     if not isinstance(value, float):
         return "-" if value is None else str(value)
     return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"
 
 
 def run_ingest(args: argparse.Namespace, console: Console) -> int:
-    capture, metrics = ingest(
-        request_of(IngestRequest, args, paths=tuple(args.source), options=source_options(args)), console
-    )
+    capture, metrics = ingest(request_of(IngestRequest, args), console)
     lost = metrics["loss"]
     lines = [
         *table(["camera", "frames"], sorted(metrics["frames"].items())),

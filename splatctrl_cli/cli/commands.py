@@ -3,8 +3,7 @@
 A function's imports wait until it runs, so that help answers at once.
 """
 
-import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,7 +75,7 @@ def _add_commands(parser: Parser, commands: dict[str, Command], *, dest: str, on
             _add_commands(one, command.actions, dest="action")
         if command.options:
             add_all(one, (*command.options, *COMMON, *(JUNIT if command.judges else ())))
-            one.set_defaults(run=command.run)
+            one.set_defaults(run=command.run, parser=one)
 
 
 def judges(words: Sequence[str]) -> bool:
@@ -84,12 +83,6 @@ def judges(words: Sequence[str]) -> bool:
     if command is not None and command.actions is not None:
         command = command.actions.get(words[1]) if len(words) > 1 else None
     return command is not None and command.judges
-
-
-def function_of(run: str) -> Callable[..., int]:
-    module, _, name = run.partition(":")
-    function: Callable[..., int] = getattr(importlib.import_module(f"splatctrl_cli.cli.{module}"), name)
-    return function
 
 
 _CONFIG = (

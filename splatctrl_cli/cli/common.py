@@ -5,19 +5,20 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, TypeVar
 
 from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several, whole
 from splatctrl_cli.cli.reports import report_command, wrap_result
-from splatctrl_cli.config import PRESETS, fixed
+from splatctrl_cli.config import PRESETS, Config, fixed, load_config
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Verdict, gate
 from splatctrl_cli.files.output import plain
-from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
+from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics
 
 T = TypeVar("T")
 
@@ -27,50 +28,54 @@ SEVERAL_LOGS = "several logs of one session are read as one"
 
 
 def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
-    """Build a request from `given` fields, else equally named options, else defaults."""
-    names = {field.name for field in fields(kind)} - given.keys()  # type: ignore[arg-type]
-    parsed = {name: value for name, value in vars(args).items() if name in names and value is not None}
-    return kind(**given, **{name: tuple(v) if isinstance(v, list) else v for name, v in parsed.items()})
+    """Build a request, its configuration and nested options: `given` fields, else options, else defaults.
+
+    Raises UsageError for a wrong value.
+    """
+    all_fields = fields(kind)  # type: ignore[arg-type]
+    left: dict[str, Any] = {field.name: field.default_factory for field in all_fields if field.name not in given}
+    found = dict(given)
+    for action in args.parser._actions:
+        value = getattr(args, action.dest, None)
+        for name, read in action.fields.items():
+            if name in left and value is not None:
+                found[name] = (resolve_name(f"splatctrl_cli.{read}") if isinstance(read, str) else read)(value)
+    for name, made_by in left.items():
+        if made_by is Config:
+            found[name] = config_of(args)
+        elif isinstance(made_by, type) and is_dataclass(made_by):
+            found[name] = request_of(made_by, args)
+    return kind(**found)
 
 
-def source_options(args: argparse.Namespace) -> SourceOptions:
-    """Read the options that `SOURCE` declares. Raises UsageError for a value of the wrong form."""
-    return request_of(
-        SourceOptions,
-        args,
-        cameras=_names(args.cameras),
-        camera_topics=tuple(_topics(text) for text in args.camera),
-        camera_poses=dict(_pose(text) for text in args.camera_pose if not text.partition("=")[2].startswith("/")),
-        camera_pose_topics=dict(
-            _pose_topic(text) for text in args.camera_pose if text.partition("=")[2].startswith("/")
-        ),
-        human_topics=dict(_human_topic(text) for text in args.human_topic),
-        intrinsics=dict(_intrinsics(text) for text in args.intrinsics),
-        pairing_tolerance_s=args.pairing_tolerance,
-        holdout=_names(args.holdout),
-        perturb=dict(_number_of("--perturb", text) for text in args.perturb),
-    )
+def config_of(args: argparse.Namespace) -> Config:
+    """Read the configuration: --config and --set, then options that set one key."""
+    given = {action.sets: getattr(args, action.dest) for action in args.parser._actions if action.sets}
+    ours = [f"{key}={value}" for key, value in given.items() if value is not None]
+    return load_config(args.config, [*args.set, *ours])
 
 
-def locked_joints(args: argparse.Namespace) -> dict[str, float]:
-    """Values of ``--lock JOINT=VALUE``. Raises UsageError for other values."""
-    return dict(_number_of("--lock", text, "JOINT") for text in args.lock)
+def _pairs(read: Callable[[str], tuple[str, Any]]) -> Callable[[Iterable[str]], dict[str, Any]]:
+    return lambda texts: dict(map(read, texts))
 
 
-def _number_of(option: str, assignment: str, what: str = "NAME") -> tuple[str, float]:
+def _number_of(option: str, what: str, assignment: str) -> tuple[str, float]:
     name, _, text = assignment.partition("=")
     value = several(text)
-    if len(value) != 1:
-        raise UsageError(f"{option} {assignment}: expected {what}=VALUE, got {text!r} for the value")
+    refuse_if(
+        len(value) != 1, f"{option} {assignment}: expected {what}=VALUE, got {text!r} for the value", error=UsageError
+    )
     return name, value[0]
 
 
-def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: str) -> tuple[str, ...]:
-    """Names in a comma list. Raises UsageError for an unknown name or none."""
-    names = tuple(dict.fromkeys(_names(text) or ()))
-    unknown = [name for name in names if name not in choices]
-    if unknown or not names:
-        raise UsageError(f"{option} {text}: expected some of: {', '.join(choices)}")
+def names_of(option: str, choices: Sequence[str], text: str) -> tuple[str, ...]:
+    """Names in a comma list, each once. Raises UsageError for an unknown name or none."""
+    names = tuple(dict.fromkeys(_names(text)))
+    refuse_if(
+        not names or not {*names} <= {*choices},
+        f"{option} {text}: expected some of: {', '.join(choices)}",
+        error=UsageError,
+    )
     return names
 
 
@@ -82,45 +87,56 @@ def pose(text: str) -> tuple[float, ...]:
 
 
 def _device(text: str) -> str:
-    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
-        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {format_value(text)}")
+    refuse_if(
+        not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text),
+        f"expected auto, cpu, cuda or cuda:N, got {format_value(text)}",
+        error=argparse.ArgumentTypeError,
+    )
     return text
 
 
 def numbers(text: str) -> tuple[float, ...]:
     """Finite numbers joined by commas, for argparse."""
     values = several(text)
-    if not values:
-        raise argparse.ArgumentTypeError(
-            f"expected finite numbers joined by commas, up to 1e6, got {format_value(text)}"
-        )
+    refuse_if(
+        not values,
+        f"expected finite numbers joined by commas, up to 1e6, got {format_value(text)}",
+        error=argparse.ArgumentTypeError,
+    )
     return values
 
 
-def _split_list(name: str, text: str) -> str:
+def _split_list(option: str, text: str) -> str:
     names = _names(text)
-    if not names:
-        raise UsageError(f"{name} {text!r}: expected names, got none", remedy="leave the option out")
+    refuse_if(
+        not names, f"{option} {text!r}: expected names, got none", remedy="leave the option out", error=UsageError
+    )
     return ",".join(names)
 
 
-def _names(text: str | None) -> tuple[str, ...] | None:
-    return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _topics(text: str) -> CameraTopics:
     name, equals, rest = text.partition("=")
     topics = rest.split(",")
-    if not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)):
-        raise UsageError(f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO")
+    refuse_if(
+        not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)),
+        f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO",
+        error=UsageError,
+    )
     return CameraTopics(name=name, color=topics[0], depth=topics[1], info=topics[2] if len(topics) == 3 else "")
 
 
 def _human_topic(text: str) -> tuple[str, str]:
     name, _, topic = text.partition("=")
-    if not name or not topic:
-        raise UsageError(f"--human-topic {text}: expected NAME=TOPIC")
+    refuse_if(not name or not topic, f"--human-topic {text}: expected NAME=TOPIC", error=UsageError)
     return name, topic
+
+
+def _is_topic(text: str) -> bool:
+    return text.partition("=")[2].startswith("/")
 
 
 def _pose(text: str) -> tuple[str, tuple[float, ...]]:
@@ -128,31 +144,43 @@ def _pose(text: str) -> tuple[str, tuple[float, ...]]:
     if name and rest == "identity":
         return name, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     values = several(rest)
-    if not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
-        raise UsageError(f"--camera-pose {text}: expected NAME={POSE} with a unit quaternion, or NAME=identity")
+    refuse_if(
+        not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0,
+        f"--camera-pose {text}: expected NAME={POSE} with a unit quaternion, or NAME=identity",
+        error=UsageError,
+    )
     return name, values
 
 
 def _pose_topic(text: str) -> tuple[str, tuple[str, str]]:
     name, _, rest = text.partition("=")
     topic, at, frame = rest.partition("@")
-    if not name or not topic or bool(at) != bool(frame):
-        raise UsageError(f"--camera-pose {text}: expected NAME=TOPIC or NAME=TOPIC@FRAME")
+    refuse_if(
+        not name or not topic or bool(at) != bool(frame),
+        f"--camera-pose {text}: expected NAME=TOPIC or NAME=TOPIC@FRAME",
+        error=UsageError,
+    )
     return name, (topic, frame.strip("/"))
 
 
 def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
     name, _, rest = text.partition("=")
     values = several(rest)
-    if not name or len(values) - 4 not in (0, *NUM_COEFFICIENTS) or not min(values[:2]) > 0:
-        counts = ", ".join(map(str, NUM_COEFFICIENTS))
-        raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels, then 0, {counts} coefficients")
+    refuse_if(
+        not name or len(values) - 4 not in (0, *NUM_COEFFICIENTS) or not min(values[:2]) > 0,
+        f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels, then 0, {', '.join(map(str, NUM_COEFFICIENTS))}"
+        " coefficients",
+        error=UsageError,
+    )
     return name, values
 
 
 def _preset(text: str) -> str:
-    if text not in PRESETS:
-        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {format_value(text)}")
+    refuse_if(
+        text not in PRESETS,
+        f"expected {' or '.join(PRESETS)}, got {format_value(text)}",
+        error=argparse.ArgumentTypeError,
+    )
     return f"preset={text}"
 
 
@@ -203,31 +231,55 @@ HOLDOUT = option(
     "--holdout 0,6",
     "keep frames of an image folder for judging, as camera holdout",
     partial(_split_list, "--holdout"),
+    fields={"holdout": lambda text: tuple(text.split(","))},
 )
 SOURCE = (  # the options of a source, all but --cameras in a group of their own
-    option("--cameras A,B", "only these cameras", partial(_split_list, "--cameras")),
+    option(
+        "--cameras A,B",
+        "only these cameras",
+        partial(_split_list, "--cameras"),
+        fields={"cameras": lambda text: tuple(text.split(","))},
+    ),
     group(
         "input",
-        option("--camera NAME=COLOR,DEPTH[,INFO] ...", "topics of a camera, instead of those found"),
+        option(
+            "--camera NAME=COLOR,DEPTH[,INFO] ...",
+            "topics of a camera, instead of those found",
+            fields={"camera_topics": lambda texts: tuple(map(_topics, texts))},
+        ),
         option(
             f"--camera-pose NAME={POSE} ...",
             "pose of a fixed camera in the world; or NAME=identity; or NAME=TOPIC[@FRAME], a topic of its poses, or"
             " of FRAME's",
+            fields={
+                "camera_poses": lambda texts: dict(_pose(text) for text in texts if not _is_topic(text)),
+                "camera_pose_topics": lambda texts: dict(_pose_topic(text) for text in texts if _is_topic(text)),
+            },
         ),
         option(
             "--intrinsics NAME=FX,FY,CX,CY[,K1,K2,P1,P2...] ...",
             "of a camera [px], and its distortion where it has one, instead of the recorded ones",
+            fields={"intrinsics": _pairs(_intrinsics)},
         ),
         option(
-            "--human-topic NAME=TOPIC ...", "mono8 masks of a camera's colour images, not 0 where they show a person"
+            "--human-topic NAME=TOPIC ...",
+            "mono8 masks of a camera's colour images, not 0 where they show a person",
+            fields={"human_topics": _pairs(_human_topic)},
         ),
         option("--world-frame FRAME", "tf frame of poses (default: root of the tf tree)"),
         option("--depth-scale M", "metres per count of depth (default: 0.001)", real(1e-9, 1e3, "m")),
-        option("--pairing-tolerance S", "colour to depth, seconds", real(0, 3600, "s"), 0.02),
+        option(
+            "--pairing-tolerance S",
+            "colour to depth, seconds",
+            real(0, 3600, "s"),
+            0.02,
+            fields={"pairing_tolerance_s": float},
+        ),
         option("--calibration FILE.toml", "what calibrate wrote: poses, depths and clock of this recording", Path),
         option(
             "--perturb NAME=VALUE ...",
             "read frames with errors: depth-noise (m at 1 m), pose-error (m), pose-turn (degrees); seed of these",
+            fields={"perturb": _pairs(partial(_number_of, "--perturb", "NAME"))},
         ),
         option("--stamps", "a log's times: those of the headers, or of logging", ("header", "log"), "header"),
         option("--joint-topic TOPIC", "JointState topic (default: /joint_states)"),
@@ -267,7 +319,11 @@ SELF_MODEL = option(
     "self-model of 'robot learn' (none: learn and apply nothing)",
     Path,
 )
-LOCK = option("--lock JOINT=VALUE ...", "hold a joint, and what mimics it, at a value [rad or m]")
+LOCK = option(
+    "--lock JOINT=VALUE ...",
+    "hold a joint, and what mimics it, at a value [rad or m]",
+    fields={"locked": _pairs(partial(_number_of, "--lock", "JOINT"))},
+)
 BASE = option(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
 
 

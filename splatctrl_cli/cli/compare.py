@@ -10,7 +10,7 @@ FORM = ".6g"
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    result = compare(request_of(CompareRequest, args, runs=tuple(args.output)), console)
+    result = compare(request_of(CompareRequest, args), console)
     return console.concluded(result.verdict, result.as_dict(), _lines(result, is_long=args.verbose > 0))
 
 

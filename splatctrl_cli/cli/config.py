@@ -14,7 +14,7 @@ from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import SCHEMA_FILE
 from splatctrl_cli.config.load import resolved_settings, template_of, toml_of
 from splatctrl_cli.config.ranges import format_value
-from splatctrl_cli.errors import UsageError, did_you_mean
+from splatctrl_cli.errors import UsageError, did_you_mean, refuse_if
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -44,9 +44,12 @@ def run_help(args: argparse.Namespace, console: Console) -> int:
     texts: dict[str, Callable[[], str]] = {name: one.format_full_help for name, one in commands.choices.items()}
     texts["settings"] = lambda: "\n".join(template_of(resolved_settings(None, ())))
     texts |= {page.stem: partial(page.read_text, encoding="utf-8") for page in folder.glob("*.md")}
-    if topic not in texts:
-        remedy = did_you_mean(topic, sorted(texts), f"give one of: {', '.join(sorted(texts))}")
-        raise UsageError(f"help: no page {format_value(topic)}", remedy=remedy)
+    refuse_if(
+        topic not in texts,
+        f"help: no page {format_value(topic)}",
+        remedy=did_you_mean(topic, sorted(texts), f"give one of: {', '.join(sorted(texts))}"),
+        error=UsageError,
+    )
     text = texts[topic]()
     return console.result({"topic": topic, "text": text}, text.splitlines())
 

@@ -6,13 +6,12 @@ import io
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 
-from splatctrl_cli.cli.commands import build_parser, function_of
-from splatctrl_cli.cli.common import Console, names_of, request_of, table
+from splatctrl_cli.cli.commands import build_parser
+from splatctrl_cli.cli.common import Console, request_of, table
 from splatctrl_cli.jobs.demo import PICTURES, DemoRequest, demo
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
-from splatctrl_cli.simulate.arm import UNMODELLED
-from splatctrl_cli.simulate.recording import RecordingOptions
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -24,7 +23,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         vars(step).pop("junit", None)  # CI is told of the demo alone
         step.quiet = args.quiet
         with contextlib.redirect_stdout(text):
-            code = function_of(step.run)(step, Console(step))
+            code = resolve_name(f"splatctrl_cli.cli.{step.run}")(step, Console(step))
         if not (console.is_quiet or console.is_json):
             print(text.getvalue().replace(str(folder), str(request.out)), end="", flush=True)
         return getattr(step, "label", f"exit code {code}" if code else "done")
@@ -39,9 +38,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def run_simulate(args: argparse.Namespace, console: Console) -> int:
-    parts = () if args.unmodelled is None else names_of(args.unmodelled, tuple(UNMODELLED), "--unmodelled")
-    options, out = request_of(RecordingOptions, args), args.out or Path("simulated")
-    result = simulate(request_of(SimulateRequest, args, out=out, options=options, unmodelled=parts), console)
+    result = simulate(request_of(SimulateRequest, args), console)
     truth = result.truth
     cells = [
         (

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult, ExportRunRequest, export, export_run
 from splatctrl_cli.records import Label
 
@@ -22,18 +22,16 @@ SHOWN = {  # of Differences: what the table calls it, and the unit it is shown i
 def run(args: argparse.Namespace, console: Console) -> int:
     if args.mcap:
         for name in ("labels", "layout", "isotropic"):
-            if getattr(args, name):
-                raise UsageError(f"--{name}: not with --mcap", remedy="leave it out")
-        logged = export_run(request_of(ExportRunRequest, args, path=args.scene, roots=tuple(args.root)))
+            refuse_if(getattr(args, name), f"--{name}: not with --mcap", remedy="leave it out", error=UsageError)
+        logged = export_run(request_of(ExportRunRequest, args))
         rows = table(("topic", "messages"), [*logged.messages.items()])
         return console.result(asdict(logged), [f"{logged.file}: {logged.bytes} bytes", *rows])
-    result = export(request_of(ExportRequest, args, labels=_labels(args.labels)), console)
+    result = export(request_of(ExportRequest, args), console)
     return console.result({n: v for n, v in asdict(result).items() if n != "was_rounded"}, _lines(result))
 
 
-def _labels(names: str | None) -> list[Label] | None:
-    if names is None:
-        return None
+def labels_of(names: str) -> list[Label]:
+    """Labels of ``--labels``. Raises UsageError for an unknown one."""
     known = {label.name.lower(): label for label in Label}
     chosen = [name.strip() for name in names.split(",")]
     if unknown := [name for name in chosen if name not in known]:

@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from pkgutil import resolve_name
 
-from splatctrl_cli.cli.commands import build_parser, function_of, judges
+from splatctrl_cli.cli.commands import build_parser, judges
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.reports import tell_of_failure, wrap_result
-from splatctrl_cli.errors import SplatCtrlError, UsageError
+from splatctrl_cli.errors import SplatCtrlError, UsageError, refuse_if
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
 from splatctrl_cli.report.junit import check_replaceable
 
@@ -51,7 +52,7 @@ def _run(argv: Sequence[str] | None) -> int:
         args = build_parser(words[0] if words else "").parse_args(words)
         args.began = start
         _check_outputs(args)
-        code = function_of(args.run)(args, Console(args))
+        code: int = resolve_name(f"splatctrl_cli.cli.{args.run}")(args, Console(args))
         sys.stdout.flush()
         return code
     except BrokenPipeError:
@@ -143,8 +144,12 @@ def _check_outputs(args: argparse.Namespace) -> None:
         if report is not None:
             _check_output(report, inputs, "--junit")
             check_replaceable(report)
-            if out is not None and _places(out) & {*_places(report), *report.absolute().parents}:
-                raise UsageError(f"--junit {report}: is in --out, which appears whole", remedy="put it beside that")
+            refuse_if(
+                out is not None and _places(out) & {*_places(report), *report.absolute().parents},
+                f"--junit {report}: is in --out, which appears whole",
+                remedy="put it beside that",
+                error=UsageError,
+            )
     except UsageError:
         args.junit = None
         raise
@@ -157,8 +162,12 @@ def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
     targets = _places(out)
     for given in inputs:
         source = Path(os.path.realpath(given))
-        if targets & {source, *source.parents}:
-            raise UsageError(f"{out}: would replace the input {given}", remedy=f"give another {option}")
+        refuse_if(
+            targets & {source, *source.parents},
+            f"{out}: would replace the input {given}",
+            remedy=f"give another {option}",
+            error=UsageError,
+        )
 
 
 def _places(output: Path) -> set[Path]:

@@ -1,15 +1,14 @@
 """An argument parser with one-line errors, short help, and one-line options."""
 
 import argparse
-import difflib
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn, TypeVar
 
 from splatctrl_cli.config.ranges import MAX_PLACE, OneOf, Section, Within, format_value
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, did_you_mean
 
 T = TypeVar("T", int, float)
 
@@ -60,29 +59,26 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise UsageError with argparse's message and a remedy."""
         command = self.prog.partition(" ")[2]
+        known = [*self._option_string_actions, "--"]
         if "required" in message:  # perhaps because it was misspelt
-            unknown = [w for w in self._words if w.startswith("--") and w.partition("=")[0] not in self._known()]
+            unknown = [w for w in self._words if w.startswith("--") and w.partition("=")[0] not in known]
             message = f"unrecognized arguments: {unknown[0]}" if unknown else message
-        raise UsageError(f"{command}: {message}" if command else message, remedy=self._remedy(message))
+        raise UsageError(f"{command}: {message}" if command else message, remedy=self._remedy(message, known))
 
-    def _remedy(self, message: str) -> str:
+    def _remedy(self, message: str, options: Sequence[str]) -> str:
         unknown = re.match(r"unrecognized arguments: (-[^\s=]*)", message)
         choice = re.match(r"argument (\S+): invalid choice: '([^']*)'", message)
         lacking = re.match(r"argument (?:\S+/)?(--[^\s/]+): expected (?:one|at least one) argument", message)
-        near, gone = "", GONE.get(choice[2] if choice else f"{self.prog} {unknown[1]}" if unknown else "")
+        gone = GONE.get(choice[2] if choice else f"{self.prog} {unknown[1]}" if unknown else "")
         if gone is not None:
             return f"run {gone} instead"
-        if unknown:
-            near = _nearest(unknown[1], self._known())
-        elif choice:
-            action = next((a for a in self._actions if choice[1] in {a.metavar, a.dest, *a.option_strings}), None)
-            near = _nearest(choice[2], (action.choices if action else None) or ())
-        elif lacking:
+        if lacking:
             return f"write {lacking[1]}=VALUE where the value begins with a minus, like {lacking[1]}=-1"
-        return f"did you mean {near}?" if near else f"see {self.prog} --help"
-
-    def _known(self) -> list[str]:
-        return [*self._option_string_actions, "--"]
+        word, known = (unknown[1], options) if unknown else ("", ())
+        if choice:
+            action = next((a for a in self._actions if choice[1] in {a.metavar, a.dest, *a.option_strings}), None)
+            word, known = choice[2], [str(name) for name in (action.choices if action else None) or ()]
+        return did_you_mean(word, known, f"see {self.prog} --help", cutoff=0.75)
 
     @property
     def actions(self) -> "argparse._SubParsersAction[Parser] | None":
@@ -140,12 +136,20 @@ def option(
     meaning: str,
     kind: Callable[[str], Any] | Sequence[str] | None = None,
     default: Any = None,
+    *,
+    fields: Mapping[str, Callable[[Any], Any] | str] | None = None,
+    sets: tuple[type[Section], str] | None = None,
     **more: Any,
 ) -> Adds:
     """Declare ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
 
-    kind: converts the text, or a tuple of choices. default: the help shows it if given. more: as in argparse.
+    kind: converts the text, or a tuple of choices. default: shown in the help. fields: of a request, each with a
+    function of the option's value, or its MODULE:NAME if heavy (default: the field of its name). sets: a key of the
+    configuration, which says the kind. more: as in argparse.
     """
+    if sets is not None:
+        declared, of_default = sets[0].declared[sets[1]], type(getattr(*sets))
+        kind = declared.words if isinstance(declared, OneOf) else _parse_within(of_default, declared)
     flags, _, metavar = name.partition(" ")
     is_place, repeats = not flags.startswith("-"), metavar.endswith(" ...")
     if isinstance(kind, tuple):
@@ -164,7 +168,14 @@ def option(
     if default is not None and default != [] and more.get("action") != "count":
         meaning += f" (default: {default:g})" if isinstance(default, int | float) else f" (default: {default})"
     names = [flags.lower()] if is_place else flags.split("/")
-    return lambda container: container.add_argument(*names, help=meaning.replace("%", "%%"), **more)
+
+    def add(container: Any) -> None:
+        action = container.add_argument(*names, help=meaning.replace("%", "%%"), **more)
+        same = tuple if repeats or more.get("nargs") == "+" else lambda value: value
+        action.fields = fields or {action.dest: same}
+        action.sets = "" if sets is None else f"{sets[0].section}.{sets[1]}"
+
+    return add
 
 
 def group(title: str, *options: Adds) -> Adds:
@@ -223,19 +234,6 @@ def whole(low: int, high: int, unit: str = "") -> Callable[[str], int]:
     return _parse_within(int, Within(low, high, unit, ""))
 
 
-def setting(section: type[Section], key: str) -> Callable[[str], float]:
-    """Parser of a configuration key's number: its type and range."""
-    declared = section.declared[key]
-    assert isinstance(declared, Within)
-    return _parse_within(int if type(getattr(section, key)) is int else float, declared)
-
-
-def words(section: type[Section], key: str) -> tuple[str, ...]:
-    declared = section.declared[key]
-    assert isinstance(declared, OneOf)
-    return declared.words
-
-
 def several(text: str) -> tuple[float, ...]:
     """Numbers joined by commas; none if one is invalid or beyond `MAX_PLACE`."""
     try:
@@ -257,7 +255,3 @@ def _parse_within(kind: Callable[[str], T], declared: Within) -> Callable[[str],
         return value
 
     return parse
-
-
-def _nearest(word: str, known: Iterable[object]) -> str:
-    return next(iter(difflib.get_close_matches(word, [str(name) for name in known], n=1, cutoff=0.75)), "")

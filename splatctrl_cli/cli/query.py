@@ -8,20 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
-from splatctrl_cli.cli.sdf_bake import labels_of
-from splatctrl_cli.config import load_config
 from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Run; without an output answers go to stdout, figures to stderr."""
-    request = request_of(
-        QueryRequest,
-        args,
-        points=sys.stdin if str(args.points) == "-" else args.points,
-        config=load_config(args.config, args.set),
-        labels=labels_of(args.include),
-    )
+    request = request_of(QueryRequest, args)
     if args.out is not None or console.is_json:
         result = query(request, console)
         out = None if result.out is None else str(result.out)

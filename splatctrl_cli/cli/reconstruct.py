@@ -1,29 +1,26 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
-from splatctrl_cli.cli.common import Console, request_of, source_options, table
-from splatctrl_cli.config import load_config
-from splatctrl_cli.errors import UsageError
-from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
+from splatctrl_cli.cli.common import Console, config_of, request_of, table
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.running.device import describe_device
 from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
 from splatctrl_cli.kernels import native
-from splatctrl_cli.records import Box
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
     native.keep_freed_memory()
-    config = load_config(args.config, args.set)  # refused before the source is opened
-    if args.max_splats is not None:
-        config = replace(config, scene=replace(config.scene, max_splats=args.max_splats))
-    if (args.source is None) == (args.dtu is None):
-        raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
+    config = config_of(args)  # refused before the source is opened
+    refuse_if(
+        (args.source is None) == (args.dtu is None),
+        "reconstruct: expected a SOURCE or --dtu ROOT, and not both",
+        error=UsageError,
+    )
     allowed = {"views-agreement", "views-scale"} if args.allow_disagreement or args.refine_poses else set()
     request = request_of(
         ReconstructRequest,
@@ -35,10 +32,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
             needs_depth=args.points is None,
             allowed=allowed | ({"alignment"} if args.allow_disagreement else set()),
         ),
-        recording=args.source,
-        out=args.out or Path("scene"),
-        box=None if args.box is None else Box.from_text(args.box),
-        corrections=Corrections(poses=args.refine_poses, exposure=args.refine_exposure),
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},
     )
     result = reconstruct(request, console)
@@ -46,9 +39,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"])
 
 
-def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
-    options, is_dtu = source_options(args), args.dtu is not None
-    return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=is_dtu, options=options, masks=masks)
+def recording_of(args: argparse.Namespace, path: Path, beside: tuple[Path, ...] = ()) -> RecordingRequest:
+    return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=args.dtu is not None, beside=beside)
 
 
 def _lines(result: ReconstructResult) -> list[str]:

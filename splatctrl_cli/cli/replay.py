@@ -3,19 +3,15 @@
 import argparse
 from collections.abc import Iterator, Sequence
 from functools import partial
-from pathlib import Path
 
 from splatctrl_cli.cli.common import (
     Console,
     format_cell,
-    locked_joints,
     long_table,
     remarks,
     request_of,
-    source_options,
     table,
 )
-from splatctrl_cli.config import load_config
 from splatctrl_cli.jobs.replay.files import chunks_of, when_and_why
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replay.request import Replay, ReplayRequest
@@ -27,17 +23,7 @@ HEADLINE = (
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    result = replay(
-        request_of(
-            ReplayRequest,
-            args,
-            out=args.out or Path("replay"),
-            config=load_config(args.config, args.set),
-            options=source_options(args),
-            locked=locked_joints(args),
-        ),
-        console,
-    )
+    result = replay(request_of(ReplayRequest, args), console)
     return console.concluded(
         result.verdict,
         {"out": str(result.out), **result.metrics},

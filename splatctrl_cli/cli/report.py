@@ -15,7 +15,7 @@ MOST_NOTES = 5
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    result = write_report(request_of(WriteReportRequest, args, roots=tuple(args.root)), console)
+    result = write_report(request_of(WriteReportRequest, args), console)
     more = len(result.notes) - MOST_NOTES
     lines = [
         f"{result.file}: {result.num_runs} runs, {result.num_scenes} in 3-D, {result.bytes} bytes",
@@ -26,7 +26,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def run_view(args: argparse.Namespace, console: Console) -> int:
-    result = view(request_of(ViewRequest, args, roots=tuple(args.root)))
+    result = view(request_of(ViewRequest, args))
     found = f"{result.num_splats} splats, {result.num_states} states, {result.num_unknown} cubes never seen"
     is_opened = not args.no_open and open_page(result.file)
     console.result({**asdict(result), "is_opened": is_opened}, [f"{result.file}: {found}, {result.bytes} bytes"])

@@ -10,7 +10,7 @@ from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.report.junit import Suite, cases_of, error_case, notes_of, tell_github, write_junit
+from splatctrl_cli.report.junit import Suite, cases_of, error_case, tell_github, write_junit
 
 RECORDINGS = ("log", "source", "reference", "dtu", "scene", "data", "output", "urdf")  # logs before maps
 JUNIT = "--junit"
@@ -40,7 +40,7 @@ def report_command(args: argparse.Namespace, verdict: Mapping[str, Any] | None, 
         name=path or command,
         path=path,
         cases=[error_case(group, line, exit_code=code)] if verdict is None else cases_of(verdict, group),
-        notes=() if verdict is None else notes_of(verdict),
+        notes=() if verdict is None else [verdict["sentence"], *verdict["notes"]],
         properties=properties | ({} if verdict is None else {"label": verdict["label"]}),
         started=(datetime.now(UTC) - timedelta(seconds=seconds)).isoformat(timespec="seconds"),
         seconds=seconds,

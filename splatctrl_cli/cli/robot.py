@@ -3,7 +3,7 @@
 import argparse
 import math
 
-from splatctrl_cli.cli.common import Console, locked_joints, remarks, request_of, source_options, table
+from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.files.output import finite
 from splatctrl_cli.jobs.reconstruct.reconstruct import LearnRequest, learn_robot
@@ -36,7 +36,7 @@ def run_check(args: argparse.Namespace, console: Console) -> int:
 
 
 def run_pairs(args: argparse.Namespace, console: Console) -> int:
-    found, document = robot_pairs(request_of(RobotRequest, args, locked=locked_joints(args)))
+    found, document = robot_pairs(request_of(RobotRequest, args))
     ordered = sorted(found.link_pairs, key=lambda pair: pair.left_out is not None)
     rows = [(*pair.links, pair.num_sphere_pairs, *_gap(pair), pair.left_out or "") for pair in ordered]
     kept = len(found.link_pairs) - len(found.left_out)
@@ -56,7 +56,7 @@ def run_pairs(args: argparse.Namespace, console: Console) -> int:
 
 
 def run_info(args: argparse.Namespace, console: Console) -> int:
-    model, document = describe_robot(request_of(RobotRequest, args, locked=locked_joints(args)))
+    model, document = describe_robot(request_of(RobotRequest, args))
     urdf, lost = model.urdf, document["meshes_not_found"]
     kinds = {joint.name: joint.kind for joint in urdf.joints}
     joints = [
@@ -80,7 +80,7 @@ def run_info(args: argparse.Namespace, console: Console) -> int:
 
 
 def run_learn(args: argparse.Namespace, console: Console) -> int:
-    request = request_of(LearnRequest, args, options=source_options(args), locked=locked_joints(args))
+    request = request_of(LearnRequest, args)
     model = learn_robot(request, console)
     having, links = ({part.link for part in parts} for parts in (model.parts, model.learned))
     lines = [

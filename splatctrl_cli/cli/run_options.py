@@ -1,18 +1,23 @@
 """Options of commands on recordings and runs."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 
-from splatctrl_cli.cli.common import BASE, LOCK, OF_FOLDERS, PACKAGES, SEVERAL_LOGS, numbers, output, seed
+from splatctrl_cli.cli.common import BASE, LOCK, OF_FOLDERS, PACKAGES, SEVERAL_LOGS, names_of, numbers, output, seed
 from splatctrl_cli.cli.parser import group, option, real, whole
+from splatctrl_cli.errors import refuse_if
 
 ROOT = "folder in which the scene and robot of a replay's command line are looked for, if they were moved"
 
 
 def _shard(text: str) -> tuple[int, int]:
     index, _, count = text.partition("/")
-    if not (index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)):
-        raise argparse.ArgumentTypeError(f"expected I/N with I from 1 to N, got {text!r}")
+    refuse_if(
+        not (index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)),
+        f"expected I/N with I from 1 to N, got {text!r}",
+        error=argparse.ArgumentTypeError,
+    )
     return int(index), int(count)
 
 
@@ -25,13 +30,13 @@ REPORT = (
         Path,
     ),
     option("--all-scenes", "of a batch, every replay in 3-D, not only the failed, changed and worst"),
-    option("--root DIR ...", ROOT, Path),
+    option("--root DIR ...", ROOT, Path, fields={"roots": tuple}),
 )
 VIEW = (
     option("PATH", "a run, scene or field folder, a field.npz, or a splat file", Path),
     *output("HTML file to write", default="PATH.html, beside PATH"),
     option("--no-open", "do not open it in a browser"),
-    option("--root DIR ...", ROOT, Path),
+    option("--root DIR ...", ROOT, Path, fields={"roots": tuple}),
 )
 BATCH = (
     option("SUITE", "TOML file of recordings and jobs (splatctrl help batch); with --list also an output", Path),
@@ -69,12 +74,19 @@ SWEEP = (
     option("--dask ADDRESS", "make the runs on a Dask cluster that shares this folder"),
 )
 COMPARE = (
-    option("OUTPUT", "folder that a command or a batch wrote; of two the earlier first", Path, nargs="+"),
+    option(
+        "OUTPUT",
+        "folder that a command or a batch wrote; of two the earlier first",
+        Path,
+        nargs="+",
+        fields={"runs": tuple},
+    ),
     option("--against FILE", "compare the only OUTPUT with this stored baseline", Path),
     option("--update-baseline FILE", "write the last OUTPUT as a baseline, alone or after the comparison", Path),
 )
 
 
+UNMODELLED = ("tool", "cable", "bracket")  # as simulate.arm has them, which is not imported for a help text
 QUICK = 30  # images of a topic
 FILES = ".mcap, .bag, .db3, ROS 2 bag folder"
 OTHERS = "folder of a dataset, or .toml of an image folder"
@@ -120,19 +132,20 @@ SIMULATE = (
         option(
             "--unmodelled PARTS",
             "parts of the arm that images and truth.json have and robot.urdf has not: tool,cable,bracket, or some",
+            fields={"unmodelled": partial(names_of, "--unmodelled", UNMODELLED)},
         ),
         option("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0),
     ),
 )
 INGEST = (
-    option("SOURCE", f"{FILES}, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
+    option("SOURCE", f"{FILES}, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+", fields={"paths": tuple}),
     *output("capture folder", default="NAME.capture in this folder, NAME that of SOURCE"),
     option("--resume", "continue an interrupted run, if there is one, to the same bytes"),
     *OF_FOLDERS,
 )
 INFO = (option("PATH", "file or folder", Path), *OF_FOLDERS)
 CHECK = (
-    option("SOURCE", f"{FILES}, capture, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
+    option("SOURCE", f"{FILES}, capture, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+", fields={"paths": tuple}),
     option("--fail-on", "exit with 1 where a finding is as bad as this", ("error", "warning", "never"), "error"),
     option(
         "--quick N",
@@ -152,13 +165,20 @@ CHECK = (
     *OF_FOLDERS,
 )
 CALIBRATE = (
-    option("SOURCE", f"the recording to calibrate: {FILES}, capture, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
+    option(
+        "SOURCE",
+        f"the recording to calibrate: {FILES}, capture, {OTHERS}; {SEVERAL_LOGS}",
+        Path,
+        nargs="+",
+        fields={"paths": tuple},
+    ),
     *output("TOML file that commands take as --calibration", default="calibration.toml"),
     option("--urdf FILE", "place the cameras by this robot's surface, where its joint states have it", Path),
     option("--hold CAMERA", "what stays as recorded (default: the robot's base, without --urdf the first camera)"),
     option(
         "--board COLUMNSxROWS:M",
         "begin where a board of so many inner corners (chessboard or ChArUco), squares of M metres, has the cameras",
+        fields={"board": "calibration.board:board_of"},
     ),
     option("--allow-unobserved", "write the result although the recording does not determine all of it"),
     group(

@@ -1,5 +1,8 @@
 """Options of commands on scenes and motions."""
 
+import sys
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 from splatctrl_cli.cli.common import (
@@ -19,27 +22,44 @@ from splatctrl_cli.cli.common import (
     SELF_MODEL,
     SOURCE,
     THREADS,
+    names_of,
     numbers,
     output,
     pose,
     settings,
 )
-from splatctrl_cli.cli.parser import MAX_SECONDS, either, group, option, real, setting, whole, words
+from splatctrl_cli.cli.parser import MAX_SECONDS, either, group, option, real, whole
 from splatctrl_cli.config import FieldConfig, SceneConfig
 
 SPLAT_FORMATS = (".ply", ".splat", ".spz", ".glb", ".usda", ".usdc")  # as the registries have them, which are not
 GRID_FORMATS = ("npz", "vti", "nrrd", "vdb", "curobo", "moveit", "ply", "obj", "stl")  # imported for a help text
+AS_BOX: Mapping[str, str] = {"box": "records:Box.from_text"}
+AS_LABELS: Mapping[str, str] = {"labels": "cli.sdf_bake:labels_of"}
 CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label", "hard", "se", "gpdf")
+
+
+def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
+    """Log and cameras of ``LOG:camera,...``; none means all that did not train."""
+    path, colon, cameras = text.rpartition(":")
+    if not colon or Path(text).exists():
+        return Path(text), ()
+    return Path(path), tuple(name.strip() for name in cameras.split(",") if name.strip())
+
+
 RECONSTRUCT = (
-    option("SOURCE", "log, capture folder, or an image folder's .toml", Path, nargs="?"),
+    option("SOURCE", "log, capture folder, or an image folder's .toml", Path, nargs="?", fields={"recording": Path}),
     option("--dtu ROOT", "a DTU data set in MVSNet's layout, or in IDR's and NeuS's, instead", Path),
     *output("scene folder", default="scene"),
     option("--resume", "continue an interrupted run, to the same bytes"),
     option("--urdf FILE", "the robot (default: the log's own): labels its splats, sets the workspace", Path),
     option("--spheres FILE.yaml", "its collision spheres", Path),
     SELF_MODEL,
-    option(f"--box {BOX}", "workspace [m] (default: the robot's reach, else the valid depth)"),
-    option("--max-splats N", "budget of splats (default: 5000)", setting(SceneConfig, "max_splats")),
+    option(f"--box {BOX}", "workspace [m] (default: the robot's reach, else the valid depth)", fields=AS_BOX),
+    option(
+        "--max-splats N",
+        "budget of splats (default: 5000)",
+        sets=(SceneConfig, "max_splats"),
+    ),
     *CONFIG,
     GATES,
     *OF_FOLDERS,
@@ -54,9 +74,15 @@ RECONSTRUCT = (
         DECLARE,
         *DISAGREEMENT,
         option(
-            "--refine-poses", "put views of a still scene where they show the same surfaces; free depth of its bend"
+            "--refine-poses",
+            "put views of a still scene where they show the same surfaces; free depth of its bend",
+            fields={"poses": bool},
         ),
-        option("--refine-exposure", "give the views of a still scene one brightness and white balance"),
+        option(
+            "--refine-exposure",
+            "give the views of a still scene one brightness and white balance",
+            fields={"exposure": bool},
+        ),
     ),
     DEVICE,
 )
@@ -65,12 +91,17 @@ EXPORT = (
         "SCENE",
         f"a scene folder, or a splat file: {', '.join(SPLAT_FORMATS)}; with --mcap also a replay or a field",
         Path,
+        fields={"scene": Path, "path": Path},
     ),
     *output(
         f"the file to write; its suffix is the format: {', '.join(SPLAT_FORMATS)}", default="SCENE.ply, beside SCENE"
     ),
     option("--mcap", "write an MCAP for Foxglove, over time (default of --out: SCENE.mcap; splatctrl help report)"),
-    option("--labels NAME,...", "only splats of these labels: object, robot, human (default: all)"),
+    option(
+        "--labels NAME,...",
+        "only splats of these labels: object, robot, human (default: all)",
+        fields={"labels": "cli.export:labels_of"},
+    ),
     option(
         "--layout",
         "of a PLY: short has label and density, full the reference's 62 properties (default: short for isotropic"
@@ -82,16 +113,23 @@ EXPORT = (
         "--root DIR ...",
         "with --mcap: folder in which the scene and robot of a replay's command line are looked for",
         Path,
+        fields={"roots": tuple},
     ),
 )
 SDF_BAKE = (
     option("SCENE", "a folder that reconstruct wrote, or a file of round splats: .ply, .splat, .spz", Path),
     *output("folder to write: the grid, field.json, report/, run.json", default="field"),
     option("--at SECONDS", "the scene as known that long after its start", real(-MAX_SECONDS, MAX_SECONDS, "s")),
-    option(f"--box {BOX}", "what the grid covers [m]; write --box=-1,... for a negative start"),
+    option(f"--box {BOX}", "what the grid covers [m]; write --box=-1,... for a negative start", fields=AS_BOX),
     option("--urdf URDF", "cover the reach of this robot around its base, without --box", Path),
-    option("--voxel M", "cell size (field.voxel)", setting(FieldConfig, "voxel")),
-    option("--formats NAME,...", f"of {', '.join(GRID_FORMATS)}", str, "npz,vti"),
+    option("--voxel M", "cell size (field.voxel)", sets=(FieldConfig, "voxel")),
+    option(
+        "--formats NAME,...",
+        f"of {', '.join(GRID_FORMATS)}",
+        str,
+        "npz,vti",
+        fields={"formats": partial(names_of, "--formats", GRID_FORMATS)},
+    ),
     option("--truth truth.json", "measure the field against this truth", Path),
     option("--seen-by LOG", "the log or capture whose cameras saw the scene, for --truth", Path),
     option("--resume", "continue an interrupted bake, to the same bytes"),
@@ -101,29 +139,43 @@ SDF_BAKE = (
     group(
         "field",
         option(
-            "--include NAME,...", "labels in the field in addition to object: robot, human, or none", str, "human"
+            "--include NAME,...",
+            "labels in the field in addition to object: robot, human, or none",
+            str,
+            "human",
+            fields=AS_LABELS,
         ),
         option("--spheres FILE.yaml", "spheres of --urdf (default: the URDF's own)", Path),
         option(
             "--channels NAME,...",
             f"what is baked beside sdf, of {', '.join(CHANNELS)} (default: {','.join(CHANNELS[:4])})",
+            fields={"channels": partial(names_of, "--channels", CHANNELS)},
         ),
         option(
             "--distance",
             "what sdf is: min(se, hard), min(gpdf, hard), the exact distance, either kernel field (field.distance)",
-            words(FieldConfig, "distance"),
+            sets=(FieldConfig, "distance"),
         ),
         option(
             "--weights",
             "of the kernel field: row sums, voxels, the full GP (field.weights)",
-            words(FieldConfig, "weights"),
+            sets=(FieldConfig, "weights"),
         ),
-        option("--length-scale M", "l of the kernel (field.length_scale)", setting(FieldConfig, "length_scale")),
-        option("--unknown", "what never-seen space counts as (field.unknown)", words(FieldConfig, "unknown")),
+        option(
+            "--length-scale M",
+            "l of the kernel (field.length_scale)",
+            sets=(FieldConfig, "length_scale"),
+        ),
+        option(
+            "--unknown",
+            "what never-seen space counts as (field.unknown)",
+            sets=(FieldConfig, "unknown"),
+        ),
         option(
             "--probability",
             "bake the channel probability, of collision, in this form (field.probability)",
-            words(FieldConfig, "probability"),
+            fields={"with_probability": bool},
+            sets=(FieldConfig, "probability"),
         ),
     ),
     group(
@@ -132,6 +184,10 @@ SDF_BAKE = (
         option(
             "--held-out LOG[:CAMERA,...]",
             "measure the field against depth of cameras that did not train; --urdf tells which pixels are robot",
+            fields={
+                "held_out": lambda text: split_cameras(text)[0],
+                "held_out_cameras": lambda text: split_cameras(text)[1],
+            },
         ),
         option("--no-report", "draw no pictures"),
         option("--update FIELD", "bake anew only what changed since that field folder was baked", Path),
@@ -140,7 +196,12 @@ SDF_BAKE = (
 )
 QUERY = (
     option("SOURCE", "a folder that sdf-bake or reconstruct wrote, a field.npz, or a file of round splats", Path),
-    option("POINTS", "CSV file with columns x,y,z [m] in the world, with or without a header; - for stdin", Path),
+    option(
+        "POINTS",
+        "CSV file with columns x,y,z [m] in the world, with or without a header; - for stdin",
+        Path,
+        fields={"points": lambda path: sys.stdin if str(path) == "-" else path},
+    ),
     *output("CSV file of the answers, in the order of the points", default="stdout, with --json none"),
     option("--scene SCENE", "what SOURCE, a field, was baked from: adds what a grid does not know", Path),
     option("--at SECONDS", "of a scene: as known that long after its start", real(-MAX_SECONDS, MAX_SECONDS, "s")),
@@ -149,6 +210,7 @@ QUERY = (
         "of a scene: labels that count in addition to object: robot, human, or none",
         str,
         "human",
+        fields=AS_LABELS,
     ),
     CONFIG_FILE,
     *settings(", such as field.distance=hard"),
@@ -191,6 +253,7 @@ SCORE = (
             "render each view from the newest snapshot by then, or all from the final splats",
             ("newest", "final"),
             "newest",
+            fields={"newest": lambda word: word == "newest"},
         ),
         option("--allow-training", "also score cameras that trained the scene"),
         option("--allow-other-recording", "continue although this is not the recording that made the scene"),

@@ -2,12 +2,11 @@
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.reconstruct import recording_of
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.score_report import PREFIX
 from splatctrl_cli.evaluate.verdict import counted
 from splatctrl_cli.jobs.score.score import ScoreRequest, score
@@ -40,22 +39,20 @@ FORMS = {  # by the start of a figure's name: factor and format
 
 def run(args: argparse.Namespace, console: Console) -> int:
     first, *beside = args.reference or [None]
-    request = request_of(
-        ScoreRequest,
-        args,
-        recording=replace(recording_of(args, first, args.masks), beside=tuple(beside)),
-        newest=args.snapshots == "newest",
-        cloud=_cloud(args),
-    )
-    result = score(request, console)
+    recording = recording_of(args, first, tuple(beside))
+    result = score(request_of(ScoreRequest, args, recording=recording, cloud=_cloud(args)), console)
     return console.concluded(result.verdict, result.report, lines_of(result.report))
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
     if args.cloud is None:
         for name in ("unit", "masks"):
-            if getattr(args, f"cloud_{name}") is not None:
-                raise UsageError(f"--cloud-{name}: only with --cloud", remedy="leave it out")
+            refuse_if(
+                getattr(args, f"cloud_{name}") is not None,
+                f"--cloud-{name}: only with --cloud",
+                remedy="leave it out",
+                error=UsageError,
+            )
         return None
     if args.dtu is None and (args.cloud_masks is not None or args.cloud.is_dir()):
         what = "--cloud-masks" if args.cloud_masks is not None else f"--cloud {args.cloud}"
@@ -147,7 +144,6 @@ def _cells(columns: Sequence[str], metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _cell(name: str, value: float | None, *, is_change: bool = False) -> str:
-    """A figure in its column's unit; changes have a sign."""
     if value is None:
         return "-"
     factor, form = next((of for start, of in FORMS.items() if name.startswith(start)), (1.0, ".4f"))

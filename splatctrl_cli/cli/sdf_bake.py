@@ -2,19 +2,14 @@
 
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.cli.common import Console, format_cell, names_of, request_of, table
-from splatctrl_cli.config import fixed, load_config
-from splatctrl_cli.formats.grid.grid_format import CHANNELS
-from splatctrl_cli.formats.grid.grid_formats import FORMATS
+from splatctrl_cli.config import fixed
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
-from splatctrl_cli.records import Box, Label
+from splatctrl_cli.records import Label
 
-SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options
 ERRORS = ("mean", "rmse", "over_95", "over_max")
 Band = Mapping[str, Any]
 """Errors in a band of true distance, as in ``field.json``."""
@@ -23,34 +18,10 @@ COLUMNS = ("count", "mean mm", "rmse mm", "95 % mm", "max mm")
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    config = load_config(args.config, args.set)
-    given = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
-    log, cameras = (None, ()) if args.held_out is None else split_cameras(args.held_out)
-    request = request_of(
-        BakeRequest,
-        args,
-        out=args.out or Path("field"),
-        config=replace(config, field=replace(config.field, **given)),
-        formats=names_of(args.formats, FORMATS, "--formats"),
-        labels=labels_of(args.include),
-        box=None if args.box is None else Box.from_text(args.box),
-        channels=None if args.channels is None else names_of(args.channels, CHANNELS, "--channels"),
-        with_probability=args.probability is not None,
-        held_out=log,
-        held_out_cameras=cameras,
-    )
-    result = bake(request, console)
+    result = bake(request_of(BakeRequest, args), console)
     console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
     found = {**result.summary, **({"accuracy": result.accuracy} if result.accuracy else {})}
     return console.concluded(result.verdict, found, _lines(result))
-
-
-def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
-    """Log and cameras of ``LOG:camera,...``; none means all that did not train."""
-    path, colon, cameras = text.rpartition(":")
-    if not colon or Path(text).exists():
-        return Path(text), ()
-    return Path(path), tuple(name.strip() for name in cameras.split(",") if name.strip())
 
 
 def _lines(result: BakeResult) -> Iterator[str]:
@@ -125,5 +96,5 @@ def _errors(band: Band, figures: Sequence[str] = ERRORS) -> list[object]:
 
 def labels_of(text: str) -> frozenset[Label]:
     """Labels in a field: objects and those of ``--include``. Raises UsageError for others."""
-    names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
+    names = () if text.strip() == "none" else names_of("--include", ("robot", "human"), text)
     return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})

@@ -1,7 +1,7 @@
 """Fixed numbers of the method, which are deliberately no settings.
 
-Each was measured, or follows from the method or a comparison; another would make runs incomparable. A unit in
-brackets precedes the meaning; others are shares, factors or counts.
+Each was measured, or follows from the method; another would make runs incomparable. A unit in brackets precedes the
+meaning; others are shares, factors or counts.
 """
 
 # Reading a recording: poses, joint states and clocks

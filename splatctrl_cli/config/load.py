@@ -20,7 +20,7 @@ from splatctrl_cli.config.sections import (
     SceneConfig,
     VerdictConfig,
 )
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,18 +102,23 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
         yield from ((f"--preset {name}", section, values) for section, values in PRESETS[name].items())
     for section, values in ({} if path is None else _read_toml(path)).items():
         _check_known(section, [field.name for field in fields(Config)], str(path), "")
-        if not isinstance(values, dict):
-            raise UsageError(f"{path}: {section}: expected a table, got {format_value(values)}")
+        refuse_if(
+            not isinstance(values, dict),
+            f"{path}: {section}: expected a table, got {format_value(values)}",
+            error=UsageError,
+        )
         yield str(path), section, values
     for assignment in assignments:
         if assignment.partition("=")[0].strip() == "preset":
             continue
         key, separator, text = assignment.partition("=")
         section, dot, name = key.strip().partition(".")
-        if not separator or not dot:
-            raise UsageError(
-                f"--set {assignment}: expected section.key=value", remedy="write it like --set scene.max_splats=3000"
-            )
+        refuse_if(
+            not separator or not dot,
+            f"--set {assignment}: expected section.key=value",
+            remedy="write it like --set scene.max_splats=3000",
+            error=UsageError,
+        )
         where = f"--set {shorten(assignment)}"
         _check_known(section, [field.name for field in fields(Config)], where, "")
         yield where, section, {name: _parse_value(text.strip())}
@@ -128,10 +133,13 @@ def _convert(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]
     for key, value in values.items():
         _check_known(key, declared, where, f"{section}.")
         typed[key] = _has_type(value, hints[key])
-        if type(typed[key]) not in [get_origin(option) or option for option in _options(hints[key])]:
-            expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
-            expected += declared[key].expected
-            raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {format_value(value)}")
+        kinds = [get_origin(option) or option for option in _options(hints[key])]
+        expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
+        refuse_if(
+            type(typed[key]) not in kinds,
+            f"{where}: {section}.{key}: expected {expected}{declared[key].expected}, got {format_value(value)}",
+            error=UsageError,
+        )
     return typed
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 
 MOST_SHOWN = 60  # characters of a refused value
 MAX_PLACE = 1e6  # [m] of a place from the world's origin
@@ -103,10 +103,12 @@ def _declare(hint: Any) -> Declared:
 
 def check(holds: bool, name: str, expected: str, value: object) -> None:
     """Raise UsageError with key, expectation and value, unless `holds`."""
-    if not holds:
-        raise UsageError(
-            f"{name}: expected {expected}, got {format_value(value)}", remedy="see splatctrl config --template"
-        )
+    refuse_if(
+        not holds,
+        f"{name}: expected {expected}, got {format_value(value)}",
+        remedy="see splatctrl config --template",
+        error=UsageError,
+    )
 
 
 def format_value(value: object) -> str:
@@ -123,11 +125,16 @@ def shorten(text: str) -> str:
 
 def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
     """Return the pose `POSE` unchanged. Raises ValueError for a wrong length or quaternion norm."""
-    if len(values) != 7:
-        raise ValueError(f"expected 7 numbers {POSE}, got {len(values)}")
-    if not all(math.isfinite(value) for value in values):
-        raise ValueError(f"expected finite numbers, got {','.join(map(str, values))}")
+    refuse_if(len(values) != 7, f"expected 7 numbers {POSE}, got {len(values)}", error=ValueError)
+    refuse_if(
+        not all(math.isfinite(value) for value in values),
+        f"expected finite numbers, got {','.join(map(str, values))}",
+        error=ValueError,
+    )
     length = math.hypot(*values[3:])
-    if abs(length - 1.0) > 0.01:
-        raise ValueError(f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}")
+    refuse_if(
+        abs(length - 1.0) > 0.01,
+        f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}",
+        error=ValueError,
+    )
     return tuple(values)

@@ -15,7 +15,7 @@ from splatctrl_cli.calibration.evidence import Arm, Estimate, Evidence, evidence
 from splatctrl_cli.calibration.solution import Solution, solved
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.jobs.check import pose_robot
@@ -95,8 +95,12 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
     cameras stay undetermined.
     """
     out = request.out or Path("calibration.toml")
-    if request.options.calibration is not None:
-        raise UsageError("--calibration: what is calibrated is the recording as it is", remedy="leave it out")
+    refuse_if(
+        request.options.calibration is not None,
+        "--calibration: what is calibrated is the recording as it is",
+        remedy="leave it out",
+        error=UsageError,
+    )
     model = pose_robot(request.paths, request.urdf, request)
     source = open_session(request.paths, request.options)
     arm = None if model is None else _arm(model, source)
@@ -104,13 +108,15 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
         frames, sightings = _frames(source, request.board, progress)
         if arm is not None:
             travel = arm.travel(sorted({frame.stamp_ns for frame in frames}))
-            if travel < fixed.CALIBRATION_TRAVEL:  # any wrong model explains a single posture
-                raise NotEvaluableError(
-                    f"calibrate: the robot hardly moves: {1e3 * travel:.0f} mm at most (expected"
-                    f" {1e3 * fixed.CALIBRATION_TRAVEL:.0f})",
-                    remedy="record it moving through the space that the cameras see, or leave --urdf out to place the"
-                    " cameras against each other",
-                )
+            # any wrong model explains a single posture
+            refuse_if(
+                travel < fixed.CALIBRATION_TRAVEL,
+                f"calibrate: the robot hardly moves: {1e3 * travel:.0f} mm at most (expected"
+                f" {1e3 * fixed.CALIBRATION_TRAVEL:.0f})",
+                remedy="record it moving through the space that the cameras see, or leave --urdf out to place the"
+                " cameras against each other",
+                error=NotEvaluableError,
+            )
         cameras, moving = sorted({frame.camera for frame in frames}), moving_cameras(frames)
         held = _held(request, cameras, has_anchor=arm is not None or bool(moving))
         begin = {camera: np.eye(4) for camera in cameras}
@@ -146,16 +152,16 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
 
 
 def _arm(model: RobotModel, source: FrameSource) -> Arm:
-    if not len(source.states):
-        raise InputError(
-            f"{source.name}: --urdf: expected joint states, got none",
-            remedy="record /joint_states, or leave --urdf out to place the cameras against each other",
-        )
-    if len(model.surface.vague) == len(model.surface.links):
-        raise InputError(
-            f"{model.urdf.path}: expected collision geometry, got spheres alone, which enclose the surface",
-            remedy="give the URDF with its meshes (--packages DIR where they are in packages)",
-        )
+    refuse_if(
+        not len(source.states),
+        f"{source.name}: --urdf: expected joint states, got none",
+        remedy="record /joint_states, or leave --urdf out to place the cameras against each other",
+    )
+    refuse_if(
+        len(model.surface.vague) == len(model.surface.links),
+        f"{model.urdf.path}: expected collision geometry, got spheres alone, which enclose the surface",
+        remedy="give the URDF with its meshes (--packages DIR where they are in packages)",
+    )
     states = source.states.of_log(*model.joint_columns(source.joint_names))
     return Arm(model, states.postures(fixed.STATES_CLOSE_NS))
 
@@ -186,8 +192,7 @@ def stamps_by_camera(source: FrameSource) -> dict[str, list[int]]:
     stamps: dict[str, list[int]] = {}
     for stamp, camera, _ in source.poses():
         stamps.setdefault(camera, []).append(stamp)
-    if not stamps:
-        raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
+    refuse_if(not stamps, f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
     return stamps
 
 
@@ -232,17 +237,22 @@ def depth_frame(stored: StoredFrame) -> RgbdFrame:
 
 def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
     """Fixed cameras: of --hold; else none with a robot or moving camera; else the first."""
-    if request.hold is not None and request.hold not in cameras:
-        raise UsageError(f"--hold {request.hold}: no such camera", remedy=f"use one of: {', '.join(cameras)}")
+    refuse_if(
+        request.hold is not None and request.hold not in cameras,
+        f"--hold {request.hold}: no such camera",
+        remedy=f"use one of: {', '.join(cameras)}",
+        error=UsageError,
+    )
     if request.hold is not None:
         return (request.hold,)
     if has_anchor:
         return ()
-    if len(cameras) < 2:
-        raise NotEvaluableError(
-            f"calibrate: one camera that stands still, {cameras[0]}, and no robot to place it against",
-            remedy="give --urdf of a robot that it sees, or a recording of several cameras",
-        )
+    refuse_if(
+        len(cameras) < 2,
+        f"calibrate: one camera that stands still, {cameras[0]}, and no robot to place it against",
+        remedy="give --urdf of a robot that it sees, or a recording of several cameras",
+        error=NotEvaluableError,
+    )
     return (cameras[0],)
 
 

@@ -9,7 +9,7 @@ from splatctrl_cli.checks.check_folder import check_folder
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity, error, note, warning
 from splatctrl_cli.checks.limits import VIEWS_RANGE
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.jobs.robot.logged_robot import TAKE, RobotOptions, differs, logged_urdf
 from splatctrl_cli.recording.source import open_logs
@@ -45,8 +45,11 @@ def check(request: CheckRequest) -> tuple[CheckReport, Verdict]:
 
     Raises UsageError for contradictory options, InputError for an unreadable recording.
     """
-    if request.num_images is not None and request.num_images < 1:
-        raise UsageError(f"--quick {request.num_images}: expected 1 or more")
+    refuse_if(
+        request.num_images is not None and request.num_images < 1,
+        f"--quick {request.num_images}: expected 1 or more",
+        error=UsageError,
+    )
     model = pose_robot(request.paths, request.urdf, request)
     other = "" if request.urdf is None or model is None else differs(model.urdf, request.paths)
     report = _report(request, model)
@@ -87,8 +90,7 @@ def pose_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) 
         file = logged_urdf(paths)
     if file is None:
         for name, option in (("spheres", "spheres"), ("base", "base"), ("locked", "lock"), ("packages", "packages")):
-            if getattr(options, name):
-                raise UsageError(f"--{option}: expected --urdf beside it")
+            refuse_if(getattr(options, name), f"--{option}: expected --urdf beside it", error=UsageError)
         return None
     return options.posed(file, own_spheres(file))
 

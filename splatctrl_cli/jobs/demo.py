@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.evaluate.views import psnr
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
@@ -19,7 +19,8 @@ from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.score.views import render_with_shell
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import JointState, RgbdFrame
-from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
+from splatctrl_cli.report.field_pictures import field_slice_picture
+from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture
 from splatctrl_cli.robot.model import RobotModel
 
 TRAINED, SCORED = "--cameras cam0,cam1,cam2", "cam3"
@@ -72,7 +73,17 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
     stopwatch, out = Stopwatch(), request.out
     recorded = request.data or (SAMPLE if SAMPLE.is_dir() else None)
     if recorded is not None:
-        _refuse_unusable(recorded, out)
+        refuse_if(
+            missing := [name for name in INPUTS if not (recorded / name).is_file()],
+            f"{recorded}: has no {', '.join(missing)}",
+            remedy="make a recording with 'splatctrl simulate -o DIR'",
+        )
+        refuse_if(
+            out.resolve() == recorded.resolve(),
+            f"{out}: is the input folder",
+            remedy="give another --out",
+            error=UsageError,
+        )
     with output_path(out, force=request.force, is_folder=True) as folder:
         data = recorded or folder / "recording"
         simulated = {} if recorded else {"simulate -o {data}": "done"}  # the same scene, with the arm of primitives
@@ -84,7 +95,15 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
                 progress.log(f"\n$ splatctrl {shlex.join(shown)}")
                 with _record_label(shown):
                     label = perform(words, folder)
-                reasons.append(_reason(words, expected, label))
+                mode = " --mode closed-loop" if "closed-loop" in words else ""
+                reasons.append(
+                    Reason(
+                        criterion=words[0] + mode,
+                        outcome=Outcome.PASSED if label in expected.split(" or ") else Outcome.FAILED,
+                        sentence=f"expected '{expected}', got '{label}'",
+                        label="not as expected",
+                    )
+                )
                 progress.log(f"demo: {reasons[-1]}")
         with stopwatch.stage("pictures"):
             _draw(data, folder, request.threads)
@@ -101,28 +120,8 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
     return verdict
 
 
-def _refuse_unusable(data: Path, out: Path) -> None:
-    if missing := [name for name in INPUTS if not (data / name).is_file()]:
-        raise InputError(
-            f"{data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
-        )
-    if out.resolve() == data.resolve():
-        raise UsageError(f"{out}: is the input folder", remedy="give another --out")
-
-
-def _reason(words: Sequence[str], expected: str, label: str) -> Reason:
-    mode = " --mode closed-loop" if "closed-loop" in words else ""
-    return Reason(
-        criterion=words[0] + mode,
-        outcome=Outcome.PASSED if label in expected.split(" or ") else Outcome.FAILED,
-        sentence=f"expected '{expected}', got '{label}'",
-        label="not as expected",
-    )
-
-
 @contextmanager
 def _record_label(words: Sequence[str]) -> Iterator[None]:
-    """Set the arguments that run.json records."""
     arguments = sys.argv
     sys.argv = [arguments[0], *words]
     try:

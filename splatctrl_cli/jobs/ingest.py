@@ -1,14 +1,13 @@
 """Conversion of recordings into capture folders."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import advise_resumption, check_same_run
@@ -17,6 +16,8 @@ from splatctrl_cli.recording.capture.capture_writer import JOURNAL, read_identit
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.recording.source import logged_descriptions, open_session
 from splatctrl_cli.recording.source_options import SourceOptions
+
+DECIDING_PACKAGES = ("numpy", "opencv-python-headless")  # whose versions may change a byte of a capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,9 +44,12 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
     with stopwatch.stage("survey"):
         source = open_session(request.paths, options)
         topics = source.joint_topics if isinstance(source, LOGGED) else None
-    if set(source.cameras) == {HOLDOUT}:
-        given = ",".join(options.cameras or ())
-        raise UsageError(f"--cameras {given}: leaves no camera to train with", remedy="name another, or leave it out")
+    refuse_if(
+        set(source.cameras) == {HOLDOUT},
+        f"--cameras {','.join(options.cameras or ())}: leaves no camera to train with",
+        remedy="name another, or leave it out",
+        error=UsageError,
+    )
     robots = logged_descriptions(request.paths)
     if len(robots) > 1:
         said = ", ".join(where for _, where, _ in robots)
@@ -53,7 +57,9 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
             f"warning: {len(robots)} robots are described, by {said}: none is kept; give --urdf to each command"
         )
     progress.log(f"{source.name}: cameras {', '.join(source.cameras)}; {len(source.joint_names)} joints")
-    identity = _identity(options, source.digests())
+    inputs = dict(source.digests())
+    versions = {"splatctrl": __version__, **{name: metadata.version(name) for name in DECIDING_PACKAGES}}
+    identity = json.loads(json.dumps({**versions, "options": asdict(options), "sha256": inputs}, default=str))
     journal = partial_path(out) / JOURNAL
     with (
         advise_resumption(journal, journal.parent),
@@ -76,18 +82,8 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
             partial,
             command="ingest",
             config=asdict(options),
-            inputs=source.digests(),
+            inputs=inputs,
             metrics=metrics,
             stopwatch=stopwatch,
         )
     return out, metrics
-
-
-def _identity(options: SourceOptions, inputs: Mapping[str, str]) -> dict[str, Any]:
-    versions = {name: metadata.version(name) for name in ("numpy", "opencv-python-headless")}
-    plain: dict[str, Any] = json.loads(
-        json.dumps(
-            {"splatctrl": __version__, **versions, "options": asdict(options), "sha256": dict(inputs)}, default=str
-        )
-    )
-    return plain

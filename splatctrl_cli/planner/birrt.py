@@ -12,7 +12,7 @@ import numpy as np
 
 from splatctrl_cli.config import PlannerConfig, fixed
 from splatctrl_cli.control.preconditions import checked_posture
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
 from splatctrl_cli.records import Float64, Index
 
@@ -187,18 +187,19 @@ def check_postures(clearance: Clearance, start: Float64, goals: Float64, config:
     for name, q in zip(names, rows, strict=True):
         outside = np.maximum(q - model.upper, model.lower - q)
         joint = int(np.argmax(outside))
-        if outside[joint] > config.limit_tolerance:
-            raise InputError(
-                f"{name}: joint {model.joint_names[joint]}: expected within [{model.lower[joint]:.4f}, "
-                f"{model.upper[joint]:.4f}] rad, got {q[joint]:.4f}",
-                remedy="give a posture within the limits, or check that the URDF is of this robot",
-            )
+        refuse_if(
+            outside[joint] > config.limit_tolerance,
+            f"{name}: joint {model.joint_names[joint]}: expected within [{model.lower[joint]:.4f}, "
+            f"{model.upper[joint]:.4f}] rad, got {q[joint]:.4f}",
+            remedy="give a posture within the limits, or check that the URDF is of this robot",
+        )
         row, distance = clearance.worst(q)
-        if distance < config.contact:
-            raise NotEvaluableError(
-                f"{name}: expected a posture {config.contact:g} m clear of its margin, got {row} at {distance:.4f} m",
-                remedy="give another posture or a smaller margin, or check the scene and --base",
-            )
+        refuse_if(
+            distance < config.contact,
+            f"{name}: expected a posture {config.contact:g} m clear of its margin, got {row} at {distance:.4f} m",
+            remedy="give another posture or a smaller margin, or check the scene and --base",
+            error=NotEvaluableError,
+        )
     return np.array(rows)
 
 
@@ -246,9 +247,10 @@ def _skip_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) 
 
 
 def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float64:
-    places = np.sort(_places(path, random.random((num, 2))), axis=1)
+    along, numbers = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))], np.arange(len(path))
+    places = np.sort(np.interp(random.random((num, 2)) * along[-1], along, numbers), axis=1)
     places = places[np.floor(places[:, 0]) < np.floor(places[:, 1])]
-    way = np.interp(places, np.arange(len(path)), _lengths(path))
+    way = np.interp(places, numbers, along)
     saved = way[:, 1] - way[:, 0] - np.linalg.norm(_points(path, places[:, 1]) - _points(path, places[:, 0]), axis=1)
     order = np.argsort(-saved, kind="stable")
     return np.asarray(places[order[saved[order] > fixed.SHORTCUT_WORTH]])
@@ -260,15 +262,6 @@ def _cut(path: Float64, cut: Float64) -> Float64:
     cut_path = rows[np.r_[True, np.linalg.norm(np.diff(rows, axis=0), axis=1) > 1e-12]]
     cut_path[-1] = path[-1]
     return cut_path
-
-
-def _lengths(path: Float64) -> Float64:
-    return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-
-
-def _places(path: Float64, share: Float64) -> Float64:
-    along = _lengths(path)
-    return np.asarray(np.interp(share * along[-1], along, np.arange(len(path))))
 
 
 def _points(path: Float64, places: Float64) -> Float64:

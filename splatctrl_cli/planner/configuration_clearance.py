@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from splatctrl_cli.config.fixed import SHORTEST_EDGE, STILL_ROW
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.kernels.chain import EdgeRoom
 from splatctrl_cli.kernels.points import solid_distance
@@ -63,8 +63,7 @@ class Solids:
 
     def __post_init__(self) -> None:
         for index, solid in enumerate(self.solids):
-            if not min(_sizes(solid)) > 0:
-                raise InputError(f"solid {index}: expected sizes above 0 m, got {_sizes(solid)}")
+            refuse_if(not min(_sizes(solid)) > 0, f"solid {index}: expected sizes above 0 m, got {_sizes(solid)}")
         object.__setattr__(self, "_packed", np.array([_packed(solid) for solid in self.solids]).reshape(-1, 16))
 
     def rows(self) -> tuple[Float64, Float64, Float64]:
@@ -159,8 +158,7 @@ class Clearance:
         InputError if no sphere moves.
         """
         moving = np.flatnonzero(model.moving_spheres)
-        if not len(moving):
-            raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
+        refuse_if(not len(moving), "robot: no collision sphere moves with a joint", remedy="check --spheres")
         levers, pairs = model.lever_arms(), np.asarray(model.self_pairs()).reshape(-1, 2)
         names, radii = sphere_names(model.sphere_set), np.asarray(model.sphere_set.radii, dtype=np.float64)
         own = radii[pairs].sum(axis=1) + self_margin - model.self_allowance

@@ -14,7 +14,7 @@ from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import Detour, PlanDetour, TimedPath, pose_error
 from splatctrl_cli.control.replay import ReplayTask
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.planner.birrt import Plan, PlanOutcome, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, check_edges
 from splatctrl_cli.records import Float64
@@ -55,10 +55,11 @@ def time_path(
     max_rate (W - 1,): limits edge shares per second. Raises InputError for fewer than two waypoints or limits not
     above zero.
     """
-    if len(waypoints) < 2:
-        raise InputError(f"path: expected at least 2 waypoints, got {len(waypoints)}")
-    if not (np.min(velocity_limit) > 0 and max_acceleration > 0):
-        raise InputError("path: expected velocity and acceleration limits above 0")
+    refuse_if(len(waypoints) < 2, f"path: expected at least 2 waypoints, got {len(waypoints)}")
+    refuse_if(
+        not (np.min(velocity_limit) > 0 and max_acceleration > 0),
+        "path: expected velocity and acceleration limits above 0",
+    )
     motion = np.abs(np.diff(waypoints, axis=0))
     is_long = np.max(motion, axis=1) > 0
     motion, is_new = motion[is_long], np.r_[True, is_long]

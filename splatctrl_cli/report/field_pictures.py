@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import Bool, DistanceGrid, Float64
 from splatctrl_cli.report.pictures import (
     CONTOURS,
     CURVE_COLORS,
     INK,
+    SPHERE_EDGE,
+    SPHERE_FILL,
     WIDTH,
     draw_distance,
     draw_never_seen,
@@ -62,6 +64,66 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
                 draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
         figure.colorbar(image, ax=[axes for axes, _ in panels], extend="both", label="distance [cm]", pad=0.01)
         figure.suptitle(f"Distance in world: {field}; lines at {lines} cm{never}", fontsize=12)
+
+
+def field_slice_picture(
+    path: Path,
+    grid: DistanceGrid,
+    axis: int,
+    value: float,
+    spheres: tuple[Float64, Float64] | None = None,
+    title: str = "",
+) -> None:
+    """Write the slice of `sdf` across `axis` (0, 1, 2) nearest to `value` [m].
+
+    Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
+    as circles. Raises NotEvaluableError outside the grid.
+    """
+    first, num = float(grid.origin[axis]), grid.channels["sdf"].shape[axis]
+    last = first + grid.voxel * (num - 1)
+    refuse_if(
+        not 0 <= round((value - first) / grid.voxel) < num,
+        f"{path}: slice {'xyz'[axis]} = {value:g} m: expected {first:.3f} to {last:.3f} m",
+        error=NotEvaluableError,
+    )
+    (cut,) = _cuts(grid, [value] * 3, axes=(axis,))
+    sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]
+    height = float(np.clip((WIDTH - 2.6) * sides[1] / sides[0] + 1.5, 4.5, 12.0))
+    with drawn_figure(path, height) as figure:
+        axes = figure.subplots()
+        image = draw_distance(axes, cut.coordinates, cut.of(grid, "sdf"), cut.voxel)
+        figure.colorbar(image, ax=axes, extend="both", label="distance [cm]", fraction=0.05, pad=0.02)
+        if "observed" in grid.channels:
+            draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
+        if spheres is not None:
+            _draw_cut_spheres(axes, spheres, cut)
+        _explain(axes, has_spheres=spheres is not None, has_observed="observed" in grid.channels)
+        _label(axes, cut)
+        axes.set_title(f"{title or 'Distance field'}   {'xyz'[axis]} = {cut.plane:.2f} m", pad=12)
+
+
+def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
+    entries = []
+    if has_spheres:
+        entries.append(
+            mpl.patches.Patch(facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, label="robot spheres, cut by the plane")
+        )
+    if has_observed:
+        entries.append(mpl.patches.Patch(facecolor="#eeeeee", edgecolor="#a8a8a8", hatch="////", label="never seen"))
+    if entries:
+        axes.legend(handles=entries, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2)
+
+
+def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], cut: Cut) -> None:
+    centers, radii = spheres
+    first, second = (other for other in range(3) if other != cut.axis)
+    squared = np.square(radii) - np.square(centers[:, cut.axis] - cut.plane)
+    for center, radius in zip(centers[squared > 0], np.sqrt(squared[squared > 0]), strict=True):
+        axes.add_patch(
+            mpl.patches.Circle(
+                (center[first], center[second]), radius, facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, linewidth=1.2
+            )
+        )
 
 
 def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
@@ -135,7 +197,6 @@ def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> No
 def _panels(
     path: Path, grid: DistanceGrid, point: Sequence[float]
 ) -> Iterator[tuple["mpl.figure.Figure", list[tuple[Any, Cut]]]]:
-    """Axes for slices across z, y and x, at one scale."""
     cuts = _cuts(grid, point, axes=(2, 1, 0))
     sides = np.array([[float(np.ptp(c)) + cut.voxel for c in cut.coordinates] for cut in cuts])
     height = float(np.clip((WIDTH - 3.2) * sides[:, 1].max() / sides[:, 0].sum() + 1.5, 3.2, 9.0))
@@ -174,7 +235,6 @@ def _label(axes: Any, cut: Cut) -> None:
 
 
 def _knows_seen(grid: DistanceGrid) -> bool:
-    """True with an occupancy grid."""
     return "observed" in grid.channels and "no occupancy" not in str(grid.header.get("observed"))
 
 
@@ -204,8 +264,7 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
 
     Raises NotEvaluableError without points, UsageError for a probability outside [0, 1].
     """
-    if not len(probability):
-        raise NotEvaluableError("reliability: expected at least one point, got none")
+    refuse_if(not len(probability), "reliability: expected at least one point, got none", error=NotEvaluableError)
     if not ((probability >= 0) & (probability <= 1)).all():
         i = int(np.argmin((probability >= 0) & (probability <= 1)))
         raise UsageError(f"reliability: point {i}: expected a probability in [0, 1], got {probability[i]}")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 from xml.etree import ElementTree
 
-from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError
+from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError, refuse_if
 from splatctrl_cli.files.output import output_path
 
 
@@ -108,14 +108,6 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
     )
 
 
-def skipped_case(group: str, why: str) -> Case:
-    return Case(name="skipped", group=group, kind=Kind.SKIPPED, sentence=why, text=why)
-
-
-def notes_of(verdict: Mapping[str, Any]) -> list[str]:
-    return [verdict["sentence"], *verdict["notes"]]
-
-
 def worst_first(suites: Iterable[Suite]) -> list[tuple[Suite, Case]]:
     """Cases not passed, with suites: failed, error, not evaluable, skipped."""
     found = [(suite, case) for suite in suites for case in suite.cases if case.kind is not Kind.PASSED]
@@ -176,8 +168,12 @@ def check_replaceable(path: Path) -> None:
         return  # `output_path` says what is wrong with the others
     except OSError as error:
         raise UsageError(f"{path}: cannot be replaced: {error.strerror}", remedy="give another --junit") from None
-    if start not in (b"", HEAD.encode()):
-        raise UsageError(f"{path}: exists, and is no JUnit report of splatctrl", remedy="give another --junit")
+    refuse_if(
+        start not in (b"", HEAD.encode()),
+        f"{path}: exists, and is no JUnit report of splatctrl",
+        remedy="give another --junit",
+        error=UsageError,
+    )
 
 
 def junit_text(suites: Sequence[Suite]) -> str:
@@ -299,7 +295,6 @@ def summary(suites: Sequence[Suite], room: int) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text in one line, escaped for Markdown."""
     escaped = "".join(f"&#{ord(mark)};" if mark in "&<>|`*_[]\\#~@" else mark for mark in text)
     return " ".join(escaped.split()).encode("utf-8", "backslashreplace").decode()
 
@@ -313,5 +308,4 @@ def _repository_path(path: str, environment: Mapping[str, str]) -> str:
 
 
 def _escape(text: str) -> str:
-    """Text escaped as in actions/toolkit."""
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_faults, require
 from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Float32, Float64, Label, SplatSet
@@ -134,13 +134,16 @@ STEPS = 65535  # of a number of 16 bits
 
 def three_js() -> str:
     """The source of three.js, deflated, base64. Raises UsageError if trimesh has none."""
-    try:
+    with refuse_faults(
+        "three.js: not found in trimesh",
+        *(OSError, KeyError, ValueError),
+        remedy="pip install 'trimesh>=4.4,<6'",
+        error=UsageError,
+    ):
         archive = trimesh.util.decompress(trimesh.resources.get_bytes("templates/viewer.zip"), file_type="zip")
         page = archive["viewer.html.template"].read().decode("utf-8")
         # three.js ends where trimesh's own script begins
         script = page[page.index("<script>") + len("<script>") : page.index("var camera,controls")]
-    except (OSError, KeyError, ValueError) as error:
-        raise UsageError(f"three.js: not found in trimesh: {error}", remedy="pip install 'trimesh>=4.4,<6'") from None
     return _deflate(script.encode("utf-8"))
 
 
@@ -308,9 +311,11 @@ def render_page(page: Page) -> str:
 
 def picture(path: Path, title: str, most: int) -> Picture:
     """An image file as JPEG, at most `most` [px] wide. Raises InputError if undecodable."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise InputError(f"{path}: is no image that can be decoded", remedy="make the run again")
+    image = require(
+        cv2.imread(str(path), cv2.IMREAD_COLOR),
+        f"{path}: is no image that can be decoded",
+        remedy="make the run again",
+    )
     height, width = image.shape[:2]
     if width > most:
         height, width = round(height * most / width), most

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.libraries import mpl
-from splatctrl_cli.records import Bool, DistanceGrid, Float32, Float64, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, UInt8
 from splatctrl_cli.robot.coverage import areas, refine_triangles
-from splatctrl_cli.voxels import VoxelState
 
 WIDTH = 12.0  # inches; at DPI 100 the width is 1200 pixels
 DPI = 100
@@ -58,8 +57,7 @@ class ComparisonRow:
 
 def comparison_picture(path: Path, rows: Sequence[ComparisonRow]) -> None:
     """Write photo | render | depth error [cm], one row per view."""
-    if not rows:
-        raise NotEvaluableError(f"{path}: no view to draw: expected at least one, got 0")
+    refuse_if(not rows, f"{path}: no view to draw: expected at least one, got 0", error=NotEvaluableError)
     height, width = rows[0].photo.shape[:2]
     row_height = (WIDTH - 1.2) / 3 * height / width + 0.42
     with drawn_figure(path, len(rows) * row_height + 0.15) as figure:
@@ -68,46 +66,6 @@ def comparison_picture(path: Path, rows: Sequence[ComparisonRow]) -> None:
         )
         for row, axes in zip(rows, grid, strict=True):
             _draw_comparison(figure, axes, row)
-
-
-def field_slice_picture(
-    path: Path,
-    grid: DistanceGrid,
-    axis: int,
-    value: float,
-    spheres: tuple[Float64, Float64] | None = None,
-    title: str = "",
-) -> None:
-    """Write the slice of `sdf` across `axis` (0, 1, 2) nearest to `value` [m].
-
-    Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
-    as circles. Raises NotEvaluableError outside the grid.
-    """
-    index = round((value - grid.origin[axis]) / grid.voxel)
-    count = grid.channels["sdf"].shape[axis]
-    if not 0 <= index < count:
-        last = grid.origin[axis] + grid.voxel * (count - 1)
-        raise NotEvaluableError(
-            f"{path}: slice {'xyz'[axis]} = {value:g} m: expected {grid.origin[axis]:.3f} to {last:.3f} m"
-        )
-    first, second = (other for other in range(3) if other != axis)
-    plane = float(grid.origin[axis] + grid.voxel * index)
-    distance = np.take(grid.channels["sdf"], index, axis=axis).astype(np.float64).T
-    coordinates = [grid.origin[i] + grid.voxel * np.arange(grid.channels["sdf"].shape[i]) for i in (first, second)]
-    spans = [float(np.ptp(c)) + grid.voxel for c in coordinates]
-    height = float(np.clip((WIDTH - 2.6) * spans[1] / spans[0] + 1.5, 4.5, 12.0))
-    with drawn_figure(path, height) as figure:
-        axes = figure.subplots()
-        image = draw_distance(axes, coordinates, distance, grid.voxel)
-        figure.colorbar(image, ax=axes, extend="both", label="distance [cm]", fraction=0.05, pad=0.02)
-        if "observed" in grid.channels:
-            never_seen = np.take(grid.channels["observed"], index, axis=axis).T == VoxelState.NEVER_SEEN
-            draw_never_seen(axes, coordinates, never_seen, grid.voxel)
-        if spheres is not None:
-            _draw_cut_spheres(axes, spheres, axis, plane)
-        _explain(axes, has_spheres=spheres is not None, has_observed="observed" in grid.channels)
-        axes.set(xlabel=f"{'xyz'[first]} [m]", ylabel=f"{'xyz'[second]} [m]", aspect="equal")
-        axes.set_title(f"{title or 'Distance field'}   {'xyz'[axis]} = {plane:.2f} m", pad=12)
 
 
 def span_of(seconds: Float64) -> tuple[float, float]:
@@ -192,30 +150,6 @@ def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArr
     axes.imshow(veil, origin="lower", extent=extent_of(coordinates, voxel), interpolation="nearest")
     if min(never_seen.shape) > 1:
         axes.contourf(*coordinates, never_seen.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
-
-
-def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
-    entries = []
-    if has_spheres:
-        entries.append(
-            mpl.patches.Patch(facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, label="robot spheres, cut by the plane")
-        )
-    if has_observed:
-        entries.append(mpl.patches.Patch(facecolor="#eeeeee", edgecolor="#a8a8a8", hatch="////", label="never seen"))
-    if entries:
-        axes.legend(handles=entries, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2)
-
-
-def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], axis: int, plane: float) -> None:
-    centers, radii = spheres
-    first, second = (other for other in range(3) if other != axis)
-    squared = np.square(radii) - np.square(centers[:, axis] - plane)
-    for center, cut in zip(centers[squared > 0], np.sqrt(squared[squared > 0]), strict=True):
-        axes.add_patch(
-            mpl.patches.Circle(
-                (center[first], center[second]), cut, facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, linewidth=1.2
-            )
-        )
 
 
 def extent_of(coordinates: Sequence[Float64], voxel: float) -> tuple[float, float, float, float]:

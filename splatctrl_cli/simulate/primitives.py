@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.geometry import interpolate_transform, invert_transform, pose_at, transform_points, turn_about_z
 from splatctrl_cli.records import Float64, Stamps
 
@@ -87,12 +87,11 @@ class Track:
     T_world_shape: Float64
 
     def __post_init__(self) -> None:
-        if len(self.stamp_ns) == 0 or len(self.stamp_ns) != len(self.T_world_shape):
-            raise InputError(
-                f"track: expected a pose for every stamp, got {len(self.T_world_shape)} for {len(self.stamp_ns)}"
-            )
-        if np.any(np.diff(self.stamp_ns) <= 0):
-            raise InputError("track: expected stamps that increase")
+        refuse_if(
+            len(self.stamp_ns) == 0 or len(self.stamp_ns) != len(self.T_world_shape),
+            f"track: expected a pose for every stamp, got {len(self.T_world_shape)} for {len(self.stamp_ns)}",
+        )
+        refuse_if(np.any(np.diff(self.stamp_ns) <= 0), "track: expected stamps that increase")
 
     def at(self, stamp_ns: int) -> Float64:
         """T_world_shape (4, 4) at a stamp."""

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, SphereSet, UInt8, by_stamp
 from splatctrl_cli.robot.model import RobotModel
@@ -73,8 +73,7 @@ class RecordingOptions:
             (self.seed >= 0, f"--seed: expected 0 or more, got {self.seed}"),
         )
         for is_kept, message in rules:
-            if not is_kept:
-                raise UsageError(message)
+            refuse_if(not is_kept, message, error=UsageError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +226,6 @@ class Recording:
 
 
 def _add_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> RobotModel:
-    """The robot with balls along the capsules on its links."""
     balls = [(link, c.radius, x) for link, c in parts for x in np.linspace(c.start, c.end, NUM_BALLS)]
     links, radii, centers = zip(*balls, strict=True)
     own = robot.sphere_set

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64, Intrinsics, Stamps
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture, Track, closest_point
@@ -118,43 +118,39 @@ def load_truth(path: Path) -> Truth:
     with refuse_faults(f"{path}: not valid JSON", ValueError):
         document = json.loads(read_text(path, "give a truth.json"))
     is_ours = isinstance(document, dict) and document.get("format") == FORMAT
-    if not is_ours or document.get("version") not in VERSIONS:
-        raise InputError(
-            f"{path}: expected {FORMAT} version {' or '.join(map(str, VERSIONS))}",
-            remedy="give the truth.json that simulate wrote",
-        )
-    try:
-        return _parse(path, document)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: damaged: {type(error).__name__}: {error}", remedy="write it anew with simulate"
-        ) from None
-
-
-def _parse(path: Path, document: dict[str, Any]) -> Truth:
-    robot, clearance = document["robot"], document["clearance"]
-    cameras = tuple(
-        Camera(
-            name=entry["name"],
-            intrinsics=Intrinsics(**entry["intrinsics"]),
-            T_world_camera=_pose(entry["T_world_camera"]),
-            is_training=entry["role"] == "training",
-        )
-        for entry in document["cameras"]
+    refuse_if(
+        not is_ours or document.get("version") not in VERSIONS,
+        f"{path}: expected {FORMAT} version {' or '.join(map(str, VERSIONS))}",
+        remedy="give the truth.json that simulate wrote",
     )
-    return Truth(
-        path=path,
-        primitives=tuple(_primitive(entry) for entry in document["primitives"]),
-        cameras=cameras,
-        luminance_std={entry["name"]: float(entry["luminance_std"]) for entry in document["cameras"]},
-        joint_names=tuple(robot["joint_names"]),
-        robot_urdf=path.parent / robot["urdf"],
-        robot_spheres=path.parent / robot["spheres"],
-        T_world_base=_pose(robot["T_world_base"]),
-        stamps=np.array(clearance["stamps"], dtype=np.int64),
-        clearance=np.array(clearance["distance"], dtype=np.float64),
-        unmodelled=tuple(robot.get("unmodelled", ())),
-    )
+    with refuse_faults(
+        lambda error: f"{path}: damaged: {type(error).__name__}: {error}",
+        *(KeyError, TypeError, ValueError),
+        remedy="write it anew with simulate",
+    ):
+        robot, clearance = document["robot"], document["clearance"]
+        cameras = tuple(
+            Camera(
+                name=entry["name"],
+                intrinsics=Intrinsics(**entry["intrinsics"]),
+                T_world_camera=_pose(entry["T_world_camera"]),
+                is_training=entry["role"] == "training",
+            )
+            for entry in document["cameras"]
+        )
+        return Truth(
+            path=path,
+            primitives=tuple(_primitive(entry) for entry in document["primitives"]),
+            cameras=cameras,
+            luminance_std={entry["name"]: float(entry["luminance_std"]) for entry in document["cameras"]},
+            joint_names=tuple(robot["joint_names"]),
+            robot_urdf=path.parent / robot["urdf"],
+            robot_spheres=path.parent / robot["spheres"],
+            T_world_base=_pose(robot["T_world_base"]),
+            stamps=np.array(clearance["stamps"], dtype=np.int64),
+            clearance=np.array(clearance["distance"], dtype=np.float64),
+            unmodelled=tuple(robot.get("unmodelled", ())),
+        )
 
 
 def _primitive_document(primitive: Primitive) -> dict[str, Any]:
@@ -179,8 +175,11 @@ def _track(entry: dict[str, Any] | None) -> Track | None:
 
 
 def _primitive(entry: dict[str, Any]) -> Primitive:
-    if len(entry["size"]) != NUM_SIZES[entry["kind"]] or min(entry["size"]) <= 0:
-        raise ValueError(f"size of {entry['name']}: {entry['size']}")
+    refuse_if(
+        len(entry["size"]) != NUM_SIZES[entry["kind"]] or min(entry["size"]) <= 0,
+        f"size of {entry['name']}: {entry['size']}",
+        error=ValueError,
+    )
     texture = entry["texture"]
     return Primitive(
         name=entry["name"],
@@ -196,6 +195,9 @@ def _primitive(entry: dict[str, Any]) -> Primitive:
 
 def _pose(rows: object) -> Float64:
     T = np.array(rows, dtype=np.float64)
-    if T.shape != (4, 4) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6):
-        raise ValueError(f"not a rigid transform: {rows}")
+    refuse_if(
+        T.shape != (4, 4) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6),
+        f"not a rigid transform: {rows}",
+        error=ValueError,
+    )
     return T

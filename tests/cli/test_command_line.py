@@ -14,10 +14,11 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 
-from splatctrl_cli.cli.commands import COMMANDS, Command, build_parser, function_of
+from splatctrl_cli.cli.commands import COMMANDS, Command, build_parser
 from splatctrl_cli.cli.main import main
 from tests.cli.here import checked, splatctrl
 from tests.conftest import ROOT
@@ -155,7 +156,7 @@ def leaves(commands: dict[str, Command]) -> Iterator[tuple[list[str], Command]]:
 def test_all_help_shows_every_option_and_the_command_has_a_function(
     capsys: pytest.CaptureFixture[str], words: list[str], command: Command
 ) -> None:
-    assert callable(function_of(command.run))
+    assert callable(resolve_name(f"splatctrl_cli.cli.{command.run}"))
     with pytest.raises(SystemExit) as ended:
         build_parser(words[0]).parse_args([*words, "--help-all"])
     shown = capsys.readouterr().out

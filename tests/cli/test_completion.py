@@ -18,6 +18,7 @@ from splatctrl_cli.cli import main as main_module
 from splatctrl_cli.cli.commands import COMMANDS, SHELLS, Command, build_parser
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.parser import GONE, Parser
+from splatctrl_cli.config import Config
 from tests.cli import here
 
 
@@ -68,7 +69,7 @@ def test_what_left_names_its_successor(words: str, capsys: pytest.CaptureFixture
     assert f"run {GONE[words]} instead" in capsys.readouterr().err
 
 
-TABLES = ("DECIDING_OPTIONS", "SETTINGS")  # of the names that a command reads by getattr
+TABLES = ("DECIDING_OPTIONS",)  # of the names that a command reads by getattr
 
 
 def leaves() -> Iterator[tuple[str, ...]]:
@@ -81,13 +82,28 @@ def command_of(words: tuple[str, ...]) -> Command:
     return command.actions[words[1]] if command.actions else command
 
 
-def declared(words: tuple[str, ...]) -> set[str]:
+def declared(words: tuple[str, ...]) -> dict[str, set[str]]:
+    """By option, the names of which one has to be read: its own, or those of the fields that it gives."""
     parser: argparse.ArgumentParser = build_parser(words[0])
     for word in words:
         below = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
         parser = below.choices[word]
     assert isinstance(parser, Parser)
-    return {action.dest for action in parser._actions} - {"help", "help_all"}
+    actions: Any = parser._actions
+    return {a.dest: {a.dest, *a.fields, *(["config"] if a.sets else [])} for a in actions if "help" not in a.dest}
+
+
+def fields_of(request: Any) -> set[str]:
+    """Names of a request's fields, and of those that options make up in turn."""
+    found = set[str]()
+    for field in dataclasses.fields(request):
+        made_by = field.default_factory
+        found.add(field.name)
+        if made_by is Config:
+            found.add("set")
+        elif isinstance(made_by, type) and dataclasses.is_dataclass(made_by):
+            found |= fields_of(made_by)
+    return found
 
 
 def read_by(module: ModuleType, function: str, seen: set[str]) -> set[str]:
@@ -98,14 +114,14 @@ def read_by(module: ModuleType, function: str, seen: set[str]) -> set[str]:
     for node in ast.walk(ast.parse(inspect.getsource(getattr(module, function)))):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in {"args", "self"}:
             found.add(node.attr)
-        if not isinstance(node, ast.Name) or node.id in seen:
+        if not isinstance(node, ast.Name) or node.id in seen or node.id == "request_of":
             continue
         named = getattr(module, node.id, None)
         home = inspect.getmodule(named)
         if node.id in TABLES:
             found.update(named)
         elif dataclasses.is_dataclass(named):
-            found.update(field.name for field in dataclasses.fields(named))
+            found |= fields_of(named)
         elif callable(named) and home is not None and home.__name__.startswith("splatctrl_cli.cli."):
             found |= read_by(home, node.id, seen)
     return found
@@ -116,4 +132,4 @@ def test_every_declared_option_is_read(words: tuple[str, ...]) -> None:
     module, _, function = command_of(words).run.partition(":")
     room = importlib.import_module(f"splatctrl_cli.cli.{module}")
     read = read_by(room, function, set()) | read_by(main_module, "_run", set())
-    assert not declared(words) - read
+    assert not [option for option, names in declared(words).items() if not names & read]

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatctrl_cli.cli import scene_options
-from splatctrl_cli.cli.parser import words
-from splatctrl_cli.cli.sdf_bake import split_cameras
+from splatctrl_cli.cli import run_options, scene_options
+from splatctrl_cli.cli.scene_options import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_scales
@@ -19,6 +18,7 @@ from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.formats.splat.splats import FORMATS, write_ply
 from splatctrl_cli.jobs.bake.accuracy import SUMMARY_METRICS
+from splatctrl_cli.simulate.arm import UNMODELLED
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli.here import splatctrl
 from tests.field.scenes import cloud, splat_set
@@ -149,13 +149,14 @@ def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) 
 
 
 def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
-    assert tuple(distance.KERNEL_OF) == words(FieldConfig, "distance")
-    assert tuple(weights.METHODS) == words(FieldConfig, "weights")
-    assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
-    assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
+    assert tuple(distance.KERNEL_OF) == FieldConfig.declared["distance"].words
+    assert tuple(weights.METHODS) == FieldConfig.declared["weights"].words
+    assert tuple(probability.PROBABILITIES) == FieldConfig.declared["probability"].words
+    assert tuple(qp.SOLVERS) == ControlConfig.declared["solver"].words
     assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
     assert tuple(FORMATS) == scene_options.SPLAT_FORMATS and tuple(grid_format.CHANNELS) == scene_options.CHANNELS
     assert scene_options.CHANNELS[:4] == baker.DEFAULT_CHANNELS
+    assert tuple(UNMODELLED) == run_options.UNMODELLED
 
 
 def test_options_and_configuration_say_the_same(tmp_path: Path, splats: Path) -> None:

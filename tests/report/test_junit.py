@@ -23,8 +23,6 @@ from splatctrl_cli.report.junit import (
     check_replaceable,
     error_case,
     junit_text,
-    notes_of,
-    skipped_case,
     summary,
     tell_github,
     worst_first,
@@ -59,9 +57,16 @@ def suite_of(*cases: Case, **more: object) -> Suite:
     return Suite(name="log.mcap", cases=cases, **more)  # type: ignore[arg-type]
 
 
+def not_run(group: str, why: str) -> Case:
+    return Case(name="skipped", group=group, kind=Kind.SKIPPED, sentence=why, text=why)
+
+
 def test_a_case_for_each_criterion_and_gate_of_which_only_the_passed_pass(tmp_path: Path) -> None:
     cases = cases_of(VERDICT, GROUP)
-    write_junit(tmp_path / "j.xml", [suite_of(*cases, notes=notes_of(VERDICT), started="2026-01-01T00:00:00+00:00")])
+    write_junit(
+        tmp_path / "j.xml",
+        [suite_of(*cases, notes=[VERDICT["sentence"], *VERDICT["notes"]], started="2026-01-01T00:00:00+00:00")],
+    )
     (suite,) = JUnitXml.fromfile(str(tmp_path / "j.xml"))
     found = {case.name: case for case in suite}
     assert list(found) == ["clearance", "known space", "--require x>=1"]
@@ -87,7 +92,7 @@ def test_a_case_for_each_criterion_and_gate_of_which_only_the_passed_pass(tmp_pa
 def test_what_could_not_run_or_was_not_run_or_was_killed_is_no_pass() -> None:
     cases = [
         error_case("a/bake", "scene: no such file", exit_code=4),
-        skipped_case("a/replay", "needs a/bake"),
+        not_run("a/replay", "needs a/bake"),
         error_case("a/bake", "timed out after 5 s", exit_code=None, lines=["fits", "still fits"]),
     ]
     (suite,) = JUnitXml.fromstring(junit_text([suite_of(*cases)]).encode())
@@ -96,7 +101,7 @@ def test_what_could_not_run_or_was_not_run_or_was_killed_is_no_pass() -> None:
     assert (error.message, "exit code: 4" in error.text) == ("scene: no such file", True)
     assert (killed.message, killed.text) == ("timed out after 5 s", "timed out after 5 s\nfits\nstill fits")
     assert (suite.tests, suite.errors, suite.skipped) == (3, 2, 1)
-    each = cases_of(VERDICT, "a")[1:], [skipped_case("b", "")], cases_of(VERDICT, "c")
+    each = cases_of(VERDICT, "a")[1:], [not_run("b", "")], cases_of(VERDICT, "c")
     worst = [case.kind for _, case in worst_first([suite_of(*some) for some in each])]
     assert worst == [Kind.FAILED, Kind.NOT_EVALUABLE, Kind.NOT_EVALUABLE, Kind.SKIPPED]
 

@@ -16,6 +16,7 @@ from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.records import DistanceGrid, UInt8
 from splatctrl_cli.report import replay_pictures
 from splatctrl_cli.report.field_pictures import (
+    field_slice_picture,
     gradient_picture,
     probability_picture,
     reliability,
@@ -26,7 +27,6 @@ from splatctrl_cli.report.pictures import (
     CURVE_COLORS,
     ComparisonRow,
     comparison_picture,
-    field_slice_picture,
     view_picture,
 )
 from splatctrl_cli.report.replay_pictures import (

@@ -14,6 +14,7 @@ from pathlib import Path
 from splatctrl_cli.jobs.batch.graph import Node
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run
 from splatctrl_cli.jobs.batch.run import DONE, FAILED, Scheduler, local_executor
+from splatctrl_cli.jobs.batch.suite import Job
 from tools.hunt.table import border_of, merge_rows, read_rows, report
 from tools.hunt.trial import Row, family_of, run
 
@@ -68,7 +69,9 @@ def preload() -> None:
 
 def _node(seed: int, index: int, device: str) -> Node:
     name = f"{seed}/{index}"
-    return Node(name=name, recording=str(seed), job=str(index), command="hunt", words=(name, device), inputs=_code())
+    return Node(
+        name=name, recording=str(seed), job=Job(name=str(index), command="hunt"), words=(name, device), inputs=_code()
+    )
 
 
 def _code() -> tuple[Path, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import COMPARED_CELLS, FAR_GRID
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.evaluate.field_accuracy import (
     compare_with_mesh,
     compare_with_truth,
@@ -58,8 +58,7 @@ def accuracy_of(
 def check_references(request: BakeRequest, source: BakeSource) -> None:
     """Raise for unusable references before a long bake."""
     for path in (request.truth, request.seen_by, request.reference_mesh):
-        if path is not None and not path.exists():
-            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+        refuse_if(path is not None and not path.exists(), f"{path}: no such file or folder", remedy="check the path")
     if request.held_out is not None:
         _held_out_cameras(open_source(request.held_out), request, source.cameras)
 
@@ -104,7 +103,6 @@ def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
 
 
 def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:
-    """Frames of training cameras, or all, up to a stamp."""
     for record in open_source(log).records():
         if record.stamp_ns > until_ns:
             return
@@ -113,9 +111,7 @@ def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator
 
 
 def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> dict[str, Any]:
-    """Compare with the newest held-out depth up to the scene's stamp. Pixels outside the scene's box or on the robot
-    do not count: the field has neither.
-    """
+    """Compare with the newest held-out depth up to the scene's stamp, without the robot and outside the box."""
     recording = open_source(log)
     cameras = _held_out_cameras(recording, request, source.cameras)
     newest: dict[str, tuple[RgbdFrame, JointState | None]] = {}
@@ -127,8 +123,9 @@ def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, re
             state = record
         elif record.camera in cameras:
             newest[record.camera] = record, state
-    if not newest:
-        raise NotEvaluableError(f"{log}: no frame of {', '.join(cameras)} up to the time of the scene")
+    refuse_if(
+        not newest, f"{log}: no frame of {', '.join(cameras)} up to the time of the scene", error=NotEvaluableError
+    )
     urdf, names = request.urdf, recording.joint_names
     robot = None if urdf is None else RobotModel.from_urdf(urdf, request.spheres).moved_by(names)
     counted = []
@@ -152,8 +149,12 @@ def _held_out_cameras(
     if also := [name for name in names if trained is not None and name in trained]:
         raise UsageError(f"--held-out: camera {also[0]} trained the scene", remedy="name one that did not")
     chosen = names or tuple(name for name in known if trained is None or name not in trained)
-    if not chosen:
-        raise UsageError(f"--held-out: every camera of {log} trained the scene", remedy="give another log")
+    refuse_if(
+        not chosen,
+        f"--held-out: every camera of {log} trained the scene",
+        remedy="give another log",
+        error=UsageError,
+    )
     return chosen
 
 

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
@@ -49,10 +50,9 @@ from splatctrl_cli.jobs.bake.request import (
     read_bake_source,
     read_previous,
 )
-from splatctrl_cli.jobs.running.device import Device, explain_fault
+from splatctrl_cli.jobs.running.device import Device, explain_faults
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, deciding_versions
-from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import (
     Reliability,
@@ -124,13 +124,13 @@ def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], form
     copies = sum(per_cell if size is None else size for size in sizes)
     needed = (per_cell + copies) * layout.num_cells + (1 << 26)  # bytes for what is small
     free = shutil.disk_usage(folder).free
-    if needed > free:
-        size = " x ".join(str(n) for n in layout.shape)
-        raise UsageError(
-            f"grid of {size} cells: needs {needed / 2**30:.1f} GiB of disk ({needed} bytes), "
-            f"{free / 2**30:.1f} GiB ({free} bytes) is free at {folder.parent}",
-            remedy="give a larger --voxel, a smaller --box, fewer --channels or --formats, or another --out",
-        )
+    refuse_if(
+        needed > free,
+        f"grid of {' x '.join(map(str, layout.shape))} cells: needs {needed / 2**30:.1f} GiB of disk ({needed} bytes)"
+        f", {free / 2**30:.1f} GiB ({free} bytes) is free at {folder.parent}",
+        remedy="give a larger --voxel, a smaller --box, fewer --channels or --formats, or another --out",
+        error=UsageError,
+    )
 
 
 def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
@@ -174,13 +174,8 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
         for path in partial.iterdir():  # all but the channels of an interrupted bake: it is written again
             if path.name != FOLDER:
                 remove(path)
-        with stopwatch.stage("bake"):
-            try:
-                grid, changes = _bake_grid(job, partial, progress)
-            except DeviceError as error:
-                raise explain_fault(error, job.device, checkpoint) from error
-            finally:
-                job.baker.close()
+        with stopwatch.stage("bake"), closing(job.baker), explain_faults(job.device, checkpoint):
+            grid, changes = _bake_grid(job, partial, progress)
         with stopwatch.stage("report"):
             statistics = grid_statistics(grid)
             document = field_document(grid, statistics, changes)
@@ -214,10 +209,17 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
 def check_request(request: BakeRequest) -> None:
     """Raise UsageError for too coarse cells, incomplete options, and gates on unknown figures."""
     check_loss(request.config.field.voxel, request.config.field.max_loss)
-    if (request.truth is None) != (request.seen_by is None):
-        raise UsageError("--truth and --seen-by: expected both or neither")
-    if request.previous_scene is not None and request.update is None:
-        raise UsageError("--previous-scene: belongs to --update", remedy="give the field folder to --update as well")
+    refuse_if(
+        (request.truth is None) != (request.seen_by is None),
+        "--truth and --seen-by: expected both or neither",
+        error=UsageError,
+    )
+    refuse_if(
+        request.previous_scene is not None and request.update is None,
+        "--previous-scene: belongs to --update",
+        remedy="give the field folder to --update as well",
+        error=UsageError,
+    )
     of_truth = () if request.truth is None else field_accuracy.metric_scales(FIELDS)
     check_gate_names(request.require, (*SUMMARY_METRICS, *of_truth))
 
@@ -270,17 +272,19 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
     names = {"sdf", *wanted, *(("probability",) if request.with_probability else ())}
     chosen = (*(name for name in CHANNELS if name in names), *sorted(names - set(CHANNELS)))
     for option in ("truth", "reference_mesh", "held_out"):
-        if getattr(request, option) is not None and not {"bound", "hard"} & names:
-            raise UsageError(
-                f"--{option.replace('_', '-')}: needs the exact distance",
-                remedy="bake the channel bound or hard as well",
-            )
-    unknown = request.config.field.unknown
-    if unknown != "free" and "observed" not in names:
-        raise UsageError(
-            f"field.unknown = {unknown}: needs to know which cells were seen",
-            remedy="bake the channel observed as well",
+        refuse_if(
+            getattr(request, option) is not None and not {"bound", "hard"} & names,
+            f"--{option.replace('_', '-')}: needs the exact distance",
+            remedy="bake the channel bound or hard as well",
+            error=UsageError,
         )
+    unknown = request.config.field.unknown
+    refuse_if(
+        unknown != "free" and "observed" not in names,
+        f"field.unknown = {unknown}: needs to know which cells were seen",
+        remedy="bake the channel observed as well",
+        error=UsageError,
+    )
     return chosen
 
 

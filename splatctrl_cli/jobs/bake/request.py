@@ -10,7 +10,7 @@ import numpy as np
 from splatctrl_cli import __version__
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import CARD_LEAST_BAKE, CARD_SPLATS
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.field.clusters import DEFAULT_LABELS, field_splats
 from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box, check_room
@@ -37,7 +37,7 @@ class BakeRequest(RunOptions):
     """
 
     scene: Path
-    out: Path
+    out: Path = Path("field")
     at: float | None = None
     labels: frozenset[Label] = DEFAULT_LABELS
     box: Box | None = None
@@ -85,8 +85,9 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
 
     Raises InputError without a scene, UsageError for a time in a bare file, NotEvaluableError for too early a time.
     """
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
+    refuse_if(
+        not path.exists(), f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply"
+    )
     if path.is_dir():
         return _read_folder(path, at_seconds)
     if at_seconds is not None:
@@ -100,8 +101,9 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
     then: SceneFolder | Snapshot = scene
     wanted_ns, files = None, [path / "splats.ply", path / "occupancy.npz"]
     if at_seconds is not None:
-        if not scene.snapshots:
-            raise NotEvaluableError(f"{path}: has no snapshots", remedy="bake without --at")
+        refuse_if(
+            not scene.snapshots, f"{path}: has no snapshots", remedy="bake without --at", error=NotEvaluableError
+        )
         wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
         then = scene.snapshot_at(wanted_ns)
         files = [then.path, then.occupancy_path]
@@ -142,8 +144,7 @@ def read_previous(path: Path, scene: Path) -> Previous:
 
     Raises InputError for a missing or damaged field, UsageError for another scene or version.
     """
-    if not path.is_dir():
-        raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
+    refuse_if(not path.is_dir(), f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
     file = path / "field.npz"
     if file.is_file():
         check_room(f"--update: {file}", file.stat().st_size, "bake without --update, which needs less")
@@ -155,12 +156,13 @@ def read_previous(path: Path, scene: Path) -> Previous:
         ) from None
     grid = read_npz(Parts.of_run(path, run).checked(file))
     is_ours = run.get("command") == "sdf-bake" and run.get("splatctrl") == __version__
-    if not is_ours or "unrepresented_voxels" not in grid.header:
-        raise UsageError(
-            f"--update {path}: expected a field that sdf-bake of splatctrl {__version__} wrote, got one of "
-            f"{run.get('command')} of {run.get('splatctrl')}",
-            remedy="bake it once without --update",
-        )
+    refuse_if(
+        not is_ours or "unrepresented_voxels" not in grid.header,
+        f"--update {path}: expected a field that sdf-bake of splatctrl {__version__} wrote, got one of "
+        f"{run.get('command')} of {run.get('splatctrl')}",
+        remedy="bake it once without --update",
+        error=UsageError,
+    )
     return Previous(
         path=path,
         grid=grid,
@@ -186,12 +188,14 @@ def check_same(
         "labels": (grid.header.get("labels"), labels),
         **{f"field.{name}": (used.get(name), value) for name, value in settings.items()},
     }
-    if differing := [f"{name} was {then}, is {now}" for name, (then, now) in then_and_now.items() if then != now]:
-        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
-        raise UsageError(
-            f"--update {previous.path}: that field was baked with other settings: {', '.join(differing[:3])}{more}",
-            remedy="give the same settings, or bake without --update",
-        )
+    differing = [f"{name} was {then}, is {now}" for name, (then, now) in then_and_now.items() if then != now]
+    more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+    refuse_if(
+        differing,
+        f"--update {previous.path}: that field was baked with other settings: {', '.join(differing[:3])}{more}",
+        remedy="give the same settings, or bake without --update",
+        error=UsageError,
+    )
 
 
 def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
@@ -206,12 +210,13 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
         snapshots = open_scene(scene).snapshots
         if snapshots and stamp_ns >= snapshots[0].stamp_ns:
             source = read_bake_source(scene, (stamp_ns - snapshots[0].stamp_ns) * 1e-9)
-    if next(iter(source.digests.values())) != wanted:
-        option = "--previous-scene" if where.startswith("--update") else "--scene"
-        raise UsageError(
-            f"{where}: was not baked from the splats of {scene}",
-            remedy=f"give the scene that it was baked from as {option}",
-        )
+    option = "--previous-scene" if where.startswith("--update") else "--scene"
+    refuse_if(
+        next(iter(source.digests.values())) != wanted,
+        f"{where}: was not baked from the splats of {scene}",
+        remedy=f"give the scene that it was baked from as {option}",
+        error=UsageError,
+    )
     return source
 
 
@@ -229,8 +234,12 @@ def choose_box(request: BakeRequest, source: BakeSource, previous: Previous | No
 def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progress: Progress) -> Device:
     """Choose the device; updates bake on the processor. Raises UsageError for an unusable card."""
     if request.update is not None:
-        if request.device.startswith(CUDA):
-            raise UsageError(f"--device {request.device}: --update bakes on the processor", remedy=TO_CPU)
+        refuse_if(
+            request.device.startswith(CUDA),
+            f"--device {request.device}: --update bakes on the processor",
+            remedy=TO_CPU,
+            error=UsageError,
+        )
         return Device()
     is_matern = KERNEL_OF[request.config.field.distance] == "gpdf"
     return choose_device(

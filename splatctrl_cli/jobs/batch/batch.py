@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import DAMAGED, UsageError
+from splatctrl_cli.errors import DAMAGED, UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, verdict_of
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, select_shard
@@ -30,7 +30,7 @@ from splatctrl_cli.jobs.batch.suite import read_suite
 from splatctrl_cli.jobs.batch.task import last_lines
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.libraries import distributed
-from splatctrl_cli.report.junit import Case, Kind, Suite, cases_of, damage_case, error_case, skipped_case
+from splatctrl_cli.report.junit import Case, Kind, Suite, cases_of, damage_case, error_case
 
 CONNECT_S = 10.0  # to a scheduler
 
@@ -65,8 +65,7 @@ class BatchResult:
 
 def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:
     """Run unfinished nodes. Raises UsageError for an invalid suite, InputError for missing files."""
-    suite, every, out = planned(request, command_line)
-    nodes = select_shard(every, request.shard)
+    suite, every, nodes, out = planned(request, command_line)
     with (
         Ledger(out) as ledger,
         scheduling(
@@ -91,26 +90,28 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
     )
 
 
-def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], Path]:
-    """The suite, its nodes of every shard in order of need, and the output folder.
+def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], list[Node], Path]:
+    """The suite, its nodes in order of need, of every shard and of this one, and the output folder.
 
     Raises UsageError for a shard without a recording.
     """
     suite = read_suite(request.suite, COMMANDS)
     out = (request.out or suite.out).absolute()
-    nodes = nodes_of(suite, out, command_line)
-    if not select_shard(nodes, request.shard):
-        index, count = request.shard
-        raise UsageError(
-            f"--shard {index}/{count}: has none of the {len(suite.recordings)} recordings", remedy="give fewer shards"
-        )
-    return suite, nodes, out
+    every = nodes_of(suite, out, command_line)
+    nodes = select_shard(every, request.shard)
+    index, count = request.shard
+    refuse_if(
+        not nodes,
+        f"--shard {index}/{count}: has none of the {len(suite.recordings)} recordings",
+        remedy="give fewer shards",
+        error=UsageError,
+    )
+    return suite, every, nodes, out
 
 
 def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node, str]]:
     """Every node with "done" or "to do"; writes nothing but a ledger's digests."""
-    _, every, out = planned(request, command_line)
-    nodes = select_shard(every, request.shard)
+    *_, nodes, out = planned(request, command_line)
     with Ledger(out) as ledger:
         keys, latest = keys_of(nodes, ledger, command_line.entry), ledger.latest()
     stand = {name for name, run in latest.items() if run.state in {DONE, FAILED} and run.key == keys.get(name)}
@@ -171,7 +172,7 @@ def suites_of(result: BatchResult) -> list[Suite]:
 
 def _cases_of(run: Run, out: Path) -> list[Case]:
     if run.state == SKIPPED:
-        return [skipped_case(run.node, run.cause)]
+        return [Case(name="skipped", group=run.node, kind=Kind.SKIPPED, sentence=run.cause, text=run.cause)]
     if run.state == ERROR:
         return [
             error_case(

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
-from splatctrl_cli.errors import UsageError
-from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table, jobs_for
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
+from splatctrl_cli.jobs.batch.suite import Job, Recording, Suite, Table, jobs_for
 
 RECORDING, NAME = "recording", "name"  # placeholders {…} in an option, besides job names
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
@@ -37,7 +37,7 @@ Variant = Mapping[str, Any]
 class CommandLine(Protocol):
     """Command line of a batch's nodes; `entry` is MODULE:FUNCTION, from words to exit code."""
 
-    entry: str
+    entry: ClassVar[str]
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
         """Words for options, whose paths are relative to `folder`, and the files they read.
@@ -53,7 +53,7 @@ class CommandLine(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """One command on one recording; name: RECORDING/JOB.
+    """One job on one recording; name: RECORDING/JOB.
 
     variant: matrix choices so far, by JOB.OPTION. words: the command line. inputs: files that decide the result.
     needs: nodes before it. out: None for a command that only prints.
@@ -61,15 +61,12 @@ class Node:
 
     name: str
     recording: str
-    job: str
-    command: str
+    job: Job
     words: tuple[str, ...]
     variant: Variant = field(default_factory=dict)
     inputs: tuple[Path, ...] = ()
     needs: tuple[str, ...] = ()
     out: Path | None = None
-    expect: str = "passed"
-    limits: Limits = field(default_factory=Limits)
 
 
 def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
@@ -114,20 +111,31 @@ def _where(job: Job, recording: Recording) -> str:
 def _fill(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
     where = _where(job, recording)
     makers = [other.name for other in jobs if other.command == role and other.name != job.name]
-    if len(makers) > 1:
-        example = " or ".join(f"'{{{name}}}'" for name in makers)
-        raise UsageError(f"{where}: {len(makers)} jobs of {role} come before it", remedy=f"say {example}")
-    if not makers and role == SCENE:
-        raise UsageError(f"{where}: expected a job of {SCENE} before it", remedy="or give scene = PATH")
+    example = " or ".join(f"'{{{name}}}'" for name in makers)
+    refuse_if(
+        len(makers) > 1,
+        f"{where}: {len(makers)} jobs of {role} come before it",
+        remedy=f"say {example}",
+        error=UsageError,
+    )
+    refuse_if(
+        not makers and role == SCENE,
+        f"{where}: expected a job of {SCENE} before it",
+        remedy="or give scene = PATH",
+        error=UsageError,
+    )
     return f"{{{makers[0] if makers else RECORDING}}}"
 
 
 def _sort_jobs(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
     needs = {name: _needs(job, jobs, recording) for name, job in jobs.items()}
-    try:
+    with refuse_faults(
+        lambda error: f"[jobs]: {' needs '.join(error.args[1][::-1])}",
+        CycleError,
+        remedy="break the circle",
+        error=UsageError,
+    ):
         TopologicalSorter(needs).prepare()
-    except CycleError as error:
-        raise UsageError(f"[jobs]: {' needs '.join(error.args[1][::-1])}", remedy="break the circle") from None
     ordered: dict[str, None] = {}
 
     def add(name: str) -> None:
@@ -144,9 +152,13 @@ def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str
     texts = json.dumps([job.options, job.matrix], ensure_ascii=False, default=str)
     found = dict.fromkeys(_PLACE.findall(texts))
     for place in found:
-        if place not in {RECORDING, NAME, *jobs}:
-            known = ", ".join((RECORDING, NAME, *jobs))
-            raise UsageError(f"{_where(job, recording)}: {{{place}}} is no job", remedy=f"known here: {known}")
+        known = (RECORDING, NAME, *jobs)
+        refuse_if(
+            place not in known,
+            f"{_where(job, recording)}: {{{place}}} is no job",
+            remedy=f"known here: {', '.join(known)}",
+            error=UsageError,
+        )
     return tuple(place for place in found if place in jobs)
 
 
@@ -172,7 +184,7 @@ def _nodes_of(
                 only_prints = job.command in ("check", "info")
                 its = None if only_prints else out / recording.name / (place + ENDINGS.get(job.command, ""))
                 values: dict[str, Any] = {
-                    **{each.job: str(each.out) for each in before},
+                    **{each.job.name: str(each.out) for each in before},
                     RECORDING: [str(path) for path in recording.paths],
                     NAME: recording.name,
                 }
@@ -188,22 +200,23 @@ def _nodes_of(
                     Node(
                         name=f"{recording.name}/{place}",
                         recording=recording.name,
-                        job=job.name,
-                        command=job.command,
+                        job=job,
                         words=words,
                         variant=variant,
                         inputs=tuple(inputs),
                         needs=tuple(each.name for each in before),
                         out=its,
-                        expect=job.expect,
-                        limits=job.limits,
                     )
                 )
     nodes = [node for each in made.values() for node in each]
     by_name: dict[str, Node] = {}
     for node in nodes:
-        if by_name.setdefault(node.name.lower(), node) is not node:
-            raise UsageError(f"two outputs are called {node.name}", remedy="rename a job, or a value of its matrix")
+        refuse_if(
+            by_name.setdefault(node.name.lower(), node) is not node,
+            f"two outputs are called {node.name}",
+            remedy="rename a job, or a value of its matrix",
+            error=UsageError,
+        )
     return nodes
 
 

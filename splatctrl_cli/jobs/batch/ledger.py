@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from uuid import uuid4
 
 import splatctrl_cli
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PACKAGES, sha256, write_durably, write_table
 from splatctrl_cli.jobs.batch.graph import Node
@@ -107,10 +107,11 @@ class Ledger(AbstractContextManager["Ledger"]):
         base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
         base.row_factory = sqlite3.Row
         version = int(base.execute("PRAGMA user_version").fetchone()[0])
-        if version > VERSION:
-            raise InputError(
-                f"{self.path}: is of version {version}, expected {VERSION}", remedy="use a newer splatctrl"
-            )
+        refuse_if(
+            version > VERSION,
+            f"{self.path}: is of version {version}, expected {VERSION}",
+            remedy="use a newer splatctrl",
+        )
         until = time.monotonic() + BUSY_S
         while base.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
             try:
@@ -245,7 +246,7 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
         named[str(node.out)] = "out"
         inputs = [digests[path] for path in node.inputs] + [keys[need] for need in node.needs]
         keys[node.name] = hashlib.sha256(
-            json.dumps([entry, code, node.command, *inputs, *_deciding_words(node.words, named)]).encode()
+            json.dumps([entry, code, node.job.command, *inputs, *_deciding_words(node.words, named)]).encode()
         ).hexdigest()
     return keys
 
@@ -262,7 +263,6 @@ def code_version() -> str:
 
 
 def _deciding_words(words: Sequence[str], named: Mapping[str, str]) -> list[str]:
-    """Words that change results, with paths replaced by digests."""
     left_out = ("--force", "--resume", "--quiet", "-q", "--json")
     pairs = zip(words, ("", *words), strict=False)
     kept = [w for w, before in pairs if w not in left_out and before != THREADS and not w.startswith(THREADS)]
@@ -273,14 +273,12 @@ def _deciding_words(words: Sequence[str], named: Mapping[str, str]) -> list[str]
 
 def _digest(path: Path, ledger: Ledger) -> str:
     """Digest of an input and what it names: images, a URDF's meshes."""
-    try:
+    with refuse_faults(
+        lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy="check the suite's paths"
+    ):
         digest = ledger.digest(path.parent if path.suffix == ".toml" and path.parent != Path() else path)
-        if path.suffix != ".urdf":
-            return digest
-        meshes = [place for place in _meshes(path) if place.is_file()]
+        meshes = [place for place in _meshes(path) if place.is_file()] if path.suffix == ".urdf" else []
         return " ".join([digest, *(ledger.digest(place) for place in meshes)])
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the suite's paths") from None
 
 
 def _meshes(urdf: Path) -> Iterator[Path]:

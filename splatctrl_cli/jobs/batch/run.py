@@ -21,6 +21,7 @@ from splatctrl_cli.jobs.batch.task import End, Task, last_lines, read_end, run_t
 from splatctrl_cli.jobs.running.progress import Progress, duration
 
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
+DISK_FULL = 6  # exit code
 AGAIN_S = 0.5  # between looks at what another batch runs
 STILL_S = 60.0  # without an ended node, until a log line names what runs
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
@@ -44,45 +45,14 @@ class Scheduler:
 
     def run(self, nodes: Sequence[Node]) -> dict[str, Run]:
         """The run of each node by name, kept or new."""
-        self.keys, latest = keys_of(nodes, self.ledger, self.entry), self.ledger.latest()
+        self.keys = keys_of(nodes, self.ledger, self.entry)
+        latest = self.ledger.latest()
         waiting = {node.name: node for node in nodes}
         futures: dict[Future[End], Node] = {}
         tries: Counter[str] = Counter()
         clock, last = Clock(nodes, self.ledger.mean_seconds(), self.slots), time.monotonic()
         while waiting or futures:
-            is_busy = False
-            for node in list(waiting.values()):
-                if len(futures) >= self.slots:
-                    break
-                if any(need not in self.runs for need in node.needs):
-                    continue
-                run = self._reuse_run(node, self.keys[node.name], latest.get(node.name))
-                if run is not None:
-                    self._settle(waiting.pop(node.name), run, clock)
-                elif self.ledger.claim(node.name):
-                    run = self._reuse_run(
-                        node, self.keys[node.name], next(self.ledger.runs([f"node={node.name}"]), None)
-                    )
-                    if run is not None:
-                        self.ledger.release(node.name)
-                        self._settle(waiting.pop(node.name), run, clock)
-                        continue
-                    del waiting[node.name]
-                    Path(self._place(node, ".end")).unlink(missing_ok=True)
-                    task = Task(
-                        entry=self.entry,
-                        words=[*node.words],
-                        key=self.keys[node.name],
-                        out="" if node.out is None else str(node.out.absolute()),
-                        result=self._place(node, ".json"),
-                        log=self._place(node, ".log"),
-                        end=self._place(node, ".end"),
-                        timeout=node.limits.timeout,
-                        memory=node.limits.memory,
-                    )
-                    futures[self.executor.submit(run_task, task)] = node
-                else:
-                    is_busy = True
+            is_busy = self._submit(waiting, futures, latest, clock)
             ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
             now = time.monotonic()
             if not ended and now - last >= STILL_S:
@@ -96,43 +66,84 @@ class Scheduler:
             for future in ended:
                 node, end = futures.pop(future), _end_of(future)
                 tries[node.name] += 1
-                # 6: the disk was full
-                may_pass = end.exit_code == 6 or end.cause.startswith(MAY_PASS)
-                if tries[node.name] <= node.limits.retries and may_pass:
+                may_pass = end.exit_code == DISK_FULL or end.cause.startswith(MAY_PASS)
+                if tries[node.name] <= node.job.retries and may_pass:
                     self.progress.log(f"batch: {node.name}: {end.cause or 'disk full'}, once more")
                     waiting[node.name] = node
-                    continue
-                run = run_of(node, self.keys[node.name], end, self.ledger.folder)
-                self.ledger.record(run)
-                self._settle(node, run, clock)
+                else:
+                    run = run_of(node, self.keys[node.name], end, self.ledger.folder)
+                    self._settle(node, self._record(run), clock)
         return {node.name: self.runs[node.name] for node in nodes}
 
-    def _reuse_run(self, node: Node, key: str, before: Run | None) -> Run | None:
+    def _submit(
+        self,
+        waiting: dict[str, Node],
+        futures: "dict[Future[End], Node]",
+        latest: Mapping[str, Run],
+        clock: "Clock",
+    ) -> bool:
+        """Settle kept nodes and submit due ones; True if another batch runs one."""
+        is_busy = False
+        for node in list(waiting.values()):
+            if len(futures) >= self.slots:
+                break
+            if any(need not in self.runs for need in node.needs):
+                continue
+            run = self._reuse_run(node, latest.get(node.name))
+            if run is None and not self.ledger.claim(node.name):
+                is_busy = True
+                continue
+            if run is None:  # another batch may have run it since `latest`
+                run = self._reuse_run(node, next(self.ledger.runs([f"node={node.name}"]), None))
+                if run is not None:
+                    self.ledger.release(node.name)
+            del waiting[node.name]
+            if run is not None:
+                self._settle(node, run, clock)
+            else:
+                Path(self._place(node, ".end")).unlink(missing_ok=True)
+                task = Task(
+                    entry=self.entry,
+                    words=[*node.words],
+                    key=self.keys[node.name],
+                    out="" if node.out is None else str(node.out.absolute()),
+                    result=self._place(node, ".json"),
+                    log=self._place(node, ".log"),
+                    end=self._place(node, ".end"),
+                    timeout=node.job.timeout,
+                    memory=node.job.memory,
+                )
+                futures[self.executor.submit(run_task, task)] = node
+        return is_busy
+
+    def _reuse_run(self, node: Node, before: Run | None) -> Run | None:
+        """The run that stands for a node, kept or skipped; None if it is to run."""
+        key, folder = self.keys[node.name], self.ledger.folder
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:
-            cause = f"needs {lacking[0]}, which left nothing"
-            run = not_run(node, key, self.ledger.folder, state=SKIPPED, cause=cause)
-            if before is None or (before.state, before.key) != (SKIPPED, key):
-                self.ledger.record(run)
-            return run
+            run = not_run(node, key, folder, state=SKIPPED, cause=f"needs {lacking[0]}, which left nothing")
+            is_known = before is not None and (before.state, before.key) == (SKIPPED, key)
+            return run if is_known else self._record(run)
         if self.again:
             return None
+        stamp = None if node.out is None else stamp_of(node.out)
         is_same = before is not None and before.key == key and before.state in (DONE, FAILED)
         # both stamps are empty after an expected error
-        if before is not None and is_same and (node.out is None or before.stamp == stamp_of(node.out)):
+        if before is not None and is_same and stamp in (None, before.stamp):
             self.num_kept += 1
             judged = _judge_again(before, node)
-            if judged != before:
-                self.ledger.record(judged)
-            return judged
+            return judged if judged == before else self._record(judged)
         end = read_end(Path(self._place(node, ".end")), key)
         if end is None or end.exit_code is None or (before is not None and end.started <= before.started):
             return None
-        if node.out is not None and end.stamp != stamp_of(node.out):
+        if stamp not in (None, end.stamp):
             return None
-        run = run_of(node, key, end, self.ledger.folder)
-        self.ledger.record(run)
+        run = self._record(run_of(node, key, end, folder))
         return run if run.state in (DONE, FAILED) else None
+
+    def _record(self, run: Run) -> Run:
+        self.ledger.record(run)
+        return run
 
     def _settle(self, node: Node, run: Run, clock: "Clock") -> None:
         self.runs[node.name] = run
@@ -154,11 +165,11 @@ def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
     run = Run(
         node=node.name,
         recording=node.recording,
-        job=node.job,
-        command=node.command,
+        job=node.job.name,
+        command=node.job.command,
         key=key,
         state=ERROR,
-        expect=node.expect,
+        expect=node.job.expect,
         outcome=outcome,
         label=label,
         sentence=verdict.get("sentence", "") or (last[0].removeprefix("splatctrl: ") if last and code else ""),
@@ -183,9 +194,9 @@ def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
 def _judge_again(run: Run, node: Node) -> Run:
     if run.cause:
         return replace(run, state=ERROR)
-    is_expected = node.expect in {run.label, run.outcome, f"exit {run.exit_code}"}
+    is_expected = node.job.expect in {run.label, run.outcome, f"exit {run.exit_code}"}
     state = DONE if is_expected else ERROR if run.exit_code in (2, 4, 6, 70, 130) else FAILED  # without a verdict
-    return replace(run, state=state, expect=node.expect)
+    return replace(run, state=state, expect=node.job.expect)
 
 
 def describe_run(run: Run) -> str:
@@ -222,7 +233,7 @@ class Clock:
     def __init__(self, nodes: Sequence[Node], means: Mapping[str, float], slots: int) -> None:
         self.started = time.time()
         self._total, self._slots = len(nodes), slots
-        self._left = Counter(node.job for node in nodes)
+        self._left = Counter(node.job.name for node in nodes)
         self._means = dict(means)
         self._seen: dict[str, list[float]] = {}
 

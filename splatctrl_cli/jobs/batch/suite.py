@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config.ranges import format_value
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if
 
 Table = Mapping[str, Any]
 
+OF_JOB = ("command", "matrix", "expect", "timeout", "memory", "retries")  # keys of a job that are no options
 _ODD = re.compile(r"[^\w.+-]")  # in no name of a folder
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 SECONDS = {"s": 1, "m": 60, "min": 60, "h": 3600}
@@ -25,19 +26,10 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Limits of a job: wall time [s], memory [bytes] (0: none), and retries."""
-
-    timeout: float = 0.0
-    memory: int = 0
-    retries: int = 1
-
-
-@dataclass(frozen=True, kw_only=True)
 class Job:
     """One command of a suite. options: by long name; matrix: values by option, each combination a variant.
 
-    expect: a verdict's label or outcome, or "exit N".
+    expect: a verdict's label or outcome, or "exit N". timeout [s], memory [bytes]: 0 for no limit.
     """
 
     name: str
@@ -45,7 +37,9 @@ class Job:
     options: Table = field(default_factory=dict)
     matrix: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     expect: str = "passed"
-    limits: Limits = field(default_factory=Limits)
+    timeout: float = 0.0
+    memory: int = 0
+    retries: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,9 +82,11 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     jobs = tuple(_job(key, table, commands) for key, table in _tables(path.name, document, "jobs").items())
     tables = _list(path.name, document, "recordings")
     recordings = _check_names([one for table in tables for one in _recordings(folder, table)])
-    if not jobs or not recordings:
-        lacking = "the first" if jobs else "the second"
-        raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {lacking}")
+    refuse_if(
+        not jobs or not recordings,
+        f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of the {'first' if jobs else 'second'}",
+        error=UsageError,
+    )
     _check_recordings(recordings, [job.name for job in jobs])
     return Suite(
         name=name,
@@ -112,56 +108,67 @@ def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str])
 
 
 def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = None) -> Job:
-    where = f"[jobs.{name}]"
-    if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {format_value(table)}")
+    where, base = f"[jobs.{name}]", base or Job(name=name, command=name)
+    refuse_if(
+        not isinstance(table, Mapping), f"{where}: expected a table, got {format_value(table)}", error=UsageError
+    )
     _check_name(where, name)
-    command = _worded(where, "command", table.get("command", base.command if base else name))
+    command = _worded(where, "command", table.get("command", base.command))
     if command not in commands:
         raise UsageError(
             f"{where}: no job is called {command!r}", remedy=_suggest(command, commands, "give command = one of")
         )
     own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
-    if own is not None:
-        raise UsageError(f"{where}: a batch gives {own} itself", remedy="leave it out")
+    refuse_if(own is not None, f"{where}: a batch gives {own} itself", remedy="leave it out", error=UsageError)
     matrix = table.get("matrix", {})
-    if not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()):
-        raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {format_value(matrix)}")
-    expect = _worded(where, "expect", table.get("expect", base.expect if base else "passed"))
+    refuse_if(
+        not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()),
+        f"{where} matrix: expected OPTION = [VALUE, ...] each, got {format_value(matrix)}",
+        error=UsageError,
+    )
+    expect = _worded(where, "expect", table.get("expect", base.expect))
     if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
         raise UsageError(
             f"{where} expect: no verdict is called {expect!r}", remedy=_suggest(expect, (*EXPECTED, "exit N"))
         )
-    limits = base.limits if base else Limits()
     return Job(
         name=name,
         command=command,
         matrix=matrix,
         expect=expect,
-        limits=Limits(
-            timeout=_amount(where, table, "timeout", SECONDS, limits.timeout),
-            memory=int(_amount(where, table, "memory", UNITS, limits.memory)),
-            retries=int(_amount(where, table, "retries", {}, limits.retries)),
-        ),
-        options={key: v for key, v in table.items() if key not in {"command", "matrix", "expect", *vars(limits)}},
+        timeout=_amount(where, table, "timeout", SECONDS, base.timeout),
+        memory=int(_amount(where, table, "memory", UNITS, base.memory)),
+        retries=int(_amount(where, table, "retries", {}, base.retries)),
+        options={key: value for key, value in table.items() if key not in OF_JOB},
     )
 
 
 def _recordings(folder: Path, table: Table) -> list[Recording]:
     where = "[[recordings]]"
-    if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {format_value(table)}", remedy="give it paths = [...]")
+    refuse_if(
+        not isinstance(table, Mapping),
+        f"{where}: expected a table, got {format_value(table)}",
+        remedy="give it paths = [...]",
+        error=UsageError,
+    )
     _check_keys(where, table, ("name", "paths", "session", "only", "jobs"))
     only = tuple(_worded(where, "only", name) for name in _list(where, table, "only"))
-    if ("paths" in table) == ("session" in table):
-        raise UsageError(f"{where}: expected paths or session, and not both")
+    refuse_if(
+        ("paths" in table) == ("session" in table),
+        f"{where}: expected paths or session, and not both",
+        error=UsageError,
+    )
     key = "paths" if "paths" in table else "session"
     paths = list(
         dict.fromkeys(path for each in _list(where, table, key) for path in _find_files(folder, where, each))
     )
     name = _worded(where, "name", table.get("name", ""))
-    if name and key == "paths" and len(paths) > 1:
-        raise UsageError(f"{where} name = {name!r}: {len(paths)} recordings match", remedy="leave the name out")
+    refuse_if(
+        name and key == "paths" and len(paths) > 1,
+        f"{where} name = {name!r}: {len(paths)} recordings match",
+        remedy="leave the name out",
+        error=UsageError,
+    )
     each = [tuple(paths)] if key == "session" else [(path,) for path in paths]
     jobs = _tables(where, table, "jobs")
     return [Recording(name=name, paths=files, only=only, overrides=jobs) for files in each]
@@ -169,8 +176,7 @@ def _recordings(folder: Path, table: Table) -> list[Recording]:
 
 def _find_files(folder: Path, where: str, pattern: object) -> list[Path]:
     places = sorted(glob.glob(_worded(where, "paths", pattern), root_dir=folder, recursive=True))  # noqa: PTH207
-    if not places:
-        raise InputError(f"{where}: nothing matches {pattern!r} in {folder}", remedy="check the pattern")
+    refuse_if(not places, f"{where}: nothing matches {pattern!r} in {folder}", remedy="check the pattern")
     return [folder / place for place in places]
 
 
@@ -204,12 +210,12 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> N
     for recording in recordings:
         _check_name("[[recordings]] name", recording.name)
         other = by_name.setdefault(recording.name, recording)
-        if other is not recording:
-            both = f"{other.paths[0]} and {recording.paths[0]}"
-            raise UsageError(
-                f"two recordings are called {recording.name!r}: {both}",
-                remedy="give one a [[recordings]] of its own, with a name",
-            )
+        refuse_if(
+            other is not recording,
+            f"two recordings are called {recording.name!r}: {other.paths[0]} and {recording.paths[0]}",
+            remedy="give one a [[recordings]] of its own, with a name",
+            error=UsageError,
+        )
         for job in recording.only:
             if job not in jobs:
                 raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_suggest(job, jobs))
@@ -229,8 +235,12 @@ def _suggest(word: str, known: Sequence[str], otherwise: str = "known here") -> 
 
 
 def _check_name(where: str, name: str) -> None:
-    if not re.fullmatch(r"\w[\w.+-]*", name):
-        raise UsageError(f"{where}: {name!r} is no name of a folder", remedy="use letters, digits, . _ + -")
+    refuse_if(
+        not re.fullmatch(r"\w[\w.+-]*", name),
+        f"{where}: {name!r} is no name of a folder",
+        remedy="use letters, digits, . _ + -",
+        error=UsageError,
+    )
 
 
 def _worded(where: str, key: str, value: object) -> str:
@@ -261,7 +271,10 @@ def _amount(where: str, table: Table, key: str, units: Mapping[str, int], defaul
         amount = float(match[1]) * units[match[2]] if match else float(value)
     except (KeyError, TypeError, ValueError):
         amount = -1.0
-    if isinstance(value, bool) or not 0 <= amount < 1e15:
-        example = f" or with one of {', '.join(units)}" if units else ""
-        raise UsageError(f"{where} {key}: expected a number, 0 or more{example}, got {format_value(value)}")
+    example = f" or with one of {', '.join(units)}" if units else ""
+    refuse_if(
+        isinstance(value, bool) or not 0 <= amount < 1e15,
+        f"{where} {key}: expected a number, 0 or more{example}, got {format_value(value)}",
+        error=UsageError,
+    )
     return amount

@@ -203,7 +203,6 @@ def _run(function: Entry, task: Task) -> End:
 
 
 def _clear(task: Task) -> None:
-    """Remove outputs of another key."""
     begun = Path(task.end).with_suffix(".begun")
     if begun.is_file() and begun.read_text() != task.key and task.out:
         remove(Path(task.out))

@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
 from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, note, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
@@ -139,8 +139,11 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
     Raises UsageError for another request, InputError for unreadable or unlike runs.
     """
     num_needed = 1 if request.against is not None else 2
-    if len(request.runs) != num_needed and not (len(request.runs) == 1 and request.update_baseline is not None):
-        raise UsageError(f"compare: expected two runs, or one and --against, got {len(request.runs)}")
+    refuse_if(
+        len(request.runs) != num_needed and not (len(request.runs) == 1 and request.update_baseline is not None),
+        f"compare: expected two runs, or one and --against, got {len(request.runs)}",
+        error=UsageError,
+    )
     after = read_judged(request.runs[-1])
     before = read_baseline(request.against) if request.against is not None else read_judged(request.runs[0])
     _check_alike(before, after)
@@ -152,28 +155,33 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
 
 
 def _check_alike(before: Judged, after: Judged) -> None:
-    if before.kind != after.kind:
-        raise InputError(f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}")
-    if before.kind == "run" and before.runs.keys() != after.runs.keys():
-        expected, got = (", ".join(judged.runs) for judged in (before, after))
-        raise InputError(f"{after.path}: expected a run of {expected}, as {before.path} is, got one of {got}")
+    refuse_if(
+        before.kind != after.kind, f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}"
+    )
+    refuse_if(
+        before.kind == "run" and before.runs.keys() != after.runs.keys(),
+        f"{after.path}: expected a run of {', '.join(before.runs)}, as {before.path} is, got one of"
+        f" {', '.join(after.runs)}",
+    )
     common = [name for name in before.runs if name in after.runs]
-    if not common:
-        expected, got = (_list_names([*judged.runs]) or "none" for judged in (before, after))
-        raise InputError(
-            f"{after.path}: expected some of the runs of {before.path} ({expected}), got {got}",
-            remedy="compare runs of the same recordings",
-        )
+    expected, got = (_list_names([*judged.runs]) or "none" for judged in (before, after))
+    refuse_if(
+        not common,
+        f"{after.path}: expected some of the runs of {before.path} ({expected}), got {got}",
+        remedy="compare runs of the same recordings",
+    )
     for name in common:
         old, new = before.runs[name], after.runs[name]
-        if old.command != new.command:
-            raise InputError(f"{after.path}: {name}: expected a run of {old.command}, got one of {new.command}")
+        refuse_if(
+            old.command != new.command,
+            f"{after.path}: {name}: expected a run of {old.command}, got one of {new.command}",
+        )
         lost = sorted(old.metrics.keys() - new.metrics.keys())
-        if before.is_baseline and new.outcome and lost:
-            raise InputError(
-                f"{before.path}: {name}: has figures that this run has not: {_list_names(lost)}",
-                remedy="run it with the options of then, or write the baseline anew with --update-baseline",
-            )
+        refuse_if(
+            before.is_baseline and new.outcome and lost,
+            f"{before.path}: {name}: has figures that this run has not: {_list_names(lost)}",
+            remedy="run it with the options of then, or write the baseline anew with --update-baseline",
+        )
 
 
 def _compare(before: Judged, after: Judged) -> CompareResult:
@@ -195,21 +203,6 @@ def _compare(before: Judged, after: Judged) -> CompareResult:
         "num_worse": len(alone) + sum(one.change is Change.WORSE for one in jobs),
         "num_better": sum(one.change is Change.BETTER for one in found),
     }
-    weighed = [
-        *((-one.share, one.metric, _figure_reason(one, after.kind)) for one in alone),
-        *((-one.worst.share, one.metric, _job_reason(one)) for one in jobs if one.change is Change.WORSE),
-    ]
-    ordered = sorted(weighed, key=lambda one: one[:2])
-    single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
-    more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
-    notes = {
-        "single recordings": [f"{one.metric} of {one.worst.run}: {one.worst.sentence}{more}" for one in single[:1]],
-        "runs": [
-            f"only in {side.path}: {_list_names(names)}"
-            for side, names in ((before, only_before), (after, only_after))
-            if names
-        ],
-    }
     num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
     counted = f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
     reasons = [
@@ -217,8 +210,12 @@ def _compare(before: Judged, after: Judged) -> CompareResult:
         if num_figures or num_verdicts
         else lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides"),
         *_verdict_reasons(verdicts, after),
-        *(reason for *_, reason in ordered),
-        *(note(criterion=name, sentence=sentence) for name, sentences in notes.items() for sentence in sentences),
+        *_regressions(alone, jobs, after.kind),
+        *(
+            note(criterion="runs", sentence=f"only in {side.path}: {_list_names(names)}")
+            for side, names in ((before, only_before), (after, only_after))
+            if names
+        ),
     ]
     return CompareResult(
         verdict=verdict_of(
@@ -292,9 +289,7 @@ def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, fl
 
 
 def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
-    """Changes of figures with enough recordings: the whole interval is on one side, and the mean exceeds the mean
-    tolerance.
-    """
+    """Changes of figures over enough recordings, worse or better by interval and mean."""
     by_job: dict[tuple[str, str], list[FigureChange]] = {}
     for one in found:
         if one.better is not Better.NEITHER and one.after is not None:
@@ -333,6 +328,21 @@ def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: Judged) -> It
         )
 
 
+def _regressions(figures: Sequence[FigureChange], jobs: Sequence[JobChange], kind: str) -> Iterator[Reason]:
+    """Reasons for what got worse, the most first; a note on single recordings."""
+    weighed = [
+        *((-one.share, one.metric, _figure_reason(one, kind)) for one in figures),
+        *((-one.worst.share, one.metric, _job_reason(one)) for one in jobs if one.change is Change.WORSE),
+    ]
+    yield from (reason for *_, reason in sorted(weighed, key=lambda one: one[:2]))
+    single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
+    more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
+    for one in single[:1]:
+        yield note(
+            criterion="single recordings", sentence=f"{one.metric} of {one.worst.run}: {one.worst.sentence}{more}"
+        )
+
+
 def _figure_reason(one: FigureChange, kind: str) -> Reason:
     return failed(
         criterion=one.metric if kind == "run" else f"{one.metric} of {one.run}",
@@ -366,7 +376,6 @@ def _job_reason(one: JobChange) -> Reason:
 
 
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
-    """Differing settings, versions and inputs, of the first such run."""
     found: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
         for name, value in old.settings.items():

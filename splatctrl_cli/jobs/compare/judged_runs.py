@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate import field_accuracy, score_report
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
@@ -85,19 +85,22 @@ def read_judged(path: Path) -> Judged:
     """Read the folder of a judging command or a batch. Raises InputError for others."""
     has_batch, has_run = is_batch(path), (path / "run.json").is_file()
     is_begun = not has_batch and not has_run and path.with_name(path.name + PARTIAL).exists()
-    if path.name.endswith(PARTIAL) or is_begun:
-        raise InputError(f"{path}: is still being written, or was interrupted", remedy="wait for it, or run it again")
+    refuse_if(
+        path.name.endswith(PARTIAL) or is_begun,
+        f"{path}: is still being written, or was interrupted",
+        remedy="wait for it, or run it again",
+    )
     if has_batch:
         return Judged(path=path, kind="batch", runs={run.name: run for run in _nodes_of(open_batch(path))})
-    if not has_run:
-        what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
-        raise InputError(f"{path}: expected the output folder of a command or a batch, got {what}")
+    what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
+    refuse_if(not has_run, f"{path}: expected the output folder of a command or a batch, got {what}")
     run = open_run(path)
     command = run.command
-    if not run.verdict or command not in (*scales(), "demo"):
-        raise InputError(
-            f"{path}: a run of {command}, which judges nothing", remedy=f"give one of {', '.join(scales())}"
-        )
+    refuse_if(
+        not run.verdict or command not in (*scales(), "demo"),
+        f"{path}: a run of {command}, which judges nothing",
+        remedy=f"give one of {', '.join(scales())}",
+    )
     return Judged(
         path=path,
         kind="run",
@@ -177,32 +180,35 @@ def read_baseline(path: Path) -> Judged:
         ) from None
     except ValueError as error:
         raise InputError(f"{path}: expected a baseline in TOML: {error}", remedy=ANEW) from None
-    if document.get("format") != BASELINE:
-        raise InputError(
-            f"{path}: expected a baseline, got another TOML file", remedy="give one of --update-baseline"
-        )
-    if (found := document.get("version")) != VERSION:
-        raise InputError(
-            f"{path}: a baseline of version {found}, this splatctrl reads {VERSION}",
-            remedy="update splatctrl" if (found or 0) > VERSION else ANEW,
-        )
+    refuse_if(
+        document.get("format") != BASELINE,
+        f"{path}: expected a baseline, got another TOML file",
+        remedy="give one of --update-baseline",
+    )
+    refuse_if(
+        (found := document.get("version")) != VERSION,
+        f"{path}: a baseline of version {found}, this splatctrl reads {VERSION}",
+        remedy="update splatctrl" if (found or 0) > VERSION else ANEW,
+    )
     version, runs = str(document.get("splatctrl", "")), {}
-    try:
+    with refuse_faults(
+        lambda error: f"{path}: damaged: {type(error).__name__}: {error}",
+        *(KeyError, TypeError, ValueError, AttributeError),
+        remedy=ANEW,
+    ):
         kind = str(document["kind"])
         for name, one in document["run"].items():
             metrics = one.pop("metrics", {})
-            if unknown := [metric for metric in metrics if metric not in scales().get(one["command"], {})]:
-                raise InputError(
-                    f"{path}: {name}: no figures of {one['command']}: {', '.join(unknown[:5])}", remedy=ANEW
-                )
+            unknown = [metric for metric in metrics if metric not in scales().get(one["command"], {})]
+            refuse_if(
+                unknown, f"{path}: {name}: no figures of {one['command']}: {', '.join(unknown[:5])}", remedy=ANEW
+            )
             runs[name] = JudgedRun(
                 name=name,
                 metrics={metric: float(value) for metric, value in metrics.items()},
                 settings={"splatctrl": version},
                 **one,
             )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: damaged: {type(error).__name__}: {error}", remedy=ANEW) from None
     return Judged(path=path, kind=kind, runs=runs, is_baseline=True)
 
 
@@ -211,8 +217,12 @@ def write_baseline(path: Path, judged: Judged) -> None:
 
     Raises UsageError if `path` is another file.
     """
-    if path.exists() and (not path.is_file() or BASELINE.encode() not in path.read_bytes()[:200]):
-        raise UsageError(f"{path}: exists, and is no baseline", remedy="give another --update-baseline")
+    refuse_if(
+        path.exists() and (not path.is_file() or BASELINE.encode() not in path.read_bytes()[:200]),
+        f"{path}: exists, and is no baseline",
+        remedy="give another --update-baseline",
+        error=UsageError,
+    )
     head = {"format": BASELINE, "version": VERSION, "splatctrl": __version__, "kind": judged.kind}
     lines = [HEAD, *(f"{name} = {_toml(value)}\n" for name, value in head.items())]
     for name, run in sorted(judged.runs.items()):

@@ -15,7 +15,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import EXPORT_DIFFERENCE, EXPORT_MAX_COLOR, EXPORT_MIN_PSNR, EXPORT_VIEWS
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError, refuse_if, require
 from splatctrl_cli.files.output import finite, output_path, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import Snapshot, open_scene
@@ -42,7 +42,7 @@ from splatctrl_cli.formats.splat.splats import (
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
+from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, beside, open_run
 from splatctrl_cli.jobs.score.views import render_splats
 from splatctrl_cli.recording.container.mcap_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
@@ -101,23 +101,32 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     errors above the format's rounding.
     """
     source = _splat_file(request.scene)
-    out = request.out or _beside(request.scene)
+    out = request.out or beside(request.scene, ".ply")
     kind = _format(out, request.layout)
-    if os.path.realpath(out) == os.path.realpath(source):
-        raise UsageError(f"{out}: is the input itself", remedy="give another --out")
+    refuse_if(
+        os.path.realpath(out) == os.path.realpath(source),
+        f"{out}: is the input itself",
+        remedy="give another --out",
+        error=UsageError,
+    )
     splats, comments, exact = read_source(source)
     check_no_shell(source, comments)  # most formats would lose the mark that separates it from surfaces
     _check_colors(source, splats)
     is_chosen = np.isin(splats.labels, [*Label] if request.labels is None else list(request.labels))
     selected, exact = (splats, exact) if request.labels is None else (splats.select(is_chosen), exact[is_chosen])
-    if not len(selected):
-        raise NotEvaluableError(f"{source}: no splat to write among {len(splats)}", remedy="give other --labels")
+    refuse_if(
+        not len(selected),
+        f"{source}: no splat to write among {len(splats)}",
+        remedy="give other --labels",
+        error=NotEvaluableError,
+    )
     chosen = nearest_splats(selected) if request.isotropic and isinstance(selected, GaussianSet) else selected
-    if request.layout == "short" and isinstance(chosen, GaussianSet):
-        raise UsageError(
-            f"--layout short: expected isotropic splats, {source} has {len(chosen)} Gaussians that are not all so",
-            remedy="give --isotropic, or --layout full",
-        )
+    refuse_if(
+        request.layout == "short" and isinstance(chosen, GaussianSet),
+        f"--layout short: expected isotropic splats, {source} has {len(chosen)} Gaussians that are not all so",
+        remedy="give --isotropic, or --layout full",
+        error=UsageError,
+    )
     # these describe a PLY's layout: wrong for the next file
     kept = {key: value for key, value in comments.items() if key not in {"splat", "label"}}
     name = source.name if source.name.isprintable() else ascii(source.name)
@@ -149,24 +158,24 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
         )
 
 
-def _beside(scene: Path) -> Path:
-    place = scene if scene.name.strip(".") else Path(os.path.realpath(scene))  # . and .. have no name of their own
-    suffix = "" if scene.is_dir() else scene.suffix
-    return place.with_name(f"{place.name.removesuffix(suffix)}.ply")
-
-
 def _splat_file(scene: Path) -> Path:
     file = scene / "splats.ply" if scene.is_dir() else scene
-    if not file.is_file():
-        said = "has no splats.ply" if scene.exists() else "no such scene"
-        raise InputError(f"{scene}: {said}", remedy="give a folder that reconstruct wrote, or a splat file")
+    refuse_if(
+        not file.is_file(),
+        f"{scene}: {'has no splats.ply' if scene.exists() else 'no such scene'}",
+        remedy="give a folder that reconstruct wrote, or a splat file",
+    )
     return file
 
 
 def _format(out: Path, layout: str | None) -> SplatFormat:
     kind = format_of(out)
-    if layout is not None and kind is not FORMATS[".ply"]:
-        raise UsageError(f"--layout {layout}: {out} is not a PLY", remedy="leave it out")
+    refuse_if(
+        layout is not None and kind is not FORMATS[".ply"],
+        f"--layout {layout}: {out} is not a PLY",
+        remedy="leave it out",
+        error=UsageError,
+    )
     return REFERENCE_PLY if layout == "full" else kind
 
 
@@ -195,22 +204,25 @@ def _gaussians(splats: Splats) -> GaussianSet:
 def _check_differences(
     out: Path, held: GaussianSet, back: GaussianSet, bound: Differences, exact: Float64
 ) -> Differences:
-    if len(held) != len(back) or not np.array_equal(held.labels, back.labels):
-        raise WriteError(f"{out}: differs from its source: {len(back)} of {len(held)} splats, or other labels")
+    refuse_if(
+        len(held) != len(back) or not np.array_equal(held.labels, back.labels),
+        f"{out}: differs from its source: {len(back)} of {len(held)} splats, or other labels",
+        error=WriteError,
+    )
     found = differences(held, back, exact)
-    if beyond := found.beyond(bound):
-        raise WriteError(f"{out}: differs from its source: {'; '.join(beyond)}")
+    refuse_if(beyond := found.beyond(bound), f"{out}: differs from its source: {'; '.join(beyond)}", error=WriteError)
     return found
 
 
 def _check_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> tuple[float, float | None, float]:
     largest, psnr, covered = _look(source, back)
     looks_the_same = psnr is None or psnr >= EXPORT_MIN_PSNR
-    if not kind.is_rounded and not (looks_the_same and largest <= EXPORT_DIFFERENCE):
-        raise WriteError(
-            f"{out}: does not render as its source: PSNR {psnr} dB, largest pixel difference "
-            f"{largest:.3g}, expected at least {EXPORT_MIN_PSNR:g} dB and at most {EXPORT_DIFFERENCE:.3g}"
-        )
+    refuse_if(
+        not kind.is_rounded and not (looks_the_same and largest <= EXPORT_DIFFERENCE),
+        f"{out}: does not render as its source: PSNR {psnr} dB, largest pixel difference "
+        f"{largest:.3g}, expected at least {EXPORT_MIN_PSNR:g} dB and at most {EXPORT_DIFFERENCE:.3g}",
+        error=WriteError,
+    )
     return largest, psnr, covered
 
 
@@ -277,8 +289,7 @@ class ExportRunResult(WrittenFile):
 def export_run(request: ExportRunRequest) -> ExportRunResult:
     """Write the MCAP. Raises InputError for another folder, UsageError for a missing library."""
     parts = sorted(_parts(open_run(request.path), request.roots), key=lambda part: part[:2])
-    name = request.path.absolute()
-    out = request.out or name.with_name(f"{name.name}.mcap")
+    out = request.out or beside(request.path.absolute(), ".mcap")
     with output_path(out, force=request.force, is_folder=False) as written:
         with foxglove_log(written) as log:
             for _, _, write in parts:
@@ -288,9 +299,8 @@ def export_run(request: ExportRunRequest) -> ExportRunResult:
 
 def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:
     if run.command == REPLAY:
-        if run.states is None:
-            raise InputError(f"{run.path}: no steps.csv", remedy="replay again")
-        yield from _replay_parts(run, run.states, roots)
+        states = require(run.states, f"{run.path}: no steps.csv", remedy="replay again")
+        yield from _replay_parts(run, states, roots)
     elif (run.path / "field.npz").is_file():
         yield 0, 0, partial(_field, 0, run.parts.checked(run.path / "field.npz"))
     elif (run.path / "splats.ply").is_file():

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TextIO
@@ -15,7 +14,7 @@ from tqdm import tqdm
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_TABLE, MARCH_STEPS
 from splatctrl_cli.control.audit import observed_at
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.field.clusters import DEFAULT_LABELS, ObstacleSpheres, Spheres, obstacle_spheres
 from splatctrl_cli.field.distance import OnDevice, SphereField, field_over, march
 from splatctrl_cli.field.grid_cells import GridField, check_room
@@ -25,9 +24,9 @@ from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.ply import point_blocks
 from splatctrl_cli.formats.scene.scene_folder import run_value
 from splatctrl_cli.jobs.bake.request import BakeSource, read_bake_source, source_of_grid
-from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, choose_device, explain_fault
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, choose_device, explain_faults
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
-from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory
+from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.records import Bool, Box, DistanceField, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import VoxelState
 
@@ -63,114 +62,105 @@ class Answers:
     rest: Float64 | None = None
 
 
-class SceneAnswers:
-    """A scene's splats and balls around unrepresented voxels, as a field by `config`."""
+def scene_answers(
+    source: BakeSource, obstacles: ObstacleSpheres, config: Config, threads: int, device: Memory | None = None
+) -> Callable[..., Answers]:
+    """Answers of a scene's splats, and balls around unrepresented voxels, as a field by `config`.
 
-    def __init__(
-        self,
-        source: BakeSource,
-        obstacles: ObstacleSpheres,
-        config: Config,
-        threads: int,
-        device: Memory | None = None,
-    ) -> None:
-        """Build the fields, on the card `device` if given.
+    A function of points (Q, 3) [m], world, and perhaps a grid's answers, which it completes, with the probability at
+    the grid's distance. Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
+    """
+    refuse_if(
+        config.field.unknown != "free",
+        f"field.unknown = {config.field.unknown}: only a baked field has it",
+        remedy="bake it with sdf-bake and query that",
+        error=UsageError,
+    )
+    splats, known, limits = obstacles.splats, source.occupancy, config.occupancy
+    spheres = Spheres.of(splats.centers, splats.radii)
+    exact: SphereField | OnDevice
+    field: DistanceField
+    if device is None:
+        exact, field = SphereField(spheres, threads=threads), field_over(spheres, config.field, threads=threads)
+    else:
+        exact = OnDevice(spheres, replace(config.field, distance="hard"), device)
+        field = OnDevice(spheres, config.field, device, threads=threads)
+    probability = make_probability(spheres, config.field, threads=threads)
+    reach = float(np.abs(splats.centers - spheres.anchor).max())
+    states = None if known is None else known.states(limits.free_below, limits.occupied_above)
 
-        Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
-        """
-        if config.field.unknown != "free":
-            raise UsageError(
-                f"field.unknown = {config.field.unknown}: only a baked field has it",
-                remedy="bake it with sdf-bake and query that",
-            )
-        splats = obstacles.splats
-        self._spheres = Spheres.of(splats.centers, splats.radii)
-        self._exact: SphereField | OnDevice
-        self._field: DistanceField
-        if device is None:
-            self._exact = SphereField(self._spheres, threads=threads)
-            self._field = field_over(self._spheres, config.field, threads=threads)
-        else:
-            self._exact = OnDevice(self._spheres, replace(config.field, distance="hard"), device)
-            self._field = OnDevice(self._spheres, config.field, device, threads=threads)
-        self._probability = make_probability(self._spheres, config.field, threads=threads)
-        self._labels, self._index = splats.labels, obstacles.index
-        self._workspace, known, limits = source.workspace, source.occupancy, config.occupancy
-        self._observed = None
-        if known is not None:
-            states = known.states(limits.free_below, limits.occupied_above)
-            self._observed = partial(observed_at, states, known.origin, known.voxel)
-        self._reach = float(np.abs(splats.centers - self._spheres.anchor).max())
-
-    def at(self, points: Float64) -> Answers:
-        """Answer at points (Q, 3) [m], world."""
-        distance, gradient = self._field.query(points)
-        nearest = self._exact.nearest(points)
-        surface, rest, _ = march(self._field, self._exact, points, steps=MARCH_STEPS)
-        size = self._reach + np.abs(points - self._spheres.anchor).max(axis=1)
-        return Answers(
-            in_box=None if self._workspace is None else self._workspace.contains(points),
+    def at(points: Float64, of_grid: Answers | None = None) -> Answers:
+        distance, gradient = field.query(points)
+        nearest = exact.nearest(points)
+        surface, rest, _ = march(field, exact, points, steps=MARCH_STEPS)
+        size = reach + np.abs(points - spheres.anchor).max(axis=1)
+        observed = None
+        if known is not None and states is not None:
+            observed = observed_at(states, known.origin, known.voxel, points).astype(np.int8)
+        answers = Answers(
+            in_box=None if source.workspace is None else source.workspace.contains(points),
             distance=distance,
             gradient=gradient,
             # what float32 may lose of an exact distance, as in a baked bound
-            bound=self._exact.query(points)[0] - 1e-6 * (1.0 + size),
-            probability=self._probability.at(points, distance),
-            label=self._labels[nearest].astype(np.int8),
-            splat=self._index[nearest],
-            observed=None if self._observed is None else self._observed(points).astype(np.int8),
+            bound=exact.query(points)[0] - 1e-6 * (1.0 + size),
+            probability=probability.at(points, distance),
+            label=splats.labels[nearest].astype(np.int8),
+            splat=obstacles.index[nearest],
+            observed=observed,
             surface=surface,
             rest=rest,
         )
-
-    def complete(self, points: Float64, of_grid: Answers) -> Answers:
-        """Add the scene's answers to a grid's; probability is at the grid's distance."""
-        probability = self._probability.at(points, of_grid.distance)
+        if of_grid is None:
+            return answers
+        at_grid = probability.at(points, of_grid.distance)
         return replace(
-            self.at(points),
+            answers,
             in_box=of_grid.in_box,
             distance=of_grid.distance,
             gradient=of_grid.gradient,
             bound=of_grid.bound,
-            probability=np.where(np.isnan(of_grid.distance), np.nan, probability),
+            probability=np.where(np.isnan(of_grid.distance), np.nan, at_grid),
         )
 
+    return at
 
-class GridAnswers:
-    """Channels of a baked grid: interpolated distances, labels and observations of the nearest cell."""
 
-    def __init__(self, grid: DistanceGrid, where: str) -> None:
-        """Read the channels. Raises InputError as `GridField` does, and for unknown labels or states."""
-        self._field = GridField(grid)
-        self.box = self._field.box
-        self._has_bound = "bound" in grid.channels
-        self._probability = GridField(grid, "probability") if "probability" in grid.channels else None
-        self._cells = {}
-        for name in _NAMES.keys() & grid.channels.keys():
-            values, most = grid.channels[name].astype(np.uint8), len(_NAMES[name]) - 2
-            if values.max() > most:
-                raise InputError(
-                    f"{where}: {name}: expected 0 to {most}, got {values.max()}", remedy="bake the field again"
-                )
-            self._cells[name] = partial(observed_at, values, grid.origin, grid.voxel)
+def grid_answers(grid: DistanceGrid, where: str) -> tuple[Box, Callable[[Float64], Answers]]:
+    """Box of a baked grid's cell centres, and its answers at points (Q, 3) [m], world, none outside.
 
-    def at(self, points: Float64) -> Answers:
-        """Answer at points (Q, 3) [m], world; none outside the box of cell centres."""
-        inside = self._field.box.contains(points)
-        distance, gradient = self._field.query(points)
-        probability = None if self._probability is None else self._probability.query(points)[0]
+    Distances are interpolated, labels and observations of the nearest cell. Raises InputError as `GridField` does,
+    and for unknown labels or states.
+    """
+    field, has_bound = GridField(grid), "bound" in grid.channels
+    of_probability = GridField(grid, "probability") if "probability" in grid.channels else None
+    cells = {name: grid.channels[name].astype(np.uint8) for name in _NAMES.keys() & grid.channels.keys()}
+    for name, values in cells.items():
+        most = len(_NAMES[name]) - 2
+        refuse_if(
+            values.max() > most,
+            f"{where}: {name}: expected 0 to {most}, got {values.max()}",
+            remedy="bake the field again",
+        )
+
+    def at(points: Float64) -> Answers:
+        inside = field.box.contains(points)
+        distance, gradient = field.query(points)
+        probability = None if of_probability is None else of_probability.query(points)[0]
+        nearest = {
+            name: np.where(inside, observed_at(values, grid.origin, grid.voxel, points), -1).astype(np.int8)
+            for name, values in cells.items()
+        }
         return Answers(
             in_box=inside,
             distance=np.where(inside, distance, np.nan),
             gradient=np.where(inside[:, None], gradient, np.nan),
-            bound=np.where(inside, self._field.certified(points), np.nan) if self._has_bound else None,
+            bound=np.where(inside, field.certified(points), np.nan) if has_bound else None,
             probability=None if probability is None else np.where(inside, probability, np.nan),
-            label=self._nearest("label", points, inside),
-            observed=self._nearest("observed", points, inside),
+            label=nearest.get("label"),
+            observed=nearest.get("observed"),
         )
 
-    def _nearest(self, channel: str, points: Float64, inside: Bool) -> NDArray[np.int8] | None:
-        look = self._cells.get(channel)
-        return None if look is None else np.where(inside, look(points), -1).astype(np.int8)
+    return field.box, at
 
 
 def rows_of(points: Float64, answers: Answers) -> str:
@@ -252,10 +242,8 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
             kind, answer, box, device = _open_source(request, progress)
         with stopwatch.stage("answer"):
             for points in _blocks(request.points, progress):
-                try:
+                with explain_faults(device):
                     answers = answer(points)
-                except DeviceError as error:
-                    raise explain_fault(error, device) from error
                 figures.append(_figures_of(answers))
                 if out is not None:
                     out.write(rows_of(points, answers))
@@ -276,23 +264,33 @@ Answering = tuple[str, Callable[[Float64], Answers], Box | None, Device | None]
 def _open_source(request: QueryRequest, progress: Progress) -> Answering:
     file = _grid_file(request.source)
     if file is None:
-        if request.scene is not None:
-            raise UsageError(
-                f"--scene: belongs to a field, and {request.source} is a scene", remedy="leave --scene out"
-            )
+        refuse_if(
+            request.scene is not None,
+            f"--scene: belongs to a field, and {request.source} is a scene",
+            remedy="leave --scene out",
+            error=UsageError,
+        )
         source = read_bake_source(request.source, request.at)
         device = choose_device(request.device, _is_enough(request.points), progress)
         scene = _scene(source, request, request.labels, request.config, device)
-        return "scene", scene.at, source.workspace, device
-    if request.at is not None:
-        raise UsageError(f"--at: {request.source} is a field of one time", remedy="give the scene, or leave --at out")
+        return "scene", scene, source.workspace, device
+    refuse_if(
+        request.at is not None,
+        f"--at: {request.source} is a field of one time",
+        remedy="give the scene, or leave --at out",
+        error=UsageError,
+    )
     check_room(str(file), file.stat().st_size, "bake a smaller --box or a larger --voxel")
     grid = read_npz(Parts.beside(file).checked(file))
-    of_grid = GridAnswers(grid, str(file))
+    box, of_grid = grid_answers(grid, str(file))
     if request.scene is None:
-        if request.device.startswith(CUDA):
-            raise UsageError(f"--device {request.device}: a baked field is read on the processor", remedy=TO_CPU)
-        return "field", of_grid.at, of_grid.box, None
+        refuse_if(
+            request.device.startswith(CUDA),
+            f"--device {request.device}: a baked field is read on the processor",
+            remedy=TO_CPU,
+            error=UsageError,
+        )
+        return "field", of_grid, box, None
     where = str(request.source)
     labels = run_value(
         grid.header, ("labels",), lambda names: frozenset(Label[name.upper()] for name in names), where=where
@@ -301,11 +299,7 @@ def _open_source(request: QueryRequest, progress: Progress) -> Answering:
     config = replace(request.config, field=replace(request.config.field, unknown="free", **baked))
     device = choose_device(request.device, _is_enough(request.points), progress)
     both = _scene(source_of_grid(where, grid, request.scene), request, labels, config, device)
-
-    def at(points: Float64) -> Answers:
-        return both.complete(points, of_grid.at(points))
-
-    return "field and scene", at, of_grid.box, device
+    return "field and scene", lambda points: both(points, of_grid(points)), box, device
 
 
 def _is_enough(points: Path | TextIO) -> bool:
@@ -319,16 +313,17 @@ def _grid_file(source: Path) -> Path | None:
     file = source / "field.npz"
     if file.is_file():
         return file
-    if (source / "field.json").is_file():
-        raise InputError(f"{source}: a field without field.npz", remedy="bake it with --formats npz")
+    refuse_if(
+        (source / "field.json").is_file(), f"{source}: a field without field.npz", remedy="bake it with --formats npz"
+    )
     return None
 
 
 def _scene(
     source: BakeSource, request: QueryRequest, labels: frozenset[Label], config: Config, device: Device
-) -> SceneAnswers:
+) -> Callable[..., Answers]:
     obstacles = obstacle_spheres(source.splats, source.unrepresented, labels)
-    return SceneAnswers(source, obstacles, config, request.threads, device.memory)
+    return scene_answers(source, obstacles, config, request.threads, device.memory)
 
 
 def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
@@ -339,10 +334,10 @@ def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
                 yield block
                 bar.update(len(block))
         return
-    try:
+    with refuse_faults(
+        lambda _: f"{points}: no such file", FileNotFoundError, remedy="give a CSV file with the columns x,y,z [m]"
+    ):
         raw = points.open("rb")
-    except FileNotFoundError:
-        raise InputError(f"{points}: no such file", remedy="give a CSV file with the columns x,y,z [m]") from None
     size = points.stat().st_size
     text = TextIOWrapper(raw, encoding="utf-8", newline="")
     with text, tqdm(total=size, unit="B", unit_scale=True, disable=hidden) as bar:

@@ -16,7 +16,7 @@ from splatctrl_cli.calibration.pose_refinement import (
     unbent,
 )
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_if, require
 from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT
@@ -42,11 +42,12 @@ class Corrections:
 
     def check(self, source: RecordSource) -> None:
         """Raise UsageError for a recording over time."""
-        if self and source.has_clock:
-            raise UsageError(
-                f"{self.options}: {source.name} is recorded over time; only views of a still scene are corrected",
-                remedy="leave it out; 'splatctrl calibrate' places the cameras of a log",
-            )
+        refuse_if(
+            self and source.has_clock,
+            f"{self.options}: {source.name} is recorded over time; only views of a still scene are corrected",
+            remedy="leave it out; 'splatctrl calibrate' places the cameras of a log",
+            error=UsageError,
+        )
 
     def of(
         self, frames: Sequence[RgbdFrame], name: str, console: Progress, *, has_robot: bool = False
@@ -57,9 +58,10 @@ class Corrections:
         """
         if not self:
             return list(frames), {}
-        depth = RecordedDepth.of(frames)
-        if depth is None:
-            raise InputError(f"{name}: {self.options}: no view has depth, which alone says what views have in common")
+        depth = require(
+            RecordedDepth.of(frames),
+            f"{name}: {self.options}: no view has depth, which alone says what views have in common",
+        )
         scale, told = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
         rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
         moved = list(frames)
@@ -166,19 +168,13 @@ def corrected_among(
         return frame
     scale, free = depth.median / fixed.SCALE_DEPTH, np.arange(len(others) + 1) == 0
     respects = next(iter(corrections.values()))
-    bend = _bend_of(frame, others, corrections)
+    # of the frame's camera, or of the only one with its intrinsics
+    cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
+    camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
+    bend = next((row.bend for (name, _), row in corrections.items() if name == camera), None)
     frame = frame if bend is None else unbent(frame, bend)
     if respects.T_world_camera is not None:
         frame = replace(frame, T_world_camera=refined_poses([frame, *others], scale, free).T_world_camera[0])
     if respects.gain is not None:
         frame = exposed(frame, exposure_gains([frame, *others], scale, free)[0])
     return frame
-
-
-def _bend_of(
-    frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
-) -> Float64 | None:
-    """Bend of the frame's camera, or of the only one with its intrinsics."""
-    cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
-    camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
-    return next((row.bend for (name, _), row in corrections.items() if name == camera), None)

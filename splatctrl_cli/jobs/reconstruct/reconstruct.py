@@ -11,7 +11,7 @@ import numpy as np
 from splatctrl_cli.calibration.displacement import displaced_cameras, placed
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
 from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names, counted
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.formats.arrays import savez
@@ -19,10 +19,10 @@ from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT
 from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_camera
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest, training_cameras
-from splatctrl_cli.jobs.reconstruct.verdict import GATED, Reconstructed, reconstruct_verdict
+from splatctrl_cli.jobs.reconstruct.verdict import GATED, reconstruct_verdict
 from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, RobotOptions, add_self_model, other_frame, urdf_of
-from splatctrl_cli.jobs.running.device import FitDevice
+from splatctrl_cli.jobs.running.device import FitDevice, explain_faults
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, checkpoint_to_go_on_from, identity
 from splatctrl_cli.recording.calibrated import LOGGED
@@ -35,7 +35,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_fusion import REACH, choose_moments, learn
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import own_spheres
-from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from splatctrl_cli.robot.urdf import read_urdf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         output_path(
             request.out, force=request.force, is_folder=True, checkpoint=CHECKPOINT, resume=request.resume
         ) as partial,
-        device.told_how_to_go_on(checkpoint_file),
+        explain_faults(device, checkpoint_file),
     ):
         inputs = request.source.digests()
         run = _identity(request, inputs)
@@ -90,21 +90,12 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
                 fitted.run(progress)
             with stopwatch.stage("write"):
                 fitted.finish()
-        for table, index in declared.unused():
-            if table == "carried":
-                progress.log(
-                    f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it; check its"
-                    " link and box, or leave it out"
-                )
-        learned = [] if robot is None or robot.self_model is None else robot.self_model.parts
-        made = Reconstructed(
-            metrics=fitted.metrics(),
-            rows=fitted.rows,
-            config=fitted.config,
-            loss=request.source.loss,
-            is_seeded=request.points is not None,
-            learned=[part.words(fitted.rows[0].stamp_ns) for part in learned],
-        )
+        for index in [index for table, index in declared.unused() if table == "carried"]:
+            progress.log(
+                f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it; check its"
+                " link and box, or leave it out"
+            )
+        made = fitted.result()
         verdict = reconstruct_verdict(made, request.require)
         write_run(
             partial,
@@ -136,9 +127,7 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
 def _learn_self(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
 ) -> tuple[RobotModel | None, dict[str, dict[str, Any]]]:
-    """Add the self-model to the robot, and find `displaced_cameras`. It is the given one, the resumed run's, or what
-    the recording shows.
-    """
+    """Add the self-model, given, resumed or learned, to the robot; find `displaced_cameras`."""
     if robot is None:
         return None, {}
     seen = arm_seen(robot, request.source, progress)
@@ -160,8 +149,7 @@ def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations
     """Read declarations, none without a file. Raises UsageError without a robot."""
     if path is None:
         return Declarations()
-    if robot is None:
-        raise UsageError(f"--declare {path}: needs the robot", remedy="give --urdf as well")
+    robot = require(robot, f"--declare {path}: needs the robot", remedy="give --urdf as well", error=UsageError)
     return read_declarations(path, robot.frame_names)
 
 
@@ -169,14 +157,18 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     urdf = urdf_of(request.urdf, [request.recording] if request.recording else [], progress)
     if urdf is None:
         for option, path in (("spheres", request.spheres), ("self-model", request.self_model)):
-            if path not in (None, NO_SELF_MODEL):
-                raise UsageError(f"--{option} {path}: needs the robot", remedy="give --urdf as well")
+            refuse_if(
+                path not in (None, NO_SELF_MODEL),
+                f"--{option} {path}: needs the robot",
+                remedy="give --urdf as well",
+                error=UsageError,
+            )
         return None
-    if guess := guessed_unit(request.source):
-        raise InputError(
-            f"{request.source.name}: {guess}; a robot needs lengths in metres that nobody guessed",
-            remedy="write poses and depth in metres, or leave the robot out",
-        )
+    refuse_if(
+        guess := guessed_unit(request.source),
+        f"{request.source.name}: {guess}; a robot needs lengths in metres that nobody guessed",
+        remedy="write poses and depth in metres, or leave the robot out",
+    )
     try:
         model = RobotModel.from_urdf(urdf, request.spheres)
         if request.source.joint_names:
@@ -184,7 +176,12 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
             model.joint_columns(request.source.joint_names)
         model = add_self_model(model, request.self_model)
         if request.urdf is None:
-            _check_fits(urdf, request.source)
+            refuse_if(
+                words := other_frame(urdf, request.source),
+                f"{urdf.path}: {words}",
+                remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one",
+            )
+            _check_has_states(request.source)
             progress.log(f"the robot is the log's own: {urdf.path}")
         notes = model.surface.notes
     except InputError as error:
@@ -199,13 +196,10 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     return model
 
 
-def _check_fits(urdf: UrdfFile, source: RecordSource) -> None:
-    if words := other_frame(urdf, source):
-        raise InputError(
-            f"{urdf.path}: {words}", remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one"
-        )
-    if not source.joint_names:
-        raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")
+def _check_has_states(source: RecordSource) -> None:
+    refuse_if(
+        not source.joint_names, f"{source.name}: expected joint states, got none", remedy="record /joint_states"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,8 +223,7 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
     model = request.posed(urdf, own_spheres(urdf))
     with output_path(request.out, force=request.force, is_folder=False) as partial:
         source = open_source(request.log, request.options)
-        if not source.joint_names:
-            raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")
+        _check_has_states(source)
         arm = arm_of(model.moved_by(source.joint_names), source)
         frames = frames_of(arm, source, progress)
         off = displaced_cameras(arm, frames)
@@ -273,8 +266,7 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
     stamps = {camera: its for camera, its in stamps.items() if camera in training_cameras(source)}
     found = [(stamp, arm.surface_poses(stamp)) for stamp in spread(min(stamps.values(), key=len), 2000)]
     posed = [(stamp, T) for stamp, T in found if T is not None]
-    if not posed:
-        raise InputError(f"{source.name}: no frame has a joint state within {1e-9 * STATES_CLOSE_NS:g} s")
+    refuse_if(not posed, f"{source.name}: no frame has a joint state within {1e-9 * STATES_CLOSE_NS:g} s")
     order = choose_moments(arm.surface, np.array([T for _, T in posed]))
     chosen = frames_nearest(stamps, [posed[number][0] for number in order])
     frames = [

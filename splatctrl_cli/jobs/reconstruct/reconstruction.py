@@ -12,12 +12,13 @@ from tqdm import tqdm
 
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config import SceneConfig, fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.formats.ply import read_points
 from splatctrl_cli.formats.scene.scene_folder import FORMAT
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, SceneWriter
 from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
 from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
+from splatctrl_cli.jobs.reconstruct.verdict import Reconstructed
 from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, guessed_unit
 from splatctrl_cli.jobs.recordings.provenance import first_frame
 from splatctrl_cli.jobs.running.device import CPU, Device, FitDevice, RunOptions
@@ -39,8 +40,12 @@ KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes a c
 def training_cameras(source: RecordSource) -> list[str]:
     """Cameras that may train. Raises UsageError without any."""
     cameras = [camera for camera in source.cameras if camera != "holdout"]
-    if not cameras:
-        raise UsageError(f"{source.name}: no camera is left to train on", remedy="camera 'holdout' is kept for score")
+    refuse_if(
+        not cameras,
+        f"{source.name}: no camera is left to train on",
+        remedy="camera 'holdout' is kept for score",
+        error=UsageError,
+    )
     return cameras
 
 
@@ -54,7 +59,7 @@ class ReconstructRequest(RunOptions):
     """
 
     source: RecordSource
-    out: Path
+    out: Path = Path("scene")
     recording: Path | None = None
     urdf: Path | None = None
     spheres: Path | None = None
@@ -142,16 +147,16 @@ class Reconstruction:
         """Raise InputError if no splat was made so far."""
         if self._fitter is None and self._early is not None:
             self._workspace(self._early)  # raises: there is no depth
-        if self._fitter is None:
-            raise InputError(
-                f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
-                remedy="'splatctrl info' says what the input lacks",
-            )
-        if not any(row.alive for row in self.rows):
-            raise InputError(
-                f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
-                remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
-            )
+        refuse_if(
+            self._fitter is None,
+            f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
+            remedy="'splatctrl info' says what the input lacks",
+        )
+        refuse_if(
+            not any(row.alive for row in self.rows),
+            f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
+            remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
+        )
 
     def _step_through(self, console: Progress) -> None:
         steps = tqdm(self.time_steps(), disable=True if console.is_quiet else None, unit=" steps")
@@ -225,9 +230,7 @@ class Reconstruction:
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Enlarge a default budget that the first step exceeded next to a robot: without a splat, a whole voxel is
-        occupied.
-        """
+        """Enlarge a default budget that the first step exceeded next to a robot."""
         least = SceneConfig().max_splats
         if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
             return False
@@ -290,6 +293,18 @@ class Reconstruction:
             "first_frames": list(self.first_frames.values()),
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }
+
+    def result(self) -> Reconstructed:
+        """Input of the criteria of the verdict."""
+        learned = () if self.robot is None or self.robot.self_model is None else self.robot.self_model.parts
+        return Reconstructed(
+            metrics=self.metrics(),
+            rows=self.rows,
+            config=self.config,
+            loss=self.source.loss,
+            is_seeded=self.cloud is not None,
+            learned=[part.words(self.rows[0].stamp_ns) for part in learned],
+        )
 
     def _record(self, row: AuditRow) -> None:
         self.rows.append(row)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from splatctrl_cli.checks.check_views import are_far, check_views, rescale_remedy
 from splatctrl_cli.config import OccupancyConfig, fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.running.progress import Progress
@@ -43,8 +43,11 @@ class RecordingRequest:
     beside: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.beside and is_folder_of_views(self.path):
-            raise UsageError(f"--reference {self.path}: expected a log beside others, got images in a folder")
+        refuse_if(
+            self.beside and is_folder_of_views(self.path),
+            f"--reference {self.path}: expected a log beside others, got images in a folder",
+            error=UsageError,
+        )
 
 
 def open_to_train(
@@ -61,11 +64,11 @@ def open_to_train(
     """
     if recording.is_dtu:
         scan = open_dtu(recording)
-        if needs_depth and not scan.has_depth:
-            raise InputError(
-                f"{recording.path}: scan '{scan.name}' has no depth",
-                remedy="give --depths DIR, or --points FILE.ply instead",
-            )
+        refuse_if(
+            needs_depth and not scan.has_depth,
+            f"{recording.path}: scan '{scan.name}' has no depth",
+            remedy="give --depths DIR, or --points FILE.ply instead",
+        )
         return scan
     refuse_scan_options(recording)
     if recording.protocol is not None:
@@ -97,14 +100,18 @@ def open_held_out(
     """Open an image folder with the views of the protocol holdout:RULE held out, by position."""
     name, path = recording.protocol or "", recording.path
     protocol = score_protocol(name)
-    if not is_folder_of_views(path) or not name.startswith("holdout:"):
-        raise UsageError(
-            f"--protocol {name}: expected --dtu, or holdout:RULE and an image folder (its TOML, or that"
-            " of a dataset)",
-            remedy="leave --protocol out, or give --dtu ROOT",
-        )
-    if recording.options.holdout:
-        raise UsageError("--holdout: the protocol says what is held out", remedy="leave one of them out")
+    refuse_if(
+        not is_folder_of_views(path) or not name.startswith("holdout:"),
+        f"--protocol {name}: expected --dtu, or holdout:RULE and an image folder (its TOML, or that of a dataset)",
+        remedy="leave --protocol out, or give --dtu ROOT",
+        error=UsageError,
+    )
+    refuse_if(
+        recording.options.holdout,
+        "--holdout: the protocol says what is held out",
+        remedy="leave one of them out",
+        error=UsageError,
+    )
     options = replace(recording.options, cameras=None)
     num = sum(1 for _ in open_source(path, options, needs_depth=needs_depth).poses())
     split = protocol.split(range(num), str(path))
@@ -125,14 +132,17 @@ def guessed_unit(source: RecordSource) -> str:
 def refuse_scan_options(recording: RecordingRequest) -> None:
     """Raise UsageError for DTU options without a DTU scan."""
     for name in ("scan", "depths", "downscale", "masks"):
-        if getattr(recording, name):
-            raise UsageError(f"--{name} {getattr(recording, name)}: only with --dtu", remedy="leave it out")
+        refuse_if(
+            getattr(recording, name),
+            f"--{name} {getattr(recording, name)}: only with --dtu",
+            remedy="leave it out",
+            error=UsageError,
+        )
 
 
 def check_pose_jumps(source: FrameSource, limit: float) -> None:
     """Raise InputError for a camera that jumps; views without times may lie anywhere."""
-    if not limit > 0:
-        raise UsageError(f"--max-pose-jump: expected metres, got {limit}")
+    refuse_if(not limit > 0, f"--max-pose-jump: expected metres, got {limit}", error=UsageError)
     jump = largest_jump(source.poses()) if source.has_clock else None
     if jump is not None and jump.distance > limit:
         later = (jump.after_ns - jump.before_ns) * 1e-9
@@ -177,12 +187,13 @@ class CameraAgreement:
                 f"{self._name}: camera {name}: depths disagree by {1e3 * pair.median:.0f} mm (median of"
                 f" {pair.num_pixels} pixels that two views see; expected at most {1e3 * pair.limit:.0f} mm)"
             )
-            if not self._is_allowed:
-                others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
-                refine = " (--refine-poses)" if self._is_still else " (splatctrl calibrate)"
-                raise InputError(
-                    line, remedy=f"{CAUSES}: correct poses or depth{refine},{others} or give --allow-disagreement"
-                )
+            others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
+            refine = " (--refine-poses)" if self._is_still else " (splatctrl calibrate)"
+            refuse_if(
+                not self._is_allowed,
+                line,
+                remedy=f"{CAUSES}: correct poses or depth{refine},{others} or give --allow-disagreement",
+            )
             console.log(f"warning: {line}; {CAUSES}: correct poses or depth, or expect surfaces twice")
 
     def _check_scale(self, step: TimeStep, console: Progress) -> None:

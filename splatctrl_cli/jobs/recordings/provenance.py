@@ -176,9 +176,7 @@ def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
-    """Describe how a scene's segmented robot differs from a model, or return an empty text. Links of one robot alone
-    are in neither, or in both map and robot.
-    """
+    """Describe how a scene's robot differs from a model, or empty; links of the model alone do not count."""
     joints = made_from.get("robot_joints")
     if joints is None:
         return ""
@@ -213,7 +211,6 @@ def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Reason | None:
 
 
 def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
-    """Splats unlike their occupancy grid: rescaled, moved, or removed."""
     known = scene.known() if scene.parts.digests is not None else None
     if known is None:
         return

@@ -32,7 +32,7 @@ from splatctrl_cli.jobs.replay.known_scene import (
     splat_fields,
 )
 from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, FitDevice
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, FitDevice, explain_faults
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.log.stored_frame import FrameSource
@@ -202,7 +202,7 @@ class Lockstep:
     def _take(self) -> None:
         step, fitted, start = self._next, self._fitted, time.perf_counter()
         assert step is not None
-        with self._stopwatch.stage("fit"), fitted.device.told_how_to_go_on(Path()):
+        with self._stopwatch.stage("fit"), explain_faults(fitted.device):
             fitted.take(step, self._console)
         with self._stopwatch.stage("read"):
             self._next = next(self._steps, None)

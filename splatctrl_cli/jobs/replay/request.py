@@ -45,7 +45,7 @@ class ReplayRequest(RobotOptions, RunOptions):
     """
 
     log: Path
-    out: Path
+    out: Path = Path("replay")
     urdf: Path | None = None
     options: SourceOptions = made_by(default_factory=SourceOptions)
     scene: Path | None = None

@@ -20,6 +20,7 @@ from splatctrl_cli.jobs.runs.run_folder import (
     FolderRequest,
     RunFolder,
     WrittenFile,
+    beside,
     is_batch,
     open_batch,
     open_run,
@@ -83,15 +84,10 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
 
 
 def _write(request: FolderRequest, page: Page) -> Path:
-    out = request.out or default_page(request.path)
+    out = request.out or beside(request.path, ".html")
     with output_path(out, force=request.force, is_folder=False) as partial:
         partial.write_text(render_page(page), encoding="utf-8")
     return out
-
-
-def default_page(path: Path) -> Path:
-    place = path.absolute() if not path.name.strip(".") else path
-    return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
 
 
 def _page_of_run(request: WriteReportRequest, run: RunFolder) -> Page:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_faults, refuse_if, require
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.grid.iso_surface import iso_surface
 from splatctrl_cli.formats.grid.npz_grid import read_npz
@@ -63,8 +63,7 @@ def space_of_scene(scene: SceneFolder) -> Space:
 def space_of_grid(path: Path) -> Space:
     """Zero surface of a baked field, on a thinned grid, and unobserved space."""
     grid = read_npz(path)
-    if "sdf" not in grid.channels:
-        raise InputError(f"{path}: expected the channel sdf, got {', '.join(grid.channels)}")
+    refuse_if("sdf" not in grid.channels, f"{path}: expected the channel sdf, got {', '.join(grid.channels)}")
     step = -(-max(grid.channels["sdf"].shape) // 80)  # cells along a side at most
     thinned = DistanceGrid(
         origin=grid.origin,
@@ -86,9 +85,7 @@ def space_of_grid(path: Path) -> Space:
 
 def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
     """A replay's scene as known over time, its robot's motion, and what decided."""
-    states = run.states
-    if states is None:
-        raise InputError(f"{run.path}: no steps.csv", remedy="replay again")
+    states = require(run.states, f"{run.path}: no steps.csv", remedy="replay again")
     robot = robot_of(run, states, roots)
     deciding = _deciding(run, states, robot)
     return replace(_scene_of(run, states, roots, deciding), deciding=deciding, motion=_motion(run, states, robot))
@@ -100,8 +97,9 @@ def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> Ro
     found = {name: _file(run, given, roots) for name, given in files.items() if given is not None}
     if files["urdf"] is None and run.parts.has(run.path / ROBOT):
         found["urdf"] = run.parts.checked(run.path / ROBOT)
-    if "urdf" not in found:
-        raise InputError(f"{run.path}: its command line has no --urdf", remedy="replay with the command line")
+    refuse_if(
+        "urdf" not in found, f"{run.path}: its command line has no --urdf", remedy="replay with the command line"
+    )
     base = run.option("--base")
     locks = tuple((name, float(value)) for name, _, value in (word.partition("=") for word in run.options("--lock")))
     packages = tuple(place for word in run.options("--packages") if (place := run.place_of(word, roots)))
@@ -133,13 +131,11 @@ def robot_bodies(robot: RobotModel) -> dict[str, Surface]:
 
 def _file(run: RunFolder, given: str, roots: tuple[Path, ...]) -> Path:
     inputs: Mapping[str, Any] = run.run.get("inputs", {})
-    place = run.place_of(given, roots, inputs.get(Path(given).name))
-    if place is None:
-        raise InputError(
-            f"{run.path}: {given} of its command line is not found, or was changed since",
-            remedy="give the folder that it was relative to with --root",
-        )
-    return place
+    return require(
+        run.place_of(given, roots, inputs.get(Path(given).name)),
+        f"{run.path}: {given} of its command line is not found, or was changed since",
+        remedy="give the folder that it was relative to with --root",
+    )
 
 
 def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding: Mapping[str, Any] | None) -> Space:
@@ -221,12 +217,10 @@ def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
 
 def position_of(states: States, robot: RobotModel, state: int) -> Float64:
     """Joint positions (J,) of a state, in the robot's order."""
-    try:
+    with refuse_faults(
+        lambda error: f"steps.csv: no column q_{error.args[0]} of the robot's joint", KeyError, remedy="replay again"
+    ):
         return np.array([states.joints[name][state] for name in robot.joint_names], np.float64)
-    except KeyError as error:
-        raise InputError(
-            f"steps.csv: no column q_{error.args[0]} of the robot's joint", remedy="replay again"
-        ) from None
 
 
 def _deciding(run: RunFolder, states: States, robot: RobotModel) -> dict[str, Any] | None:

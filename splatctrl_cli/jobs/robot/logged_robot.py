@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.formats.arrays import DAMAGE, read_arrays
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.geometry import transform_from
@@ -51,9 +51,11 @@ class RobotOptions:
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
     """Robot described by logs, None if none is. Raises InputError for several or an invalid one."""
     found = logged_descriptions(paths)
-    if len(found) > 1:
-        where = ", ".join(where for _, where, _ in found)
-        raise InputError(f"{paths[0]}: {len(found)} robots, of {where}", remedy="give one of them with --urdf")
+    refuse_if(
+        len(found) > 1,
+        f"{paths[0] if paths else ''}: {len(found)} robots, of {', '.join(where for _, where, _ in found)}",
+        remedy="give one of them with --urdf",
+    )
     return _urdf(*found[0]) if found else None
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_WORK
-from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError
+from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError, refuse_if
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.fit import DeviceFit, bytes_needed
@@ -78,12 +78,10 @@ def automatic(
 ) -> Device:
     """Choose a usable card with `needed` bytes, if the work is enough; log why."""
     try:
-        if too_little:
-            raise DeviceError(too_little)
+        refuse_if(too_little, too_little, error=DeviceError)
         device = open_device(name, source)
         assert device.memory is not None
-        if needed > device.memory.available():
-            raise DeviceError("too little memory is free on the card")
+        refuse_if(needed > device.memory.available(), "too little memory is free on the card", error=DeviceError)
     except DeviceError as error:
         progress.log(f"computes on cpu: {error}")
         return Device()
@@ -96,9 +94,7 @@ def choose_device(name: str, is_enough: bool, progress: Progress) -> Device:
 
     Raises UsageError if unusable.
     """
-    if (device := demand_device(name, FIELD)) is not None:
-        return device
-    return automatic(progress, source=FIELD) if is_enough else Device()
+    return demand_device(name, FIELD) or (automatic(progress, source=FIELD) if is_enough else Device())
 
 
 class FitDevice:
@@ -109,7 +105,7 @@ class FitDevice:
     """
 
     def __init__(self, name: str = CPU) -> None:
-        self._device = demand_device(name)
+        self.device = demand_device(name)
         self._fit: DeviceFit | None = None
         self.history: list[dict[str, Any]] = []
 
@@ -118,9 +114,9 @@ class FitDevice:
         num_splats, window = fitter.config.max_splats, fitter.config.window
         sizes = [(frame.intrinsics.height, frame.intrinsics.width) for frame in frames]
         sizes += [max(sizes)] * window
-        if self._device is None:
-            self._device = self._choose(num_splats, sizes, progress)
-        device, last = self._device, self.history[-1] if self.history else None
+        if self.device is None:
+            self.device = self._choose(num_splats, sizes, progress)
+        device, last = self.device, self.history[-1] if self.history else None
         if last is None or any(last.get(name) != device.as_dict().get(name) for name in ("device", "card")):
             begins = fitter.descent.num_iterations
             self.history.append({**device.as_dict(), "from_iteration": begins})
@@ -146,26 +142,20 @@ class FitDevice:
             with suppress(DeviceError):  # its failure was reported already
                 self._fit.close()
 
-    @contextmanager
-    def told_how_to_go_on(self, checkpoint: Path) -> Iterator[None]:
-        try:
-            yield
-        except DeviceError as error:
-            raise explain_fault(error, self._device, checkpoint) from error
 
-
-def explain_fault(error: DeviceError, device: Device | None, checkpoint: Path | None = None) -> DeviceFault:
-    """Describe a device's failure, with a remedy from `checkpoint` if it exists."""
-    kind = DeviceFull if isinstance(error, OutOfMemory) else DeviceFault
-    remedies = [error.remedy] if error.remedy else []
-    if checkpoint is not None and checkpoint.is_file():
-        kept = checkpoint.parent.parent
-        remedies.append(f"{kept} is kept: go on with --resume, and --device cpu if it fails again")
-    else:
-        remedies.append("start over, with --device cpu if it fails again")
-    return kind(
-        f"{'device' if device is None else describe_device(device.as_dict())}: {error}", remedy="; ".join(remedies)
-    )
+@contextmanager
+def explain_faults(device: Device | FitDevice | None, checkpoint: Path | None = None) -> Iterator[None]:
+    """Raise a device's failure as DeviceFault, with a remedy from `checkpoint` if it exists."""
+    try:
+        yield
+    except DeviceError as error:
+        used = device.device if isinstance(device, FitDevice) else device
+        what = "device" if used is None else describe_device(used.as_dict())
+        remedy = "start over, with --device cpu if it fails again"
+        if checkpoint is not None and checkpoint.is_file():
+            remedy = f"{checkpoint.parent.parent} is kept: go on with --resume, and --device cpu if it fails again"
+        kind = DeviceFull if isinstance(error, OutOfMemory) else DeviceFault
+        raise kind(f"{what}: {error}", remedy=f"{error.remedy}; {remedy}" if error.remedy else remedy) from error
 
 
 def describe_device(device: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.config import Config
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, read_checkpoint
 from splatctrl_cli.jobs.running.progress import Progress
@@ -93,15 +93,17 @@ def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint
 def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise UsageError naming deciding values that differ from the interrupted run."""
     before, after = dict(_flat(run)), dict(_flat(now))
-    if differing := [name for name in {**before, **after} if before.get(name) != after.get(name)]:
-        said = ", ".join(
-            f"{n} was {_format_value(before.get(n))}, is {_format_value(after.get(n))}" for n in differing[:3]
-        )
-        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
-        raise UsageError(
-            f"{folder}: --resume: the interrupted run differs: {said}{more}",
-            remedy="give the same options, or start over without --resume",
-        )
+    differing = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    said = ", ".join(
+        f"{n} was {_format_value(before.get(n))}, is {_format_value(after.get(n))}" for n in differing[:3]
+    )
+    more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+    refuse_if(
+        differing,
+        f"{folder}: --resume: the interrupted run differs: {said}{more}",
+        remedy="give the same options, or start over without --resume",
+        error=UsageError,
+    )
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

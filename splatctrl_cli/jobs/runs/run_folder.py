@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError, refuse_faults
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.output import PARTIAL, Parts, sha256
 from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Run, run_of_document
 from splatctrl_cli.records import Float64, Stamps
@@ -135,27 +136,38 @@ class WrittenFile:
     bytes: int
 
 
+def beside(path: Path, ending: str) -> Path:
+    """Output of the same name next to an input, with another ending."""
+    place = path if path.name.strip(".") else Path(os.path.realpath(path))  # . and .. have no name of their own
+    return place.with_name(f"{place.name if place.is_dir() else place.stem}{ending}")
+
+
 def open_run(path: Path) -> RunFolder:
     """Open a run's folder. Raises InputError if it is no run, incomplete, or too new."""
     partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
-    if partial.exists() and (partial == path or not path.exists()):
-        raise InputError(
-            f"{partial}: not whole: its run is still writing, or was interrupted",
-            remedy="wait for it, or run its command again",
-        )
-    if not path.exists():
-        raise InputError(f"{path}: no such folder", remedy="give the folder that a command wrote with --out")
+    refuse_if(
+        partial.exists() and (partial == path or not path.exists()),
+        f"{partial}: not whole: its run is still writing, or was interrupted",
+        remedy="wait for it, or run its command again",
+    )
+    refuse_if(not path.exists(), f"{path}: no such folder", remedy="give the folder that a command wrote with --out")
     file = path / "run.json"
-    if not file.is_file():
-        raise InputError(
-            f"{path}: no run: it has no run.json", remedy="give a folder that a command wrote with --out"
-        )
+    refuse_if(
+        not file.is_file(),
+        f"{path}: no run: it has no run.json",
+        remedy="give a folder that a command wrote with --out",
+    )
     run = read_object(file)
-    if "command" not in run:
-        raise InputError(f"{file}: expected what a command of splatctrl writes", remedy="make the run again")
+    refuse_if(
+        "command" not in run, f"{file}: expected what a command of splatctrl writes", remedy="make the run again"
+    )
     version = str(run.get("splatctrl", ""))
-    if _numbers(version) > _numbers(__version__):  # its values may mean something else
-        raise InputError(f"{file}: written by splatctrl {version}, this is {__version__}", remedy="update splatctrl")
+    # its values may mean something else
+    refuse_if(
+        _numbers(version) > _numbers(__version__),
+        f"{file}: written by splatctrl {version}, this is {__version__}",
+        remedy="update splatctrl",
+    )
     return RunFolder(path, run)
 
 
@@ -208,8 +220,11 @@ class BatchFolder:
 
     def inside(self, name: str) -> Path:
         """Path the batch names. Raises InputError if it leaves the folder."""
-        if not name or Path(name).is_absolute() or ".." in Path(name).parts:
-            raise InputError(f"{self.path / FILE}: {name!r}: expected a path in the batch", remedy="run it again")
+        refuse_if(
+            not name or Path(name).is_absolute() or ".." in Path(name).parts,
+            f"{self.path / FILE}: {name!r}: expected a path in the batch",
+            remedy="run it again",
+        )
         return self.path / name
 
 
@@ -222,12 +237,12 @@ def open_batch(path: Path) -> BatchFolder:
     file = path / FILE
     batch = read_object(file)
     try:
-        if batch["format"] != FORMAT:
-            raise ValueError(f"format {batch['format']}")
-        if int(batch["version"]) > FILE_VERSION:
-            raise InputError(
-                f"{file}: version {batch['version']}, this program reads {FILE_VERSION}", remedy="update splatctrl"
-            )
+        refuse_if(batch["format"] != FORMAT, f"format {batch['format']}", error=ValueError)
+        refuse_if(
+            int(batch["version"]) > FILE_VERSION,
+            f"{file}: version {batch['version']}, this program reads {FILE_VERSION}",
+            remedy="update splatctrl",
+        )
         jobs, runs = map(str, batch["jobs"]), map(run_of_document, batch["nodes"])
         return BatchFolder(path=path, suite=str(batch["suite"]), jobs=tuple(jobs), runs=tuple(runs))
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder
 from splatctrl_cli.jobs.recordings.open_recording import (
@@ -164,12 +164,12 @@ def check_times(reference: Reference, scoring: Sequence[str], training: Sequence
     trained = [stamp for camera in training for stamp in reference.stamps_ns.get(camera, ())]
     for camera in scoring if trained else ():
         stamps = reference.stamps_ns[camera]
-        if stamps[0] > max(trained) or stamps[-1] < min(trained):
-            raise InputError(
-                f"{reference.where}: camera {camera}: expected frames between those that trained, {min(trained)} to"
-                f" {max(trained)} ns, got {stamps[0]} to {stamps[-1]} ns",
-                remedy="give logs of the same time and clock, or other --cameras",
-            )
+        refuse_if(
+            stamps[0] > max(trained) or stamps[-1] < min(trained),
+            f"{reference.where}: camera {camera}: expected frames between those that trained, {min(trained)} to"
+            f" {max(trained)} ns, got {stamps[0]} to {stamps[-1]} ns",
+            remedy="give logs of the same time and clock, or other --cameras",
+        )
 
 
 def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None:
@@ -177,13 +177,12 @@ def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None
     if reference.protocol is None or reference.split is None or not scene.names_its_views:
         return
     trained, expected = scene.training_stamps_ns, reference.training_stamps_ns
-    if trained == expected:
-        return
-    lacks, others = len(expected - trained), len(trained - expected)
-    raise UsageError(
-        f"{path}: protocol {reference.protocol.name} trains on {len(expected)} views"
-        f" ({reference.split.words()}), of which {lacks} did not train the scene, and {others} others did",
+    refuse_if(
+        trained != expected,
+        f"{path}: protocol {reference.protocol.name} trains on {len(expected)} views ({reference.split.words()}), of"
+        f" which {len(expected - trained)} did not train the scene, and {len(trained - expected)} others did",
         remedy=f"reconstruct with --protocol {reference.protocol.name}",
+        error=UsageError,
     )
 
 
@@ -202,10 +201,10 @@ def recording_check(
     if recorded:
         basis.append("intrinsics, stamp, pose and picture of each training camera's first frame")
         lines += differences(recorded, reference.source.records())
-    if lines and not allow_other:
-        raise InputError(
-            f"{reference.where}: not the recording that {path} was made from: {'; '.join(lines)}",
-            remedy="give that recording, or --allow-other-recording to score against this one; for a camera of"
-            " another log of its session give both, each as --reference",
-        )
+    refuse_if(
+        lines and not allow_other,
+        f"{reference.where}: not the recording that {path} was made from: {'; '.join(lines)}",
+        remedy="give that recording, or --allow-other-recording to score against this one; for a camera of"
+        " another log of its session give both, each as --reference",
+    )
     return {"basis": basis, "differences": lines}

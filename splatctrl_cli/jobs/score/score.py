@@ -1,13 +1,13 @@
 """A score of scenes against held-out views of one or several scans."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
 from splatctrl_cli.evaluate.score_report import (
     AVERAGING,
@@ -34,7 +34,7 @@ from splatctrl_cli.jobs.score.reference import (
 )
 from splatctrl_cli.jobs.score.views import CloudSettings, Scorer, cloud_figures
 from splatctrl_cli.records import Label
-from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, view_picture
+from splatctrl_cli.report.pictures import comparison_picture, view_picture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +60,12 @@ class ScoreRequest:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        if self.images == "all" and self.out is None:
-            raise UsageError("--images all: expected a folder for them", remedy="give -o")
+        refuse_if(
+            self.images == "all" and self.out is None,
+            "--images all: expected a folder for them",
+            remedy="give -o",
+            error=UsageError,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,37 +105,15 @@ def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
 
 
 def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> ScoreResult:
-    stopwatch, recording = Stopwatch(), request.recording
+    stopwatch, surface = Stopwatch(), dict[str, float]()
     if folder:
         folder.mkdir(exist_ok=True)
-    scene = open_splats(request.scene)
-    if scene.is_anisotropic:
-        scene.gaussians()  # both raise if there is no splat to compare
-    else:
-        field_splats(scene.splats())
-    reference = open_reference(recording, progress)
-    if request.cloud is not None and not scene.names_its_views:
-        raise UsageError(
-            f"--cloud: the surface is looked at from the views that trained, which {request.scene} does not name",
-            remedy="leave it out, or give a folder that reconstruct wrote",
-        )
+    scorer = _open_scorer(request, folder, progress)
+    scene, reference = scorer.scene, scorer.reference
     cloud = None if request.cloud is None else request.cloud.of_scan(reference.scan)
-    wanted, allow_training = recording.options.cameras, request.allow_training
-    scorer = Scorer(
-        scene=scene,
-        reference=reference,
-        cameras=cameras_to_score(wanted, reference, scene.cameras, allow_training=allow_training),
-        draw=_view_drawer(folder / "views") if folder and request.images == "all" else None,
-        newest=request.newest,
-        allow_training=allow_training,
-        threads=request.threads,
-    )
-    check_times(reference, scorer.cameras, scene.cameras)
-    check_training(request.scene, scene, reference)
     digests = reference.source.digests()
     same = recording_check(request.scene, scene, reference, digests, allow_other=request.allow_other_recording)
     scorer.run(progress, stopwatch)
-    surface: dict[str, float] = {}
     if cloud is not None:
         with stopwatch.stage("cloud"):
             surface = cloud_figures(cloud, scene, scorer.training, request.threads)
@@ -163,6 +145,36 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
             stopwatch=stopwatch,
         )
     return result
+
+
+def _open_scorer(request: ScoreRequest, folder: Path | None, progress: Progress) -> Scorer:
+    scene = open_splats(request.scene)
+    if scene.is_anisotropic:
+        scene.gaussians()  # both raise if there is no splat to compare
+    else:
+        field_splats(scene.splats())
+    reference = open_reference(request.recording, progress)
+    refuse_if(
+        request.cloud is not None and not scene.names_its_views,
+        f"--cloud: the surface is looked at from the views that trained, which {request.scene} does not name",
+        remedy="leave it out, or give a folder that reconstruct wrote",
+        error=UsageError,
+    )
+    wanted = request.recording.options.cameras
+    scorer = Scorer(
+        scene=scene,
+        reference=reference,
+        cameras=cameras_to_score(wanted, reference, scene.cameras, allow_training=request.allow_training),
+        newest=request.newest,
+        allow_training=request.allow_training,
+        threads=request.threads,
+    )
+    check_times(reference, scorer.cameras, scene.cameras)
+    check_training(request.scene, scene, reference)
+    if folder and request.images == "all":
+        (folder / "views").mkdir(parents=True, exist_ok=True)
+        scorer.draw = lambda row: view_picture(folder / "views" / f"{row.title}.png", row)
+    return scorer
 
 
 def _report(
@@ -225,11 +237,6 @@ def _conclude(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool
     return ScoreResult(
         report=report, verdict=score_verdict(report, request.require, is_damaged=is_damaged), out=request.out
     )
-
-
-def _view_drawer(folder: Path) -> Callable[[ComparisonRow], None]:
-    folder.mkdir(parents=True, exist_ok=True)
-    return lambda row: view_picture(folder / f"{row.title}.png", row)
 
 
 def _write_result(
@@ -297,6 +304,8 @@ def select_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
     Raises InputError without them: masks of one scan fit no other.
     """
     masks = None if recording.masks is None else recording.masks / scan
-    if masks is not None and not masks.is_dir():
-        raise InputError(f"{recording.masks}: expected a folder {scan} with this scan's masks, got none")
+    refuse_if(
+        masks is not None and not masks.is_dir(),
+        f"{recording.masks}: expected a folder {scan} with this scan's masks, got none",
+    )
     return replace(recording, scan=scan, masks=masks)

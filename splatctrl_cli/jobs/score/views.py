@@ -13,7 +13,7 @@ import numpy as np
 
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, space_out, thin
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
 from splatctrl_cli.evaluate.score import CORRECTABLE, CORRECTED, score_view
@@ -84,11 +84,12 @@ class Scorer:
         wait = Wait(progress, f"scores {', '.join(self.cameras)}", "views").announce()
         doubts = Doubts(is_still=not has_clock, may_train=may_train, mask_rule=self.reference.mask_rule)
         for view in views:
-            if view.frame.stamp_ns in scene.training_stamps_ns and not may_train:
-                raise UsageError(
-                    f"{view.name}: trained the scene, its score says nothing about other views",
-                    remedy="give the --holdout or --protocol that reconstruct was given, or --allow-training",
-                )
+            refuse_if(
+                view.frame.stamp_ns in scene.training_stamps_ns and not may_train,
+                f"{view.name}: trained the scene, its score says nothing about other views",
+                remedy="give the --holdout or --protocol that reconstruct was given, or --allow-training",
+                error=UsageError,
+            )
             num_known = bisect_right(stamps, view.frame.stamp_ns)
             if has_clock and not num_known:
                 self.skipped.append(view.name)
@@ -107,12 +108,12 @@ class Scorer:
 
     def _check(self) -> None:
         where, cameras = self.reference.where, ", ".join(self.cameras)
-        if not self.views:
-            raise NotEvaluableError(
-                f"{where}: no view of {cameras} to score; {len(self.skipped)} lie before the first snapshot of the"
-                " scene",
-                remedy="give the recording that the scene was reconstructed from, or other --cameras",
-            )
+        refuse_if(
+            not self.views,
+            f"{where}: no view of {cameras} to score; {len(self.skipped)} lie before the first snapshot of the scene",
+            remedy="give the recording that the scene was reconstructed from, or other --cameras",
+            error=NotEvaluableError,
+        )
         has_training = self.scene.names_its_views
         if has_training and self.reference.has_depth and not any(view["seen_share"] for view in self.figures):
             raise NotEvaluableError(

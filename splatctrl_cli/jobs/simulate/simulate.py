@@ -11,7 +11,7 @@ import numpy as np
 from defusedxml import ElementTree
 
 from splatctrl_cli.config import ControlConfig, fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, refuse_if
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
@@ -45,7 +45,7 @@ class SimulateRequest:
     in place of the options' table.
     """
 
-    out: Path
+    out: Path = Path("simulated")
     urdf: Path | None = None
     spheres: Path | None = None
     packages: tuple[Path, ...] = ()
@@ -57,10 +57,17 @@ class SimulateRequest:
     force: bool = False
 
     def __post_init__(self) -> None:
-        if self.urdf is None and self.spheres is not None:
-            raise UsageError(f"--spheres {self.spheres}: needs the robot", remedy="give --urdf as well")
-        if self.urdf is not None and (self.is_slim or self.unmodelled):
-            raise UsageError("--slim, --unmodelled: expected the simulated arm, got --urdf")
+        refuse_if(
+            self.urdf is None and self.spheres is not None,
+            f"--spheres {self.spheres}: needs the robot",
+            remedy="give --urdf as well",
+            error=UsageError,
+        )
+        refuse_if(
+            self.urdf is not None and (self.is_slim or self.unmodelled),
+            "--slim, --unmodelled: expected the simulated arm, got --urdf",
+            error=UsageError,
+        )
 
     @property
     def config(self) -> dict[str, Any]:
@@ -233,17 +240,18 @@ def adapt_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Mot
         before.append(np.argmin(costs[:, None] + legs, axis=0))
         costs = np.min(costs[:, None] + legs, axis=0)
     chosen = [int(np.argmin(costs))]
-    if not np.isfinite(costs[chosen[0]]):
-        raise InputError(f"{model.urdf.path}: expected a way between the waypoints, got none", remedy=REMEDY)
+    refuse_if(
+        not np.isfinite(costs[chosen[0]]),
+        f"{model.urdf.path}: expected a way between the waypoints, got none",
+        remedy=REMEDY,
+    )
     for choice in reversed(before):
         chosen.insert(0, int(choice[chosen[0]]))
     return Motion(times=times, waypoints=np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)]))
 
 
 def _copy_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
-    """Copy a URDF's meshes, visual ones as STL, and return its text. A link with an unreadable visual mesh shows its
-    collision geometry.
-    """
+    """Copy a URDF's meshes, visual ones as STL; return its text, without unreadable visual ones."""
     root, copies = ElementTree.fromstring(urdf.text), dict[tuple[str, str], str]()
     parts = [(link, part) for link in root.iter("link") for tag in ("collision", "visual") for part in link.iter(tag)]
     for link, part in parts:

@@ -8,7 +8,7 @@ from typing import Any
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.ranges import Within
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean
+from splatctrl_cli.errors import UsageError, did_you_mean, refuse_if, require
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.jobs.batch.graph import CommandLine
 from splatctrl_cli.jobs.batch.suite import Job
@@ -128,39 +128,46 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
         for name, key in keys.items()
     }
     wanted = {command for key in searched.values() for command in key.options}
-    if "speed" in keys and not is_driven:
-        raise UsageError(
-            "--over speed: the arm moves as it was recorded", remedy="sweep a replay of --mode closed-loop"
-        )
+    refuse_if(
+        "speed" in keys and not is_driven,
+        "--over speed: the arm moves as it was recorded",
+        remedy="sweep a replay of --mode closed-loop",
+        error=UsageError,
+    )
     simulation = _simulation_of(stages[0]) if SIMULATE in wanted else None
     while wanted & {FIT, BAKE, SIMULATE} and (
         option := next((o for o in MADE_BEFORE.get(stages[0].command, ()) if o in stages[0].options), None)
     ):
         before = open_run(Path(stages[0].options[option]))
-        if before.command not in (FIT, BAKE):
-            raise UsageError(
-                f"{before.path}: was written by {before.command}, expected {FIT}",
-                remedy="sweep a replay of another scene",
-            )
+        refuse_if(
+            before.command not in (FIT, BAKE),
+            f"{before.path}: was written by {before.command}, expected {FIT}",
+            remedy="sweep a replay of another scene",
+            error=UsageError,
+        )
         stages[0] = replace(stages[0], options={**stages[0].options, option: f"{{{before.command}}}"})
         stages.insert(0, _stage(before, command_line))
     if simulation is not None:
         stages = _add_simulation(simulation, stages, command_line)
     made = {stage.command for stage in stages}
     for name, key in searched.items():
-        if not made & key.options.keys():
-            raise UsageError(
-                f"--over {name}: the run has no {' or '.join(key.options)} that it could change",
-                remedy="sweep a replay with --scene or --lockstep",
-            )
+        refuse_if(
+            not made & key.options.keys(),
+            f"--over {name}: the run has no {' or '.join(key.options)} that it could change",
+            remedy="sweep a replay with --scene or --lockstep",
+            error=UsageError,
+        )
         takers = [stage for stage in stages if stage.command in key.options]
-        if "cameras" in key.options.values() and not all(stage.cameras for stage in takers):
-            raise UsageError(f"--over {name}: the run does not say which cameras trained", remedy="reconstruct again")
+        refuse_if(
+            "cameras" in key.options.values() and not all(stage.cameras for stage in takers),
+            f"--over {name}: the run does not say which cameras trained",
+            remedy="reconstruct again",
+            error=UsageError,
+        )
     return Chain(stages=tuple(stages), keys=searched)
 
 
 def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
-    """Read a command's options with current paths."""
     options = command_line.options_of(run.arguments)
     found: list[Path] = []
 
@@ -169,27 +176,24 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
             return [placed(each) for each in value]
         if not isinstance(value, Path):
             return value
-        place = run.place_of(str(value), ())
-        if place is None:
-            raise InputError(
-                f"{value}: is not there any more, and {run.path} was made from it",
-                remedy="put it back, or make the run again and sweep that",
-            )
-        found.append(place.absolute())
-        return str(place.absolute())
+        place = require(
+            run.place_of(str(value), ()),
+            f"{value}: is not there any more, and {run.path} was made from it",
+            remedy="put it back, or make the run again and sweep that",
+        ).absolute()
+        found.append(place)
+        return str(place)
 
     options = {name: placed(value) for name, value in options.items()}
     for recorded, digest in run.run.get("inputs", {}).items():
         name = recorded.removeprefix(CALIBRATION)
         places = [p for at in found for p in (*((at,) if at.name == name else ()), at / name, at.parent / name)]
         files = [file for file in places if file.is_file()]
-        if not recorded.startswith(PERTURB) and not any(sha256(file) == digest for file in files):
-            raise InputError(
-                f"{files[0]}: has changed since {run.path} was made"
-                if files
-                else f"{run.path}: {recorded} has moved",
-                remedy="put it back as it was, or make the run again and sweep that",
-            )
+        refuse_if(
+            not recorded.startswith(PERTURB) and not any(sha256(file) == digest for file in files),
+            f"{files[0]}: has changed since {run.path} was made" if files else f"{run.path}: {recorded} has moved",
+            remedy="put it back as it was, or make the run again and sweep that",
+        )
     of_map = run.path / "scene"
     has_map = "lockstep" in options and (of_map / "run.json").is_file()
     metrics = open_run(of_map).metrics if has_map else run.metrics
@@ -213,8 +217,12 @@ def _add_simulation(simulation: RunFolder, stages: Sequence[Stage], command_line
     for given in [Path(stage.options[option]) for stage in stages for option in logs if option in stage.options]:
         header = given / "capture.json"
         sources = json.loads(header.read_text())["sources"].values() if header.is_file() else (sha256(given),)
-        if sha256(log) not in sources:
-            raise UsageError(f"{given}: is not the recording of {folder}", remedy=f"replay {log}")
+        refuse_if(
+            sha256(log) not in sources,
+            f"{given}: is not the recording of {folder}",
+            remedy=f"replay {log}",
+            error=UsageError,
+        )
     kept = dict.fromkeys(logs, f"{{{SIMULATE}}}/log.mcap") | {"truth": f"{{{SIMULATE}}}/truth.json"}
     return [
         _stage(simulation, command_line),

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome
 from splatctrl_cli.files.output import MARKERS, check_can_be_written, write_durably, write_json
 from splatctrl_cli.jobs.batch.batch import scheduling, write_batch
@@ -115,15 +115,20 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
     NotEvaluableError without a verdict to flip.
     """
     run, ranges = open_run(request.replay), ranges_of(request.over)
-    if run.command != REPLAY:
-        raise UsageError(
-            f"{run.path}: a run of {run.command}, expected one of replay", remedy="sweep the replay of it"
-        )
+    refuse_if(
+        run.command != REPLAY,
+        f"{run.path}: a run of {run.command}, expected one of replay",
+        remedy="sweep the replay of it",
+        error=UsageError,
+    )
     _check_judged(str(run.path), run.verdict)
     keys = {name: key_of(name) for name in ranges}
     for name, (a, b) in ranges.items():
-        if keys[name].is_whole and not (a.is_integer() and b.is_integer()):
-            raise UsageError(f"--over {name}: expected whole numbers, got {a:g}:{b:g}")
+        refuse_if(
+            keys[name].is_whole and not (a.is_integer() and b.is_integer()),
+            f"--over {name}: expected whole numbers, got {a:g}:{b:g}",
+            error=UsageError,
+        )
     chain, out = chain_of(run, keys, command_line), request.out.absolute()
     asked = {
         "run": run.path.absolute().name,
@@ -147,8 +152,11 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
         _write(out, asked, {})
         start = runs.at([starts])[0]
         _check_judged(_words(starts), vars(start))
-        if start.outcome == REFUSED:
-            raise InputError(f"{_words(starts)}: is refused: {start.sentence}", remedy="begin at a value that is not")
+        refuse_if(
+            start.outcome == REFUSED,
+            f"{_words(starts)}: is refused: {start.sentence}",
+            remedy="begin at a value that is not",
+        )
         _check_settings(run, open_run(out / start.folder), chain)
         flips = [_vary_alone(name, starts, b, runs, request.tolerance) for name, (_, b) in ranges.items()]
         least = _vary_together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None
@@ -162,21 +170,28 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
 
 
 def _check_same(out: Path, asked: Mapping[str, Any]) -> None:
-    """Raise unless `out` is empty, or a sweep of the same settings."""
     file = out / FILE
     if not file.is_file():
-        if any((out / other).exists() for other in (*MARKERS, BATCH)):
-            raise UsageError(f"{out}: is no sweep, but something else", remedy="give another --out")
+        refuse_if(
+            any((out / other).exists() for other in (*MARKERS, BATCH)),
+            f"{out}: is no sweep, but something else",
+            remedy="give another --out",
+            error=UsageError,
+        )
         return
-    try:
+    with refuse_faults(
+        lambda _: f"{file}: is not what a sweep writes",
+        *(OSError, ValueError, KeyError, TypeError, AttributeError),
+        remedy="give another --out",
+    ):
         before = json.loads(file.read_text(encoding="utf-8"))["asked"]
         differs = [key for key in asked if before.get(key) != asked[key]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{file}: is not what a sweep writes", remedy="give another --out") from None
-    if differs:
-        raise UsageError(
-            f"{out}: was begun with other settings: {', '.join(differs)}", remedy="give them again, or another --out"
-        )
+    refuse_if(
+        differs,
+        f"{out}: was begun with other settings: {', '.join(differs)}",
+        remedy="give them again, or another --out",
+        error=UsageError,
+    )
 
 
 def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -188,24 +203,26 @@ def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
             start, end = (float(f"{float(each):.6g}") for each in span.split(":"))
         except ValueError:
             start = end = math.nan
-        if not name or not (math.isfinite(start) and math.isfinite(end)):
-            raise UsageError(f"--over {text}: expected KEY=A:B", remedy="write it like --over margin=0.02:0.08")
-        if start == end:
-            raise UsageError(f"--over {text}: both ends are {start:g}", remedy="give two values")
-        if name in ranges:
-            raise UsageError(f"--over {text}: {name} is given twice", remedy="leave one out")
+        refuse_if(
+            not name or not (math.isfinite(start) and math.isfinite(end)),
+            f"--over {text}: expected KEY=A:B",
+            remedy="write it like --over margin=0.02:0.08",
+            error=UsageError,
+        )
+        refuse_if(start == end, f"--over {text}: both ends are {start:g}", remedy="give two values", error=UsageError)
+        refuse_if(name in ranges, f"--over {text}: {name} is given twice", remedy="leave one out", error=UsageError)
         ranges[name] = start, end
-    if not ranges:
-        raise UsageError("sweep: expected --over KEY=A:B, got none", remedy="say what is varied")
+    refuse_if(not ranges, "sweep: expected --over KEY=A:B, got none", remedy="say what is varied", error=UsageError)
     return ranges
 
 
 def _check_judged(what: str, verdict: Mapping[str, Any]) -> None:
-    if verdict.get("outcome") == Outcome.NOT_EVALUABLE:
-        raise NotEvaluableError(
-            f"{what}: there is no verdict to flip: {verdict['sentence']}",
-            remedy="give it the evidence that it lacks first",
-        )
+    refuse_if(
+        verdict.get("outcome") == Outcome.NOT_EVALUABLE,
+        f"{what}: there is no verdict to flip: {verdict.get('sentence')}",
+        remedy="give it the evidence that it lacks first",
+        error=NotEvaluableError,
+    )
 
 
 @dataclass(kw_only=True)
@@ -241,8 +258,12 @@ class Runs:
         made = {values: self.nodes_at(point) for values, point in new.items()}
         nodes: dict[str, Node] = {}
         for node in (node for each in made.values() for node in each):
-            if nodes.setdefault(node.name, self.nodes.get(node.name, node)).words != node.words:
-                raise UsageError(f"two runs are called {node.name}", remedy="vary fewer keys at once")
+            refuse_if(
+                nodes.setdefault(node.name, self.nodes.get(node.name, node)).words != node.words,
+                f"two runs are called {node.name}",
+                remedy="vary fewer keys at once",
+                error=UsageError,
+            )
         assert self.scheduler is not None
         found = self.scheduler.run(list(nodes.values())) if nodes else {}
         self.nodes |= nodes
@@ -260,11 +281,11 @@ class Runs:
         if last.outcome and last.state not in (ERROR, SKIPPED):
             return tried(outcome=last.outcome, label=last.label, sentence=last.sentence, folder=last.out)
         wrong = next(run for run in runs if run.state in (ERROR, SKIPPED) or run is last)
-        if wrong.cause or wrong.exit_code not in BY_ITS_VALUES:
-            raise InputError(
-                f"{_words(values)}: {wrong.job} came to no verdict: {wrong.cause or wrong.sentence}",
-                remedy=f"see {self.out / wrong.log}",
-            )
+        refuse_if(
+            wrong.cause or wrong.exit_code not in BY_ITS_VALUES,
+            f"{_words(values)}: {wrong.job} came to no verdict: {wrong.cause or wrong.sentence}",
+            remedy=f"see {self.out / wrong.log}",
+        )
         return tried(outcome=REFUSED, label=REFUSED, sentence=f"{wrong.job}: {wrong.sentence}", folder="")
 
 
@@ -276,11 +297,11 @@ def _check_settings(run: RunFolder, again: RunFolder, chain: Chain) -> None:
         for name, value in values.items()
         if f"{section}.{name}" not in varied and again.run["config"].get(section, {}).get(name) != value
     ]
-    if differs:
-        raise InputError(
-            f"{run.path}: made again it has other settings: {', '.join(differs[:5])}",
-            remedy="its --config or the program has changed: make the run again and sweep that",
-        )
+    refuse_if(
+        differs,
+        f"{run.path}: made again it has other settings: {', '.join(differs[:5])}",
+        remedy="its --config or the program has changed: make the run again and sweep that",
+    )
 
 
 def _words(values: Mapping[str, float]) -> str:

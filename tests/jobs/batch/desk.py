@@ -7,7 +7,7 @@ from typing import Any
 from splatctrl_cli.jobs.batch.graph import Node
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run
 from splatctrl_cli.jobs.batch.run import Scheduler, local_executor
-from splatctrl_cli.jobs.batch.suite import Limits
+from splatctrl_cli.jobs.batch.suite import Job
 from splatctrl_cli.jobs.running.progress import SILENT
 
 ENTRY = "tests.jobs.batch.entry:main"
@@ -16,18 +16,16 @@ ENTRY = "tests.jobs.batch.entry:main"
 def node(folder: Path, name: str, *words: str, needs: Sequence[str] = (), **more: Any) -> Node:
     """A node that writes its output; its words come before that, and its limits by name."""
     out = folder / name
-    limits = Limits(**{key: more.pop(key) for key in ("timeout", "memory", "retries") if key in more})
+    of_job = {key: more.pop(key) for key in ("expect", "timeout", "memory", "retries") if key in more}
     said = (*words, "write", str(out), "text")
     recording, job = name.split("/")
     return Node(
         name=name,
         recording=recording,
-        job=job,
-        command=job,
+        job=Job(name=job, command=job, **of_job),
         words=said,
         needs=tuple(needs),
         out=out,
-        limits=limits,
         **more,
     )
 

@@ -11,7 +11,7 @@ from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.batch.graph import COMMANDS, Node, columns_of, nodes_of, select_shard
 from splatctrl_cli.jobs.batch.ledger import NAME, VERSION, Ledger, Run, write_csv
-from splatctrl_cli.jobs.batch.suite import Limits, read_suite
+from splatctrl_cli.jobs.batch.suite import read_suite
 from tests.refused import expect_refusal
 
 RECORDINGS = '[[recordings]]\npaths = ["*.mcap"]\n'
@@ -53,7 +53,7 @@ def test_a_matrix_makes_variants_that_go_on_in_what_needs_them(tmp_path: Path) -
         "matrix = { field = ['{sdf-bake}'] }\n"
     )
     found = nodes(tmp_path, RECORDINGS + jobs.replace("scene = '{reconstruct}'\n", ""), shard=(1, 2))
-    of = {job: [node for node in found if node.job == job] for job in ("reconstruct", "sdf-bake", "replay")}
+    of = {job: [node for node in found if node.job.name == job] for job in ("reconstruct", "sdf-bake", "replay")}
     assert [len(each) for each in of.values()] == [4, 4, 4]
     assert {(options(n)["--max-splats"], options(n)["--set"]) for n in of["reconstruct"]} == {
         (splats, f"scene.window={window}") for splats in ("100", "200") for window in (2, 4)
@@ -86,7 +86,7 @@ def test_nodes_and_columns_come_in_the_order_of_the_suite(tmp_path: Path) -> Non
     assert [node.name for node in found[:4]] == ["a/ingest", "a/scene", "a/audit", "a/check"]
     few = "[[recordings]]\npaths = ['a.mcap']\nonly = ['check']\n[[recordings]]\npaths = ['b.mcap']\n"
     found = nodes(tmp_path, few + "[jobs.ingest]\n[jobs.check]\nmatrix = { quick = [10, 9] }\n")
-    columns = columns_of(((node.job, node.name.split("/")[1]) for node in found), ["ingest", "check"])
+    columns = columns_of(((node.job.name, node.name.split("/")[1]) for node in found), ["ingest", "check"])
     assert columns == ["ingest", "check+quick=10", "check+quick=9"]
 
 
@@ -103,7 +103,7 @@ matrix = { cameras = [["cam0"], ["cam0", "cam1"]], "set.scene.max_splats" = [100
 command = "replay"
 matrix = { urdf = ["arms/a/panda.urdf", "arms/b/panda.urdf"], spheres = ["arms/a/wrist.yaml", "arms/b/coarse.yaml"] }
 """
-    found = [n.name for n in nodes(tmp_path, "[[recordings]]\npaths = ['a.mcap']\n" + jobs) if n.job == "audit"]
+    found = [n.name for n in nodes(tmp_path, "[[recordings]]\npaths = ['a.mcap']\n" + jobs) if n.job.name == "audit"]
     assert found[0] == "a/audit+cameras=cam0+scene.max_splats=100+urdf=a+spheres=a_wrist.yaml"
     assert found[-1] == "a/audit+cameras=cam0_cam1+scene.max_splats=100+urdf=b+spheres=b_coarse.yaml"
     seeds = "matrix = { seed = [1, 2] }\n"
@@ -121,10 +121,10 @@ def test_a_recording_may_have_a_job_otherwise_or_not_at_all(tmp_path: Path) -> N
         n.name: n for n in nodes(tmp_path, own + "[jobs.check]\ntimeout = '2 min'\nmemory = '1 GiB'\n[jobs.ingest]\n")
     }
     assert set(found) == {"a/check", "a/ingest", "both/check"}
-    assert (options(found["a/check"])["--fail-on"], found["a/check"].expect) == ("warning", "exit 1")
+    assert (options(found["a/check"])["--fail-on"], found["a/check"].job.expect) == ("warning", "exit 1")
     assert found["both/check"].words[-2:] == (str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"))
-    assert found["both/check"].expect == "passed"
-    assert found["a/check"].limits == Limits(timeout=120.0, memory=2**30)
+    assert found["both/check"].job.expect == "passed"
+    assert (found["a/check"].job.timeout, found["a/check"].job.memory) == (120.0, 2**30)
 
 
 def test_recordings_of_one_file_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ class Recorded:
         found = open_run(self.folder / run)
         chain = chain_of(found, {name: key_of(name) for name in values}, PROGRAM)
         runs = Runs(run=found, chain=chain, out=self.folder / "out", command_line=PROGRAM)
-        return {node.command: list(node.words) for node in runs.nodes_at(values)}
+        return {node.job.command: list(node.words) for node in runs.nodes_at(values)}
 
 
 @pytest.fixture(scope="module")
