@@ -57,21 +57,11 @@ LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shown:
-    """The row of a state table that shows a figure: where `column` is `pick`.
-
-    pick: "least", "largest", or a word of the column.
-    """
-
-    column: str
-    pick: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Metric(Generic[R]):
+class Measure(Generic[R]):
     """One figure: its value, and the number of states, views or points behind it.
 
-    running: its value before the first state, and up to each (T,); None if not of states. shown: its row in a table.
+    running: its value before the first state, and up to each (T,); None if not of states. column: of a state table,
+    empty if none shows it; pick: the row there that does: "least", "largest", or a word of the column.
     """
 
     name: str
@@ -79,14 +69,19 @@ class Metric(Generic[R]):
     count: Callable[[R], int]
     running: Callable[[R], tuple[float, Float64]] | None = None
     scale: Scale = DESCRIBES
-    shown: Shown | None = None
+    column: str = ""
+    pick: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """A column (T,) folded to a value; accumulate: up to each state, from `start` on."""
+    """A column (T,) folded to a value, most of which the `pick` of its values makes.
+
+    accumulate: up to each state, from `start` on.
+    """
 
     of: Callable[[Float64], float | None]
+    pick: str = "largest"
     start: float = np.nan
     accumulate: Callable[[Float64], Float64] | None = None
 
@@ -119,12 +114,13 @@ def last(values: Float64) -> float | None:
     return float(there[-1]) if len(there) else None
 
 
-LEAST = Fold(of=least, start=np.inf, accumulate=np.fmin.accumulate)
-LOWEST = Fold(of=lowest, start=np.inf, accumulate=np.fmin.accumulate)
+LEAST = Fold(of=least, pick="least", start=np.inf, accumulate=np.fmin.accumulate)
+LOWEST = Fold(of=lowest, pick="least", start=np.inf, accumulate=np.fmin.accumulate)
 LARGEST = Fold(of=largest, start=-np.inf, accumulate=np.fmax.accumulate)
 MEAN, P95 = (Fold(of=partial(_fold_known, fold)) for fold in (np.mean, partial(np.percentile, q=95)))
 LAST = Fold(of=last)
 TOTAL = Fold(of=lambda values: int(np.nansum(values)))
+NUMBER = Fold(of=TOTAL.of, pick="least", start=0.0, accumulate=lambda values: np.asarray(np.nancumsum(values)))
 
 
 def known(values: Float64) -> int:
@@ -139,36 +135,18 @@ def folded(
     count: Callable[[R], int] | None = None,
     *,
     scale: Scale = DESCRIBES,
-    shown: Shown | None = None,
-) -> Metric[R]:
-    """A column's fold; counts all but NaN, unless `count` is given."""
+    shown: str = "",
+) -> Measure[R]:
+    """A column's fold; counts all but NaN, unless `count` is given. shown: the name of the column that shows it."""
     accumulate = fold.accumulate
-    return Metric(
+    return Measure(
         name=name,
         value=lambda result: fold.of(column(result)),
         count=count or (lambda result: known(column(result))),
         running=None if accumulate is None else lambda result: (fold.start, accumulate(column(result))),
         scale=scale,
-        shown=shown,
-    )
-
-
-def counted(
-    name: str,
-    column: Column[R],
-    is_on: Callable[[R, Float64], Bool],
-    *,
-    scale: Scale = FAULTS,
-    shown: Shown | None = None,
-) -> Metric[R]:
-    """The number of values where `is_on`."""
-    return Metric(
-        name=name,
-        value=lambda result: int(np.sum(is_on(result, column(result)))),
-        count=lambda result: known(column(result)),
-        running=lambda result: (0.0, np.cumsum(is_on(result, column(result))).astype(np.float64)),
-        scale=scale,
-        shown=shown,
+        column=shown,
+        pick=fold.pick,
     )
 
 

@@ -14,7 +14,7 @@ from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate import field_accuracy, score_report
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
-from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
+from splatctrl_cli.evaluate.metrics import Better, Measure, Scale
 from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PARTIAL, output_path
 from splatctrl_cli.jobs.bake.accuracy import SUMMARY_METRICS
@@ -41,7 +41,7 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
 
 
 @cache
-def shown() -> Mapping[str, Shown]:
+def shown() -> Mapping[str, Measure[Any]]:
     return {name: where for mode in MODES for name, where in shown_metrics(mode, REPLAY_FIELDS).items()}
 
 
@@ -274,7 +274,7 @@ def worst_state(folder: Path | None, metric: str) -> WorstState | None:
     )
 
 
-def _badness(where: Shown, text: str) -> float:
+def _badness(where: Measure[Any], text: str) -> float:
     """Rank a cell: smaller is worse."""
     if where.pick not in ("least", "largest"):
         return 0.0 if text == where.pick else math.inf

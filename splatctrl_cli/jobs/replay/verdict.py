@@ -44,7 +44,7 @@ def replay_verdict(judged: Judged) -> Verdict:
     reasons += gate_reasons(
         request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)
     )
-    stamps = replay.audit.stamp_ns
+    stamps = replay.trace.stamp_ns
     first, last = replay.start_time_s, replay.start_time_s + float(stamps[-1] - stamps[0]) * 1e-9
     motion = "driven" if replay.closed_loop else "logged"
     span, past = f"{motion} motion from {first:.2f} to {last:.2f} s of the log", judged.past_end_s
@@ -67,7 +67,7 @@ def _how(judged: Judged) -> str:
     """Return "waived", "proven" (all space within the margin seen free), or an empty text."""
     if any(waivers(judged.request)):
         return "waived"
-    assumed = nearby(judged, judged.replay.near["assumed"])
+    assumed = nearby(judged, judged.replay.trace["assumed"])
     return "proven" if assumed is not None and assumed[0] <= 0 else ""
 
 
@@ -78,12 +78,12 @@ def _notes(judged: Judged) -> Iterator[str]:
         yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
-    unseen, assumed = (nearby(judged, judged.replay.near[name]) for name in ("unseen", "assumed"))
+    unseen, assumed = (nearby(judged, judged.replay.trace[name]) for name in ("unseen", "assumed"))
     if unseen is None:
         yield "space about the arm not judged"
     if assumed is not None and assumed[0] > 0:
         yield f"at most {100 * assumed[0]:.0f} % of the space within the margin of the arm was assumed to be free"
-    if nearby(judged, judged.replay.near["age"]) is None:
+    if nearby(judged, judged.replay.trace["evidence_age"]) is None:
         yield "age of the evidence about the arm not judged"
     yield from _declared_notes(judged)
     yield from waivers(judged.request)

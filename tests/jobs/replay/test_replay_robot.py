@@ -15,7 +15,7 @@ from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.files import spilled_rows
 from splatctrl_cli.geometry import transform_points
-from splatctrl_cli.jobs.replay import files, state_pass, state_store
+from splatctrl_cli.jobs.replay import files, state_pass
 from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, doubts_of, measured_robot
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.recording.log import state_columns
@@ -231,7 +231,7 @@ def test_blocks_of_any_size_give_the_same_files(
     truth = ("--truth", str(desk.folder / "truth.json"))
     more = {"audit": truth, "open-loop": (), "closed-loop": ("--follow",)}[mode]
     for num in (1, 7, 10_000):
-        for module in (files, state_pass, state_store, spilled_rows, state_columns):
+        for module in (files, state_pass, spilled_rows, state_columns):
             monkeypatch.setattr(module, "BLOCK", num)
         assert desk.replay("--scene", str(scene), "-q", "--mode", mode, *more, out=str(num)) == 0
     for file in FILES:
@@ -241,10 +241,8 @@ def test_blocks_of_any_size_give_the_same_files(
 
 def signals(values: Sequence[float], names: Sequence[str]) -> list[Signal]:
     value = np.array(values)
-    low = Signal(
-        kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, names=lambda i: [names[i]], is_high_worse=False
-    )
-    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, names=lambda i: [names[i]])]
+    low = Signal(kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, who=names, is_high_worse=False)
+    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, who=names)]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5, 12])
@@ -264,7 +262,7 @@ def test_an_event_that_crosses_blocks_is_one(size: int) -> None:
 
 
 def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None:
-    stored: state_store.StoredObjects[int] = state_store.StoredObjects()
+    stored: spilled_rows.ObjectFile[int] = spilled_rows.ObjectFile()
     for block in ([0, 1], [], [2, 3, 4], [5]):
         stored.extend(block)
     whole = list(range(6))

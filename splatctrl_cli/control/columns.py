@@ -1,0 +1,112 @@
+"""Columns of a replay's states, by name: what was audited, commanded and left."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.control.audit import AuditTrace
+from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
+from splatctrl_cli.control.qp import Rung
+from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.control.terms import RowKind
+from splatctrl_cli.records import Float64, Index
+
+Columns = Mapping[str, Any]
+"""By name: numbers (T, ...), NaN without a value; or T words, or tuples of words, empty without any."""
+
+RUNGS = tuple(Rung)
+
+
+def names_at(names: Sequence[str], index: Index) -> list[str]:
+    """Names (T,) by index (T,); empty for -1."""
+    return [names[i] if i >= 0 else "" for i in index.tolist()]
+
+
+def audit_columns(part: AuditTrace, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str]) -> Columns:
+    """Columns of audited states, in their units; q: position (T, J)."""
+    columns: dict[str, Any] = {"stamp_ns": part.stamp_ns, "q": part.position}
+    for field, nearest in part.clearance.items():
+        columns[f"clearance_{field}"] = nearest.distance
+        columns[f"nearest_{field}"] = names_at(spheres, nearest.sphere)
+    return columns | {
+        "self_clearance": part.self_clearance,
+        "self_pair": names_at(pairs, part.self_pair),
+        "limit_margin": part.limit_margin,
+        "limit_joint": names_at(joints, part.limit_joint),
+        "unknown_share": part.unknown_share,
+    }
+
+
+def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> Columns:
+    """Columns of a controller's steps, None where it had none.
+
+    v (T, J) [rad/s]: velocity. rung_number: in RUNGS. position_error [m], rotation_error [rad]. shaped: 1 if any row,
+    or one of a kind, shapes the command, NaN for an external controller. multiplier: largest of a kind's rows. who_*:
+    rows, the largest first.
+    """
+
+    def number(value: Callable[[ControlStep], float]) -> Float64:
+        return np.array([np.nan if step is None else value(step) for step in steps], dtype=np.float64)
+
+    def words(value: Callable[[ControlStep], Any]) -> list[Any]:
+        return ["" if step is None else value(step) for step in steps]
+
+    def shaped(step: ControlStep, kind: RowKind | None = None) -> float:
+        return np.nan if step.rung is Rung.OUTSIDE else float(is_shaped(step, kind))
+
+    blank = np.full(num_joints, np.nan)
+    columns = {
+        "v": np.array([blank if step is None else step.velocity for step in steps]),
+        "barrier_clearance": number(lambda step: step.clearance),
+        "barrier_nearest": words(lambda step: step.nearest),
+        "rung": words(lambda step: str(step.rung)),
+        "rung_number": number(lambda step: RUNGS.index(step.rung)),
+        "scale": number(lambda step: step.scale),
+        "slack": number(lambda step: max((row.slack for row in step.relaxed), default=0.0)),
+        "relaxed": words(lambda step: " ".join(row.name for row in step.relaxed)),
+        "who_relaxed": words(
+            lambda step: tuple(row.name for row in sorted(step.relaxed, key=lambda row: -row.slack))
+        ),
+        "intervening": words(lambda step: "; ".join(step.intervening)),
+        "multipliers": words(lambda step: "; ".join(f"{row.multiplier:.4g}" for row in step.interventions)),
+        "num_rows": number(lambda step: step.num_rows),
+        "num_refused": number(lambda step: step.num_refused),
+        "residual": number(lambda step: step.residual),
+        "position_error": number(lambda step: float(np.linalg.norm(step.pose_error[:3]))),
+        "rotation_error": number(lambda step: float(np.linalg.norm(step.pose_error[3:]))),
+        "fixed_distance": number(lambda step: step.fixed_distance),
+        "who_fixed": words(lambda step: step.violated_fixed),
+        "shaped": number(shaped),
+    }
+    for kind in RowKind:
+        own = [[] if step is None else [row for row in step.interventions if row.kind is kind] for step in steps]
+        columns[f"shaped_{kind}"] = number(lambda step, kind=kind: shaped(step, kind))
+        columns[f"multiplier_{kind}"] = np.array([max((row.multiplier for row in rows), default=0.0) for rows in own])
+        columns[f"who_{kind}"] = [
+            tuple(row.name for row in sorted(rows, key=lambda row: -row.multiplier)) for rows in own
+        ]
+    return columns
+
+
+def open_loop_columns(part: OpenLoopTrace) -> Columns:
+    """Columns of open-loop states: their steps, and the room that the logged velocity left.
+
+    logged, dv (commanded less logged) (T, J) [rad/s]; velocity_difference: its norm, largest_difference: of a joint.
+    """
+    room = [
+        (np.nan, "", np.nan, "") if m is None else (m.barrier, m.barrier_row, m.limit, m.limit_row)
+        for m in part.margins
+    ]
+    barrier, barrier_row, limit, limit_row = zip(*room, strict=True)
+    return {
+        **step_columns(part.steps, part.logged.shape[1]),
+        "logged": part.logged,
+        "dv": part.difference,
+        "velocity_difference": np.linalg.norm(part.difference, axis=1),
+        "largest_difference": np.max(np.abs(part.difference), axis=1),
+        "barrier_margin_logged": np.array(barrier),
+        "barrier_row_logged": list(barrier_row),
+        "velocity_margin_logged": np.array(limit),
+        "velocity_row_logged": list(limit_row),
+    }
