@@ -24,8 +24,9 @@ def names_at(names: Sequence[str], index: Index) -> list[str]:
 
 
 def audit_columns(part: AuditTrace, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str]) -> Columns:
-    """Columns of audited states, in their units; q: position (T, J)."""
-    columns: dict[str, Any] = {"stamp_ns": part.stamp_ns, "q": part.position}
+    """Columns of audited states, in their units; q: position (T, J); is_blank: 1 where a field has no distance."""
+    blank = np.any([np.isnan(nearest.distance) for nearest in part.clearance.values()], axis=0)
+    columns: dict[str, Any] = {"stamp_ns": part.stamp_ns, "q": part.position, "is_blank": blank}
     for field, nearest in part.clearance.items():
         columns[f"clearance_{field}"] = nearest.distance
         columns[f"nearest_{field}"] = names_at(spheres, nearest.sphere)

@@ -1,10 +1,9 @@
 """Events of an audit and a controller: intervals with worst value and names."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -125,75 +124,39 @@ def runs_of(is_on: Bool) -> list[tuple[int, int]]:
     return [(int(first), int(end)) for first, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def events_of(stamp_ns: Stamps, signals: Iterable[Signal]) -> tuple[Event, ...]:
-    """Intervals of all signals (T,), by start."""
-    fold = EventFold()
-    fold.add(stamp_ns, signals)
-    return fold.events()
-
-
 Near = Callable[[EventKind, str, int], Obstacle | None]
 """Kind of an event, name of its worst and at which of the states -> what is nearest there."""
 
 
-class EventFold:
-    """Intervals of signals in blocks of states; an interval may span blocks."""
+def events_of(stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> tuple[Event, ...]:
+    """Intervals of all signals (T,), by start; near: the obstacle of a worst value."""
+    runs = [(signal, first, end) for signal in signals for first, end in runs_of(signal.is_on)]
+    runs.sort(key=lambda run: (stamp_ns[run[1]], -stamp_ns[run[2] - 1]))
+    return tuple(_event(stamp_ns, signal, first, end, near) for signal, first, end in runs)
 
-    def __init__(self) -> None:
-        self._num, self._start_ns = 0, 0
-        self._open: dict[int, Event] = {}  # by the signal's order, with all their names
-        self._closed: list[tuple[int, Event]] = []
 
-    def add(self, stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> None:
-        """Add a block of stamps (T,) and signals (T,), in the same order each time.
-
-        near: the obstacle of a worst value.
-        """
-        if not self._num:
-            self._start_ns = int(stamp_ns[0])
-        for order, signal in enumerate(signals):
-            before = self._open.pop(order, None)
-            runs = runs_of(signal.is_on)
-            if before is not None and not (runs and runs[0][0] == 0):
-                self._closed.append((order, before))
-                before = None
-            for first, end in runs:
-                event = self._grown(before, stamp_ns, signal, first, end, near)
-                before = None
-                if end == len(stamp_ns):
-                    self._open[order] = event
-                else:
-                    self._closed.append((order, event))
-        self._num += len(stamp_ns)
-
-    def events(self) -> tuple[Event, ...]:
-        """All intervals so far, by start; an open one ends with the last state."""
-        events = sorted([*self._closed, *self._open.items()], key=lambda e: (e[1].first_ns, -e[1].last_ns, e[0]))
-        return tuple(replace(event, names=event.names[:MAX_NAMES]) for _, event in events)
-
-    def _grown(
-        self, before: Event | None, stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None
-    ) -> Event:
-        """`before` (None: a new event) with the states [first, end) of this block."""
-        values = signal.value[first:end]
-        at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
-        worst = float(signal.value[at])
-        start_s, end_s, worst_s = (float(int(stamp_ns[i]) - self._start_ns) * 1e-9 for i in (first, end - 1, at))
-        names = tuple(dict.fromkeys([*(before.names if before else ()), *signal.names(first, end)]))
-        grown: dict[str, Any] = {
-            "last_ns": int(stamp_ns[end - 1]),
-            "end_s": end_s,
-            "num_states": end - first + (before.num_states if before else 0),
-            "names": names,
-            "num_names": len(names),
-        }
-        if before is None or (worst > before.worst if signal.is_high_worse else worst < before.worst):
-            name = next(iter(signal.names(at, at + 1)), "")
-            grown |= {"worst": worst, "worst_s": worst_s, "state": self._num + at, "worst_name": name}
-            grown["obstacle"] = None if near is None else near(signal.kind, name, at)
-        if before is not None:
-            return replace(before, **grown)
-        return Event(kind=signal.kind, source=signal.source, first_ns=int(stamp_ns[first]), start_s=start_s, **grown)
+def _event(stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None) -> Event:
+    """The event of the states [first, end)."""
+    values = signal.value[first:end]
+    at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
+    start_s, end_s, worst_s = (float(stamp_ns[i] - stamp_ns[0]) * 1e-9 for i in (first, end - 1, at))
+    names, name = signal.names(first, end), next(iter(signal.names(at, at + 1)), "")
+    return Event(
+        kind=signal.kind,
+        source=signal.source,
+        first_ns=int(stamp_ns[first]),
+        last_ns=int(stamp_ns[end - 1]),
+        start_s=start_s,
+        end_s=end_s,
+        num_states=end - first,
+        worst=float(signal.value[at]),
+        worst_s=worst_s,
+        state=at,
+        worst_name=name,
+        names=tuple(names[:MAX_NAMES]),
+        num_names=len(names),
+        obstacle=None if near is None else near(signal.kind, name, at),
+    )
 
 
 def first_intervention(events: Sequence[Event]) -> Event | None:

@@ -14,7 +14,6 @@ from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame, Stamps
 
 R = TypeVar("R")  # the result that has the metric
-Column = Callable[[R], Float64]
 
 
 class Better(StrEnum):
@@ -121,33 +120,6 @@ MEAN, P95 = (Fold(of=partial(_fold_known, fold)) for fold in (np.mean, partial(n
 LAST = Fold(of=last)
 TOTAL = Fold(of=lambda values: int(np.nansum(values)))
 NUMBER = Fold(of=TOTAL.of, pick="least", start=0.0, accumulate=lambda values: np.asarray(np.nancumsum(values)))
-
-
-def known(values: Float64) -> int:
-    """The number of values except NaN."""
-    return int(np.sum(~np.isnan(values)))
-
-
-def folded(
-    name: str,
-    fold: Fold,
-    column: Column[R],
-    count: Callable[[R], int] | None = None,
-    *,
-    scale: Scale = DESCRIBES,
-    shown: str = "",
-) -> Measure[R]:
-    """A column's fold; counts all but NaN, unless `count` is given. shown: the name of the column that shows it."""
-    accumulate = fold.accumulate
-    return Measure(
-        name=name,
-        value=lambda result: fold.of(column(result)),
-        count=count or (lambda result: known(column(result))),
-        running=None if accumulate is None else lambda result: (fold.start, accumulate(column(result))),
-        scale=scale,
-        column=shown,
-        pick=fold.pick,
-    )
 
 
 FEWEST = 8  # recordings; of fewer there are too few different resamples for their percentiles to mean anything

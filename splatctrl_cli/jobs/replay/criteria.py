@@ -10,7 +10,7 @@ from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
-from splatctrl_cli.jobs.replay.metrics import Metrics, is_blank
+from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.records import Float64
 
@@ -176,7 +176,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
     the first map.
     """
     config, replay = judged.request.config.verdict, judged.replay
-    stamps, unbounded, blank = replay.trace.stamp_ns, replay.trace["unbounded_s"], is_blank(replay)
+    stamps, unbounded, blank = replay.trace.stamp_ns, replay.trace["unbounded_s"], replay.trace["is_blank"]
     if blank.any():
         yield lacking(
             criterion="judged states",

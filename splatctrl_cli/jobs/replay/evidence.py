@@ -18,7 +18,7 @@ from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.sections import VerdictConfig
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.control.columns import names_at
-from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle, clearance_signals
+from splatctrl_cli.control.events import Event, EventKind, Obstacle, clearance_signals, events_of
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
@@ -243,7 +243,7 @@ class Swept:
         """Sweep every audited state; memory grows with the space passed alone."""
         moving = np.flatnonzero(model.moving_spheres)
         cells, radii = np.zeros((0, 3)), np.zeros(0)
-        for first, last in ranges(len(trace)):
+        for first, last in ranges(len(trace.rows("q"))):
             centers = model.sphere_centers_batch(trace.rows("q")[first:last])[:, moving]
             cells = np.concatenate([cells, np.floor(centers.reshape(-1, 3) / SPHERE_CELL)])
             radii = np.concatenate([radii, np.tile(model.sphere_set.radii[moving], last - first)])
@@ -326,7 +326,7 @@ def _drop_expected(
 
 def _true_events(inputs: ReplayInputs, replay: Replay, truth: Truth) -> tuple[Event, ...]:
     model, trace = inputs.model, replay.trace
-    names, stamps, fold = sphere_names(model.sphere_set), trace.stamp_ns, EventFold()
+    names, stamps = sphere_names(model.sphere_set), trace.stamp_ns
 
     def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
         stamp, center = int(stamps[at]), model.sphere_centers(trace.rows("q")[at])[[names.index(name)]]
@@ -336,6 +336,4 @@ def _true_events(inputs: ReplayInputs, replay: Replay, truth: Truth) -> tuple[Ev
         x, y, z = (float(v) for v in surface[0])
         return Obstacle(distance=float(distance[0]), position=(x, y, z), name=least.name)
 
-    columns = {"clearance_true": trace["clearance_true"], "nearest_true": trace.words("nearest_true")}
-    fold.add(stamps, clearance_signals(columns, "true", replay.margin), near)
-    return fold.events()
+    return events_of(stamps, clearance_signals(trace, "true", replay.margin), near)

@@ -49,14 +49,14 @@ def chunks_of(replay: Replay) -> Iterator[Columns]:
 
 
 def columns_of(replay: Replay, rows: slice = slice(None)) -> Columns:
-    trace, stamps = replay.trace, replay.trace.stamp_ns
+    trace, stamps = replay.trace, replay.trace.rows("stamp_ns")
     columns: Columns = {
         "stamp_ns": stamps[rows].tolist(),
         "time_s": ((stamps[rows] - stamps[0]) * 1e-9).tolist(),
     }
     by_field = [name for field in replay.fields for name in (f"clearance_{field}", f"nearest_{field}")]
     for name in ("q", *by_field, *(name for name in COLUMNS if name in trace)):
-        values = trace.block(name, rows)
+        values = trace.rows(name)[rows]
         if isinstance(values, list):
             columns[name] = values
         elif values.ndim == 1:
@@ -283,13 +283,13 @@ def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | Non
 
 def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:
     trace, model, names = replay.trace, replay.model, sphere_names(replay.model.sphere_set)
-    stamp, sphere = int(trace.stamp_ns[state]), trace.words("nearest_exact")[state]
+    stamp, sphere = int(trace.stamp_ns[state]), trace["nearest_exact"][state]
     worst, centers = names.index(sphere), model.sphere_centers(trace.rows("q")[state])
     (obstacle,) = inputs.scene.at(stamp).obstacles(np.ascontiguousarray(centers[[worst]]))
     of = {NAMES.get(field, field): f"clearance_{field}" for field in replay.fields}
     of |= {"truth": "clearance_true"} if "clearance_true" in trace else {}
     figures = [f"{name} {100 * float(trace.rows(column)[state]):.2f} cm" for name, column in of.items()]
-    rung = trace.words("rung")[state] if "rung" in trace else ""
+    rung = trace["rung"][state] if "rung" in trace else ""
     scale = trace.rows("scale")[state] if rung else 1.0
     step = f"   step: {rung}" if rung else ""
     step += f", scaled by {scale:g}" if scale < 1 else ""

@@ -34,7 +34,6 @@ from splatctrl_cli.evaluate.metrics import (
     Fold,
     Measure,
     Scale,
-    folded,
 )
 from splatctrl_cli.jobs.replay.goal import TWIST_FIGURES
 from splatctrl_cli.jobs.replay.inputs import LOG_FIGURES, LoggedStates
@@ -45,11 +44,6 @@ from splatctrl_cli.voxels import EvidenceClass
 Metrics = dict[str, float | None]
 Declared = tuple[Measure[Replay], ...]
 num_states: Callable[[Replay], int] = attrgetter("num_states")
-
-
-def is_blank(replay: Replay) -> Bool:
-    """(T,) True where a field has no distance."""
-    return np.asarray(np.any([np.isnan(replay.trace[f"clearance_{name}"]) for name in replay.fields], axis=0))
 
 
 def _single(
@@ -68,28 +62,31 @@ def _of(
     scale: Scale = DESCRIBES,
     *,
     part: int | None = None,
+    where: Callable[[Replay, Float64], Bool] | None = None,
     count: Callable[[Replay], int] | None = None,
     shown: str = "",
 ) -> Measure[Replay]:
-    """A fold of a column of the trace, or of one `part` of it."""
+    """A fold of a column (T,) of the trace, or of one `part` of it.
+
+    where: fold 1 where it is true, else 0. count: by default of states with a value. shown: the column of
+    ``steps.csv`` that shows it.
+    """
 
     def values(replay: Replay) -> Float64:
-        whole = replay.trace[column]
-        return whole if part is None else whole[:, part]
+        whole = replay.trace.get(column, np.empty(0))
+        own = whole if part is None else whole[:, part]
+        return own if where is None else np.where(np.isnan(own), np.nan, where(replay, own))
 
-    return folded(name, fold, values, count, scale=scale, shown=shown)
-
-
-def _where(
-    column: str, name: str, is_on: Callable[[Replay, Float64], Bool], scale: Scale = FAULTS, *, shown: str = ""
-) -> Measure[Replay]:
-    """The number of states where a column of the trace `is_on`."""
-
-    def values(replay: Replay) -> Float64:
-        whole = replay.trace[column]
-        return np.where(np.isnan(whole), np.nan, is_on(replay, whole))
-
-    return folded(name, NUMBER, values, scale=scale, shown=shown)
+    accumulate = fold.accumulate
+    return Measure(
+        name=name,
+        value=lambda replay: fold.of(values(replay)),
+        count=count or (lambda replay: int(np.sum(~np.isnan(values(replay))))),
+        running=None if accumulate is None else lambda replay: (fold.start, accumulate(values(replay))),
+        scale=scale,
+        column=shown,
+        pick=fold.pick,
+    )
 
 
 def _clearance(field: str) -> Measure[Replay]:
@@ -139,15 +136,9 @@ OF_AUDIT: Declared = (
     _single("duration_s", lambda replay: replay.trace.seconds(-1), scale=TIME),
 )
 OF_STATES: Declared = (
-    folded(
-        "min_clearance_true",
-        LEAST,
-        lambda r: r.trace["clearance_true"] if "clearance_true" in r.trace else np.empty(0),
-        scale=GAP,
-        shown="clearance_true",
-    ),
-    _where(NEAREST, "num_below_margin", lambda replay, values: values < replay.margin, shown=NEAREST),
-    _where(NEAREST, "num_in_collision", lambda _, values: values < 0, shown=NEAREST),
+    _clearance("true"),
+    _of(NEAREST, "num_below_margin", NUMBER, FAULTS, where=lambda replay, d: d < replay.margin, shown=NEAREST),
+    _of(NEAREST, "num_in_collision", NUMBER, FAULTS, where=lambda _, d: d < 0, shown=NEAREST),
     _of(
         "self_clearance",
         "min_self_clearance",
@@ -177,7 +168,7 @@ OF_STATES: Declared = (
     _of("evidence_age", "max_evidence_age_s", LARGEST, AGE),
     _single("unjudged_s", lambda r: float(r.trace["unbounded_s"].sum()) + r.lead_in_s, _intervals, AGE),
     _of("unknown_share", "unknown_share", MEAN, BAD_SHARE, shown="unknown_share"),
-    folded("num_without_distance", NUMBER, lambda r: is_blank(r).astype(np.float64), scale=FAULTS),
+    _of("is_blank", "num_without_distance", NUMBER, FAULTS),
     _single(
         "num_static_violations",
         lambda r: len(r.static_violations),
@@ -195,8 +186,9 @@ def _rung(rung: Rung) -> Measure[Replay]:
     name, scale = "num_" + rung.value.replace("-", "_"), FAULTS
     if rung is Rung.SOLVED:
         scale = Scale(better=Better.HIGHER, relative=0.05)
-    number = _where("rung_number", name, lambda _, values: values == RUNGS.index(rung), scale, shown="rung")
-    return replace(number, pick=rung.value)
+    number = RUNGS.index(rung)
+    measure = _of("rung_number", name, NUMBER, scale, where=lambda _, rungs: rungs == number, shown="rung")
+    return replace(measure, pick=rung.value)
 
 
 OF_STEPS: Declared = (
@@ -206,7 +198,7 @@ OF_STEPS: Declared = (
     _of("barrier_clearance", "min_barrier_clearance", LOWEST, GAP, shown="barrier_clearance"),
     *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
     _of("num_refused", "num_refused", TOTAL, FAULTS),
-    _where("scale", "num_scaled_back", lambda _, values: values < 1, shown="scale"),
+    _of("scale", "num_scaled_back", NUMBER, FAULTS, where=lambda _, scales: scales < 1, shown="scale"),
     _of("residual", "max_residual", LARGEST, Scale(better=Better.LOWER, absolute=1e-6), shown="residual"),
 )
 DIFFERENCE, BARRIER, VELOCITY = "velocity_difference", "barrier_margin_logged", "velocity_margin_logged"
@@ -215,7 +207,7 @@ OF_OPEN_LOOP: Declared = (
     _of(DIFFERENCE, "p95_velocity_difference", P95, SPEED, shown=DIFFERENCE),
     _of("largest_difference", "max_velocity_difference", LARGEST, SPEED, shown=DIFFERENCE),
     _of(BARRIER, "min_barrier_margin_logged", LOWEST, SLACK, shown=BARRIER),
-    _where(BARRIER, "num_barrier_broken_logged", lambda _, values: values < 0, shown=BARRIER),
+    _of(BARRIER, "num_barrier_broken_logged", NUMBER, FAULTS, where=lambda _, room: room < 0, shown=BARRIER),
     _of(VELOCITY, "min_velocity_margin_logged", LOWEST, SLACK, shown=VELOCITY),
 )
 

@@ -40,7 +40,6 @@ def _audit(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     for stamps, positions, velocities in _blocks(record, inputs.states, first):
         record.measured(stamps, positions, velocities)
-        record.explain()
     return _finish_logged(request, inputs, config, record, first)
 
 
@@ -67,7 +66,7 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
                 scene_step_at=scene.step_at,
                 commander=commander,
             )
-            record.explain(open_loop_columns(trace))
+            record.trace.append(open_loop_columns(trace))
     return replace(
         _finish_logged(request, inputs, config, record, first),
         twist_figures=twist_figures(model, config.control, frame, twists, record.trace),
@@ -118,7 +117,7 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
         straight = np.zeros_like(positions)  # the driven arm moves straight from state to state
         record.measured(stamps, positions, straight)
         apart = divergence(model, task.frame, stamps, positions, motion)
-        record.explain(step_columns(trace.steps[first:last], model.num_joints) | apart)
+        record.trace.append({**step_columns(trace.steps[first:last], model.num_joints), **apart})
     return replace(
         _finish(request, inputs, config, record, trace.static_violations, radius_of=0),
         closed_loop=trace,
@@ -191,7 +190,7 @@ def _finish(
         overtaken=tuple(record.newer_depth.found),
         statics=record.fixed_parts.found,
         closest=record.closest,
-        events=record.events.events(),
+        events=record.events(),
     )
 
 

@@ -156,7 +156,7 @@ class Replay:
 
     @property
     def num_states(self) -> int:
-        return len(self.trace)
+        return len(self.trace.rows("stamp_ns"))
 
     @property
     def margin(self) -> float:

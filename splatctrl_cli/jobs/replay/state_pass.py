@@ -1,4 +1,4 @@
-"""States of a replay, measured, explained and stored block by block."""
+"""States of a replay, measured and stored block by block."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +20,15 @@ from splatctrl_cli.control.audit import (
     part_clearances,
 )
 from splatctrl_cli.control.columns import Columns, audit_columns, names_at
-from splatctrl_cli.control.events import EventFold, EventKind, Obstacle, audit_signals, motion_signals, step_signals
+from splatctrl_cli.control.events import (
+    Event,
+    EventKind,
+    Obstacle,
+    audit_signals,
+    events_of,
+    motion_signals,
+    step_signals,
+)
 from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace
 from splatctrl_cli.control.preconditions import FixedParts
@@ -73,15 +81,13 @@ class ReplayRecord:
         contact, its times from `first_state_ns`. surfaces: for self-collision; None uses the spheres.
         """
         self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
-        self.trace, self.events = Trace(), EventFold()
-        self._block: Columns = {}  # measured last
+        self.trace = Trace()
         self.fields: tuple[str, ...] = ()
         self._robot = self._model = model
         self._scene, self._max_map_age = scene, max_map_age
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
         self.fixed_parts = FixedParts(model, 2.0 * (self._margin - fixed.SLIGHTLY_UNDER))
         self._spheres = sphere_names(model.sphere_set)
-        self._number = {name: number for number, name in enumerate(self._spheres)}
         self._surfaces, self._kept = surfaces, kept
         self._enough = max(config.control.self_margin, config.control.margin)
         self.closest: dict[KeptMargin, tuple[float, int]] = {}
@@ -123,7 +129,7 @@ class ReplayRecord:
         strain = self._limits.add(stamps, positions if self._is_continuous else np.zeros_like(positions))
         joints = self._model.joint_names
         self._look_at_statics(part)
-        self._block = {
+        columns = {
             **audit_columns(part, self._spheres, joints, self._pairs),
             "obstacle": ["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)],
             "map_age_s": np.array([scene.age_s(stamp) for stamp in stamps.tolist()]),
@@ -135,26 +141,26 @@ class ReplayRecord:
             **self._look_around(part),
             "clearance_splats": self._clearance_of_splats(part),
         }
-        self.trace.append(self._block)
+        self.trace.append(columns)
         return part
 
-    def explain(self, commanded: Columns | None = None) -> None:
-        """Find the events of the block measured last; commanded: `step_columns` there."""
-        block, more = self._block, commanded or {}
-        self.trace.append(more)
+    def events(self) -> tuple[Event, ...]:
+        """Events of all states, and of a controller's `step_columns` if the trace has them."""
+        trace, number = self.trace, {name: number for number, name in enumerate(self._spheres)}
         signals = [
-            *audit_signals(block, self.fields, self._margin),
-            *motion_signals(block, self._margin - fixed.SLIGHTLY_UNDER, self._max_map_age),
-            *(step_signals(more) if more else ()),
+            *audit_signals(trace, self.fields, self._margin),
+            *motion_signals(trace, self._margin - fixed.SLIGHTLY_UNDER, self._max_map_age),
+            *(step_signals(trace) if "rung" in trace else ()),
         ]
 
         def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
-            if name not in self._number or kind is EventKind.WITHOUT_DISTANCE:
+            if name not in number or kind is EventKind.WITHOUT_DISTANCE:
                 return None
-            center = self._model.sphere_centers(block["q"][at])[[self._number[name]]]
-            return self._scene.at(int(block["stamp_ns"][at])).obstacles(center)[0]
+            stamp = int(trace.rows("stamp_ns")[at])
+            center = self._robot.at(stamp).sphere_centers(trace.rows("q")[at])[[number[name]]]
+            return self._scene.at(stamp).obstacles(center)[0]
 
-        self.events.add(block["stamp_ns"], signals, near)
+        return events_of(trace.stamp_ns, signals, near)
 
     def _without_expected(self, part: AuditTrace) -> AuditTrace:
         if not self._declared.expected_contact:

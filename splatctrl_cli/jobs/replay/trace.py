@@ -1,18 +1,18 @@
 """The trace of a replay: one table of its states, in files."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.control.columns import Columns
 from splatctrl_cli.files.spilled_rows import ObjectFile, RowFile, Rows
-from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.records import Stamps
 
 BLOCK = 1024  # states that are replayed at once
 
 
-class Trace:
+class Trace(Mapping[str, Any]):
     """T states by named column, appended in blocks.
 
     Numbers (T, ...) are NaN without a value. Words, empty without any, name who or where a value is from:
@@ -33,34 +33,24 @@ class Trace:
                 self._words.setdefault(name, ObjectFile()).extend(values)
 
     def __len__(self) -> int:
-        return len(self._numbers["stamp_ns"])
+        """The number of columns."""
+        return len(self._numbers) + len(self._words)
 
     def __iter__(self) -> Iterator[str]:
         return iter((*self._numbers, *self._words))
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._numbers or name in self._words
+    def __getitem__(self, name: str) -> Any:
+        """All numbers (T, ...) of a column, or its words (T,), read where needed."""
+        return np.asarray(self.rows(name)) if name in self._numbers else self._words[name]
 
-    def __getitem__(self, name: str) -> Float64:
-        """A whole column of numbers (T, ...)."""
-        return np.asarray(self.rows(name))
-
-    def block(self, name: str, which: slice) -> Float64 | list[Any]:
-        """Numbers (K, ...) or words of some states."""
-        return self.rows(name)[which] if name in self._numbers else self._words[name][which]
-
-    def rows(self, name: str) -> Rows:
-        """A column of numbers (T, ...), read where needed."""
-        return Rows(self._numbers[name])
-
-    def words(self, name: str) -> Sequence[Any]:
-        """A column of words (T,), read where needed."""
-        return self._words[name]
+    def rows(self, name: str) -> Any:
+        """A column (T, ...), read where needed: `Rows` of numbers, or words."""
+        return Rows(self._numbers[name]) if name in self._numbers else self._words[name]
 
     @property
     def stamp_ns(self) -> Stamps:
         """Stamps (T,) [ns]."""
-        return np.asarray(self.rows("stamp_ns"), dtype=np.int64)
+        return np.asarray(self["stamp_ns"], dtype=np.int64)
 
     def seconds(self, index: int) -> float:
         """Time [s] of a state since the first."""

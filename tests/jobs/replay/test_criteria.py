@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config, ControlConfig
+from splatctrl_cli.control.audit import AuditTrace, Clearance
+from splatctrl_cli.control.columns import audit_columns
 from splatctrl_cli.control.events import Event, EventKind, Signal, events_of
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.control.replay import ReplayTrace
@@ -53,8 +55,9 @@ def judged(
 ) -> Judged:
     """What the criteria look at, of a run with nothing broken but these columns, a scene's figures, and `replay`."""
     stamps, trace = np.arange(NUM, dtype=np.int64) * 100_000_000, Trace()
-    safe = {"unknown_share": np.zeros(NUM), "unbounded_s": np.zeros(NUM), "clearance_surface": np.full(NUM, 0.1)}
-    trace.append({"stamp_ns": stamps, "map_age_s": np.zeros(NUM), **safe, **NOTHING_NEAR, **(columns or {})})
+    safe = dict.fromkeys(("unknown_share", "unbounded_s", "map_age_s", "is_blank"), np.zeros(NUM))
+    surface = {"clearance_surface": np.full(NUM, 0.1)}
+    trace.append({"stamp_ns": stamps, **safe, **surface, **NOTHING_NEAR, **(columns or {})})
     config = Config(control=ControlConfig(margin=margin))
     nothing: Any = None
     run: dict[str, Any] = {
@@ -159,17 +162,23 @@ def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
 
 
 def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:
-    there, blank = np.full(NUM, 0.2), np.full(NUM, 0.2)
+    there, blank, nowhere = np.full(NUM, 0.2), np.full(NUM, 0.2), np.full(NUM, -1)
     blank[3] = np.nan
     for fields in ((there, blank), (blank, there)):
-        columns = dict(zip(("clearance_a", "clearance_b"), fields, strict=True))
-        (reason,) = evidence.judged_time(judged(columns, fields=("a", "b")))
+        part = AuditTrace(
+            stamp_ns=np.arange(NUM),
+            position=np.zeros((NUM, 0)),
+            clearance={name: Clearance(distance=d, sphere=nowhere) for name, d in zip("ab", fields, strict=True)},
+            **dict.fromkeys(("limit_margin", "self_clearance", "unknown_share"), there),
+            **dict.fromkeys(("limit_joint", "self_pair"), nowhere),
+        )
+        (reason,) = evidence.judged_time(judged({"is_blank": audit_columns(part, (), (), ())["is_blank"]}))
         assert (reason.outcome, reason.time_s) == (Outcome.NOT_EVALUABLE, pytest.approx(0.3))
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_a_lead_in_longer_than_is_allowed_is_not_judged(share: float) -> None:
-    run = judged({"clearance_a": np.full(NUM, 0.2)}, fields=("a",), lead_in_s=share * Config().verdict.lead_in)
+    run = judged(lead_in_s=share * Config().verdict.lead_in)
     assert outcomes(evidence.judged_time, run) == ([Outcome.NOT_EVALUABLE] if share > 1 else [])
 
 

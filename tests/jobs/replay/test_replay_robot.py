@@ -3,7 +3,6 @@
 import json
 import re
 from argparse import Namespace
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 import trimesh
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.files import spilled_rows
 from splatctrl_cli.geometry import transform_points
@@ -237,28 +235,6 @@ def test_blocks_of_any_size_give_the_same_files(
     for file in FILES:
         whole = (desk.folder / "10000" / file).read_bytes()
         assert all((desk.folder / out / file).read_bytes() == whole for out in ("1", "7")), file
-
-
-def signals(values: Sequence[float], names: Sequence[str]) -> list[Signal]:
-    value = np.array(values)
-    low = Signal(kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, who=names, is_high_worse=False)
-    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, who=names)]
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 5, 12])
-def test_an_event_that_crosses_blocks_is_one(size: int) -> None:
-    values = [0.5, 0.2, 0.9, 0.2, 3.0, 4.0, 4.0, 1.5, 0.1, 5.0, 5.0, 0.3]
-    names = list("abacddefghij")
-    stamps = np.arange(12, dtype=np.int64) * 1_000_000
-    fold = EventFold()
-    for first in range(0, 12, size):
-        part = slice(first, first + size)
-        fold.add(stamps[part], signals(values[part], names[part]))
-    found = fold.events()
-    assert found == events_of(stamps, signals(values, names))
-    first = found[0]
-    assert (first.num_states, first.worst, first.state, first.worst_name) == (4, 0.2, 1, "b")
-    assert first.names == ("a", "b", "c") and [event.num_states for event in found] == [4, 3, 1, 2, 1]
 
 
 def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None:
