@@ -1,10 +1,9 @@
-"""Declared metrics: value, count, fold over states and scale; clearances against the truth."""
+"""Folds of columns, scales of figures, mean changes; clearances against the truth."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -12,8 +11,6 @@ from splatctrl_cli.config.fixed import CLEARANCE_NEAR, MAP_ALLOWANCE
 from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame, Stamps
-
-R = TypeVar("R")  # the result that has the metric
 
 
 class Better(StrEnum):
@@ -53,23 +50,6 @@ DECIBELS = Scale(unit="dB", better=Better.HIGHER, absolute=0.2)  # as far as fou
 SIMILARITY = Scale(better=Better.HIGHER, absolute=0.005)
 AGE = Scale(unit="s", better=Better.LOWER, absolute=0.01, relative=0.02)
 LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measure(Generic[R]):
-    """One figure: its value, and the number of states, views or points behind it.
-
-    running: its value before the first state, and up to each (T,); None if not of states. column: of a state table,
-    empty if none shows it; pick: the row there that does: "least", "largest", or a word of the column.
-    """
-
-    name: str
-    value: Callable[[R], float | None]
-    count: Callable[[R], int]
-    running: Callable[[R], tuple[float, Float64]] | None = None
-    scale: Scale = DESCRIBES
-    column: str = ""
-    pick: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Figures of a replay by predefined names: value, sample count, first failure."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import numpy as np
@@ -32,7 +32,6 @@ from splatctrl_cli.evaluate.metrics import (
     TOTAL,
     Better,
     Fold,
-    Measure,
     Scale,
 )
 from splatctrl_cli.jobs.replay.goal import TWIST_FIGURES
@@ -42,17 +41,24 @@ from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.voxels import EvidenceClass
 
 Metrics = dict[str, float | None]
-Declared = tuple[Measure[Replay], ...]
 num_states: Callable[[Replay], int] = attrgetter("num_states")
 
 
-def _single(
-    name: str,
-    value: Callable[[Replay], float | None],
-    count: Callable[[Replay], int] = num_states,
-    scale: Scale = DESCRIBES,
-) -> Measure[Replay]:
-    return Measure(name=name, value=value, count=count, scale=scale)
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """One figure of a replay: its value, and the number of states, links or points behind it.
+
+    running: its value before the first state, and up to each (T,); None if not of states. column: of ``steps.csv``,
+    empty if none shows it; pick: the row there that does: "least", "largest", or a word of the column.
+    """
+
+    name: str
+    value: Callable[[Replay], float | None]
+    count: Callable[[Replay], int] = num_states
+    scale: Scale = DESCRIBES
+    running: Callable[[Replay], tuple[float, Float64]] | None = None
+    column: str = ""
+    pick: str = ""
 
 
 def _of(
@@ -65,7 +71,7 @@ def _of(
     where: Callable[[Replay, Float64], Bool] | None = None,
     count: Callable[[Replay], int] | None = None,
     shown: str = "",
-) -> Measure[Replay]:
+) -> Measure:
     """A fold of a column (T,) of the trace, or of one `part` of it.
 
     where: fold 1 where it is true, else 0. count: by default of states with a value. shown: the column of
@@ -89,7 +95,10 @@ def _of(
     )
 
 
-def _clearance(field: str) -> Measure[Replay]:
+Declared = tuple[Measure, ...]
+
+
+def _clearance(field: str) -> Measure:
     column = f"clearance_{field}"
     return _of(column, "min_clearance" if field == "exact" else f"min_{column}", LEAST, GAP, shown=column)
 
@@ -101,17 +110,13 @@ def _num_sudden(replay: Replay) -> int:
     )
 
 
-def _map_error(name: str, figure: str, scale: Scale) -> Measure[Replay]:
-    return _single(
-        name,
-        lambda r: getattr(r.map_error.bound, figure) if r.map_error and r.map_error.bound else None,
-        lambda r: r.map_error.num_seen if r.map_error else 0,
-        scale,
+def _map_error(name: str, figure: str, scale: Scale) -> Measure:
+    return Measure(
+        name=name,
+        value=lambda r: getattr(r.map_error.bound, figure) if r.map_error and r.map_error.bound else None,
+        count=lambda r: r.map_error.num_seen if r.map_error else 0,
+        scale=scale,
     )
-
-
-def _intervals(replay: Replay) -> int:
-    return num_states(replay) - 1
 
 
 LIMIT = Scale(unit="rad", better=Better.HIGHER, absolute=1e-3)  # or m, of a prismatic joint
@@ -122,18 +127,23 @@ TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_ro
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
 NEAREST = "clearance_exact"
 OF_AUDIT: Declared = (
-    _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
-    _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links), FAULTS),
-    _single(
-        "coverage_deficit",
-        lambda r: None if r.model.coverage is None else r.model.coverage.max_deficit,
-        lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links),
-        ERROR,
+    Measure(name="num_spheres", value=lambda replay: len(replay.model.sphere_set.radii)),
+    Measure(
+        name="num_bare_links",
+        value=lambda replay: len(replay.model.bare_links),
+        count=lambda replay: len(replay.model.urdf.links),
+        scale=FAULTS,
     ),
-    _single("num_self_pairs", lambda replay: len(replay.model.self_pairs())),
-    _single("num_states", num_states),
-    _single("num_before_scene", lambda replay: replay.num_before_scene, scale=FAULTS),
-    _single("duration_s", lambda replay: replay.trace.seconds(-1), scale=TIME),
+    Measure(
+        name="coverage_deficit",
+        value=lambda r: None if r.model.coverage is None else r.model.coverage.max_deficit,
+        count=lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links),
+        scale=ERROR,
+    ),
+    Measure(name="num_self_pairs", value=lambda replay: len(replay.model.self_pairs())),
+    Measure(name="num_states", value=num_states),
+    Measure(name="num_before_scene", value=lambda replay: replay.num_before_scene, scale=FAULTS),
+    Measure(name="duration_s", value=lambda replay: replay.trace.seconds(-1), scale=TIME),
 )
 OF_STATES: Declared = (
     _clearance("true"),
@@ -148,7 +158,7 @@ OF_STATES: Declared = (
         shown="self_clearance",
     ),
     _of("limit_margin", "min_limit_margin", LEAST, LIMIT, shown="limit_margin"),
-    _of("velocity_share", "max_velocity_share", LARGEST, BAD_SHARE, count=_intervals),
+    _of("velocity_share", "max_velocity_share", LARGEST, BAD_SHARE, count=lambda replay: replay.num_states - 1),
     _of("acceleration_share", "max_acceleration_share", LARGEST, BAD_SHARE, count=_num_sudden),
     _of("clearance_surface", "min_clearance_surface", LEAST, GAP, shown=NEAREST),
     _of("clearance_between", "min_clearance_between", LEAST, GAP, shown=NEAREST),
@@ -162,18 +172,30 @@ OF_STATES: Declared = (
         for kind in EvidenceClass
         for figure in (
             _of("class_shares", f"max_share_{kind.name.lower()}", LARGEST, BAD_SHARE, part=kind),
-            _of("class_distance", f"min_distance_{kind.name.lower()}", LEAST, GAP, part=kind, count=num_states),
+            _of(
+                "class_distance",
+                f"min_distance_{kind.name.lower()}",
+                LEAST,
+                GAP,
+                part=kind,
+                count=num_states,
+            ),
         )
     ),
     _of("evidence_age", "max_evidence_age_s", LARGEST, AGE),
-    _single("unjudged_s", lambda r: float(r.trace["unbounded_s"].sum()) + r.lead_in_s, _intervals, AGE),
+    Measure(
+        name="unjudged_s",
+        value=lambda r: float(r.trace["unbounded_s"].sum()) + r.lead_in_s,
+        count=lambda replay: replay.num_states - 1,
+        scale=AGE,
+    ),
     _of("unknown_share", "unknown_share", MEAN, BAD_SHARE, shown="unknown_share"),
     _of("is_blank", "num_without_distance", NUMBER, FAULTS),
-    _single(
-        "num_static_violations",
-        lambda r: len(r.static_violations),
-        lambda r: len(r.statics),
-        Scale(better=Better.LOWER, absolute=2, relative=0.05),
+    Measure(
+        name="num_static_violations",
+        value=lambda replay: len(replay.static_violations),
+        count=lambda replay: len(replay.statics),
+        scale=Scale(better=Better.LOWER, absolute=2, relative=0.05),
     ),
     _of("map_age_s", "max_map_age_s", LARGEST, AGE, shown="map_age_s"),
     _map_error("map_error_bound", "bound", ERROR),
@@ -182,7 +204,7 @@ OF_STATES: Declared = (
 )
 
 
-def _rung(rung: Rung) -> Measure[Replay]:
+def _rung(rung: Rung) -> Measure:
     name, scale = "num_" + rung.value.replace("-", "_"), FAULTS
     if rung is Rung.SOLVED:
         scale = Scale(better=Better.HIGHER, relative=0.05)
@@ -194,7 +216,11 @@ def _rung(rung: Rung) -> Measure[Replay]:
 OF_STEPS: Declared = (
     _of("shaped", "intervention_share", MEAN),
     *(_of(f"shaped_{kind}", f"intervention_share_{kind}", MEAN) for kind in RowKind),
-    _single("first_intervention_s", lambda r: getattr(first_intervention(r.events), "start_s", None), scale=TIME),
+    Measure(
+        name="first_intervention_s",
+        value=lambda replay: getattr(first_intervention(replay.events), "start_s", None),
+        scale=TIME,
+    ),
     _of("barrier_clearance", "min_barrier_clearance", LOWEST, GAP, shown="barrier_clearance"),
     *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
     _of("num_refused", "num_refused", TOTAL, FAULTS),
@@ -212,18 +238,20 @@ OF_OPEN_LOOP: Declared = (
 )
 
 
-def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESCRIBES) -> Measure[Replay]:
-    return _single(name, lambda replay: value(replay.closed_loop) if replay.closed_loop else None, scale=scale)
+def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESCRIBES) -> Measure:
+    return Measure(
+        name=name, value=lambda replay: value(replay.closed_loop) if replay.closed_loop else None, scale=scale
+    )
 
 
 OF_CLOSED_LOOP: Declared = (
     _trace("goal_reached", lambda trace: int(trace.outcome is Outcome.GOAL_REACHED), FULFILLED),
     _trace("stalled", lambda trace: int(trace.outcome is Outcome.STALLED), FAULTS),
     _trace("num_goals_reached", lambda trace: trace.num_reached, FULFILLED),
-    _single("start_time_s", lambda replay: replay.start_time_s, scale=TIME),
+    Measure(name="start_time_s", value=attrgetter("start_time_s"), scale=TIME),
     _trace("num_steps", lambda trace: len(trace.steps)),
-    _single("position_error", lambda replay: float(replay.trace["position_error"][-1]), scale=AT_GOAL),
-    _single("rotation_error", lambda replay: float(replay.trace["rotation_error"][-1]), scale=TURNED),
+    _of("position_error", "position_error", LAST, AT_GOAL),
+    _of("rotation_error", "rotation_error", LAST, TURNED),
     _trace("num_scene_hits", lambda trace: sum(change.is_hit for change in trace.scene_changes), FAULTS),
     _trace("num_anchors", lambda trace: len(trace.anchored)),
     _trace("num_detours", lambda trace: len(trace.detours)),
@@ -265,7 +293,7 @@ def metric_scales(
     return scales
 
 
-def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Measure[Replay]]:
+def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Measure]:
     """Figures that a column of ``steps.csv`` shows, by name."""
     return {metric.name: metric for metric in _list_metrics(mode, of_fields) if metric.column}
 
@@ -282,7 +310,7 @@ def metrics_of(replay: Replay) -> Metrics:
 
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
     """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
-    found = dict.fromkeys(metrics, num_states(replay))
+    found = dict.fromkeys(metrics, replay.num_states)
     found |= {metric.name: metric.count(replay) for metric in _list_metrics(replay.mode, replay.fields)}
     for field, agreement in replay.agreement.items():
         compared = int(agreement["num_compared"] or 0)

@@ -20,32 +20,34 @@ class Trace(Mapping[str, Any]):
     """
 
     def __init__(self) -> None:
-        self._numbers: dict[str, RowFile] = {}
-        self._words: dict[str, ObjectFile[Any]] = {}
+        self._columns: dict[str, RowFile | ObjectFile[Any]] = {}
 
     def append(self, columns: Columns) -> None:
         """Append a block to some columns; the others follow, or are absent."""
         for name, values in columns.items():
-            if isinstance(values, np.ndarray):
+            if name not in self._columns:
                 dtype = np.int64 if name == "stamp_ns" else np.float64
-                self._numbers.setdefault(name, RowFile(values.shape[1:], dtype=dtype)).append(values)
-            else:
-                self._words.setdefault(name, ObjectFile()).extend(values)
+                is_words = isinstance(values, list)
+                self._columns[name] = ObjectFile() if is_words else RowFile(values.shape[1:], dtype=dtype)
+            file = self._columns[name]
+            file.append(values) if isinstance(file, RowFile) else file.extend(values)
 
     def __len__(self) -> int:
         """The number of columns."""
-        return len(self._numbers) + len(self._words)
+        return len(self._columns)
 
     def __iter__(self) -> Iterator[str]:
-        return iter((*self._numbers, *self._words))
+        return iter(self._columns)
 
     def __getitem__(self, name: str) -> Any:
         """All numbers (T, ...) of a column, or its words (T,), read where needed."""
-        return np.asarray(self.rows(name)) if name in self._numbers else self._words[name]
+        column = self.rows(name)
+        return np.asarray(column) if isinstance(column, Rows) else column
 
     def rows(self, name: str) -> Any:
         """A column (T, ...), read where needed: `Rows` of numbers, or words."""
-        return Rows(self._numbers[name]) if name in self._numbers else self._words[name]
+        file = self._columns[name]
+        return Rows(file) if isinstance(file, RowFile) else file
 
     @property
     def stamp_ns(self) -> Stamps:
