@@ -1,6 +1,7 @@
 """Columns of a replay's states, by name: what was audited, commanded and left."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Float64, Index
 
-Columns = Mapping[str, Any]
+NamedColumns = Mapping[str, Any]
 """By name: numbers (T, ...), NaN without a value; or T words, or tuples of words, empty without any."""
 
 RUNGS = tuple(Rung)
@@ -23,7 +24,9 @@ def names_at(names: Sequence[str], index: Index) -> list[str]:
     return [names[i] if i >= 0 else "" for i in index.tolist()]
 
 
-def audit_columns(part: AuditTrace, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str]) -> Columns:
+def audit_columns(
+    part: AuditTrace, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str]
+) -> NamedColumns:
     """Columns of audited states, in their units; q: position (T, J); is_blank: 1 where a field has no distance."""
     blank = np.any([np.isnan(nearest.distance) for nearest in part.clearance.values()], axis=0)
     columns: dict[str, Any] = {"stamp_ns": part.stamp_ns, "q": part.position, "is_blank": blank}
@@ -39,7 +42,7 @@ def audit_columns(part: AuditTrace, spheres: Sequence[str], joints: Sequence[str
     }
 
 
-def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> Columns:
+def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> NamedColumns:
     """Columns of a controller's steps, None where it had none.
 
     v (T, J) [rad/s]: velocity. rung_number: in RUNGS. position_error [m], rotation_error [rad]. shaped: 1 if any row,
@@ -71,7 +74,7 @@ def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> Column
         ),
         "intervening": words(lambda step: "; ".join(step.intervening)),
         "multipliers": words(lambda step: "; ".join(f"{row.multiplier:.4g}" for row in step.interventions)),
-        "num_rows": number(lambda step: step.num_rows),
+        "num_rows": words(lambda step: step.num_rows),
         "num_refused": number(lambda step: step.num_refused),
         "residual": number(lambda step: step.residual),
         "position_error": number(lambda step: float(np.linalg.norm(step.pose_error[:3]))),
@@ -82,7 +85,7 @@ def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> Column
     }
     for kind in RowKind:
         own = [[] if step is None else [row for row in step.interventions if row.kind is kind] for step in steps]
-        columns[f"shaped_{kind}"] = number(lambda step, kind=kind: shaped(step, kind))
+        columns[f"shaped_{kind}"] = number(partial(shaped, kind=kind))
         columns[f"multiplier_{kind}"] = np.array([max((row.multiplier for row in rows), default=0.0) for rows in own])
         columns[f"who_{kind}"] = [
             tuple(row.name for row in sorted(rows, key=lambda row: -row.multiplier)) for rows in own
@@ -90,7 +93,7 @@ def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> Column
     return columns
 
 
-def open_loop_columns(part: OpenLoopTrace) -> Columns:
+def open_loop_columns(part: OpenLoopTrace) -> NamedColumns:
     """Columns of open-loop states: their steps, and the room that the logged velocity left.
 
     logged, dv (commanded less logged) (T, J) [rad/s]; velocity_difference: its norm, largest_difference: of a joint.

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from splatctrl_cli.control.columns import Columns
+from splatctrl_cli.control.columns import NamedColumns
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, Float64, Stamps
@@ -164,7 +164,7 @@ def first_intervention(events: Sequence[Event]) -> Event | None:
     return next((event for event in events if event.kind in INTERVENTIONS), None)
 
 
-def clearance_signals(columns: Columns, source: str, margin: float) -> list[Signal]:
+def clearance_signals(columns: NamedColumns, source: str, margin: float) -> list[Signal]:
     """Signals of a field's clearance (T,) [m]: below the margin, in contact, unknown."""
     distance, who = columns[f"clearance_{source}"], columns[f"nearest_{source}"]
     low = partial(Signal, value=distance, who=who, is_high_worse=False, source=source)
@@ -176,7 +176,7 @@ def clearance_signals(columns: Columns, source: str, margin: float) -> list[Sign
     ]
 
 
-def audit_signals(columns: Columns, fields: Sequence[str], margin: float) -> list[Signal]:
+def audit_signals(columns: NamedColumns, fields: Sequence[str], margin: float) -> list[Signal]:
     """Signals of audited states: clearance by each field, known space, limits, self-collision."""
     unknown, outside, touching = (columns[name] for name in ("unknown_share", "limit_margin", "self_clearance"))
     low = partial(Signal, is_high_worse=False)
@@ -188,7 +188,7 @@ def audit_signals(columns: Columns, fields: Sequence[str], margin: float) -> lis
     ]
 
 
-def motion_signals(columns: Columns, margin: float, max_map_age: float) -> list[Signal]:
+def motion_signals(columns: NamedColumns, margin: float, max_map_age: float) -> list[Signal]:
     """Signals of motion and time: limits exceeded, clearance [m] between states, old maps [s]."""
     fast, sudden, lower = (columns[name] for name in ("velocity_share", "acceleration_share", "clearance_between"))
     unbounded, age = columns["unbounded_s"], columns["map_age_s"]
@@ -201,7 +201,7 @@ def motion_signals(columns: Columns, margin: float, max_map_age: float) -> list[
     ]
 
 
-def step_signals(columns: Columns) -> list[Signal]:
+def step_signals(columns: NamedColumns) -> list[Signal]:
     """Signals of a controller's steps: rows that shaped them, fallbacks, broken rows."""
     rung, scale, slack = np.array(columns["rung"]), columns["scale"], columns["slack"]
     is_least, is_hold, is_outside = (rung == each for each in (Rung.MINIMUM_VIOLATION, Rung.HOLD, Rung.OUTSIDE))

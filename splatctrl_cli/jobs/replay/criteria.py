@@ -12,7 +12,7 @@ from splatctrl_cli.evaluate.verdict import Outcome, Reason, counted, failed, hel
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
-from splatctrl_cli.records import Float64
+from splatctrl_cli.jobs.replay.trace import Trace
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
 BROKEN, UNKNOWN = "failed", "*not evaluable*"  # in the table of criteria
@@ -48,10 +48,11 @@ def mm(metres: float) -> str:
     return f"{1e3 * metres:.1f} mm"
 
 
-def nearby(judged: Judged, values: Float64) -> tuple[float, float, int] | None:
-    """Largest of values (T,) about the arm, its time [s], and their count."""
+def nearby(trace: Trace, column: str) -> tuple[float, float, int] | None:
+    """Largest value about the arm, its time [s], and the number of states with one."""
+    values = trace[column]
     num = int(np.isfinite(values).sum())
-    return (float(np.nanmax(values)), judged.replay.trace.seconds(int(np.nanargmax(values))), num) if num else None
+    return (float(np.nanmax(values)), trace.seconds(int(np.nanargmax(values))), num) if num else None
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
@@ -71,7 +72,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             remedy="its time of arrival is unknown: cameras must give depth all the time",
             count=judged.replay.num_states,
         )
-    ahead = nearby(judged, judged.replay.trace["evidence_ahead"])
+    ahead = nearby(judged.replay.trace, "evidence_ahead")
     allowed = SAME_MOMENT_NS / 1e9  # frames of one time step differ in time
     if ahead is not None and ahead[0] > allowed:
         yield lacking(
@@ -83,7 +84,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             remedy="a state is judged by what was known then: reconstruct with snapshots, or check the clocks",
             count=ahead[2],
         )
-    near, oldest = nearby(judged, judged.replay.trace["evidence_age"]), judged.request.max_map_age
+    near, oldest = nearby(judged.replay.trace, "evidence_age"), judged.request.max_map_age
     if near is not None:
         age, time_s, count = near
         words, remedy = _end_words(judged, age, time_s)
@@ -104,7 +105,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
 
 
 def _end_words(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
-    lasts = float(judged.replay.trace.stamp_ns[-1] - judged.replay.trace.stamp_ns[0]) * 1e-9 - judged.past_end_s
+    lasts = judged.replay.trace.seconds(-1) - judged.past_end_s
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""
     remedy = f"end it with the log (--set control.max_time={max(lasts, 0.01):.3g}), start earlier (--start-time), or"

@@ -59,7 +59,7 @@ class Limit:
 
     def values(self, near: Trace) -> Float64:
         """The limited column (T,); NaN where space about the arm was not evaluated."""
-        values = near[self.column]
+        values: Float64 = near[self.column]
         return values[:, self.parts].min(axis=1) if self.parts else values
 
     def is_broken(self, near: Trace, margin: float) -> bool:
@@ -164,7 +164,7 @@ def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = l
     if limit is PROOF and np.isnan(near["assumed"]).all():
         yield lacking(sentence="evidence of the space near the arm is not recorded")
     if limit.most is not None:
-        worst = nearby(judged, values)
+        worst = nearby(near, limit.column)
         if worst is None:
             return
         words = f"{100 * worst[0]:.0f} % {limit.words}"

@@ -40,17 +40,21 @@ COLUMNS = (  # of the trace in steps.csv, after stamps and clearances; a column 
     *("barrier_margin_logged", "barrier_row_logged", "velocity_margin_logged", "velocity_row_logged"),
     *("divergence_joints", "divergence_position", "divergence_rotation_deg"),
 )
-Columns = dict[str, list[object]]
+OF_STEP = (  # columns with empty cells where the controller had no step
+    *("barrier_clearance", "scale", "slack", "residual", "position_error", "rotation_error"),
+    *("barrier_margin_logged", "velocity_margin_logged"),
+)
+Cells = dict[str, list[object]]
 
 
-def chunks_of(replay: Replay) -> Iterator[Columns]:
+def chunks_of(replay: Replay) -> Iterator[Cells]:
     """Columns of all states, BLOCK at a time, to bound memory."""
     return (columns_of(replay, slice(k, k + BLOCK)) for k in range(0, replay.num_states, BLOCK))
 
 
-def columns_of(replay: Replay, rows: slice = slice(None)) -> Columns:
+def columns_of(replay: Replay, rows: slice = slice(None)) -> Cells:
     trace, stamps = replay.trace, replay.trace.rows("stamp_ns")
-    columns: Columns = {
+    columns: Cells = {
         "stamp_ns": stamps[rows].tolist(),
         "time_s": ((stamps[rows] - stamps[0]) * 1e-9).tolist(),
     }
@@ -60,7 +64,7 @@ def columns_of(replay: Replay, rows: slice = slice(None)) -> Columns:
         if isinstance(values, list):
             columns[name] = values
         elif values.ndim == 1:
-            columns[name] = values.tolist()
+            columns[name] = ["" if name in OF_STEP and np.isnan(v) else v for v in values.tolist()]
         else:
             columns |= {f"{name}_{joint}": values[:, j].tolist() for j, joint in enumerate(replay.model.joint_names)}
     return columns

@@ -19,7 +19,7 @@ from splatctrl_cli.control.audit import (
     observed_at,
     part_clearances,
 )
-from splatctrl_cli.control.columns import Columns, audit_columns, names_at
+from splatctrl_cli.control.columns import NamedColumns, audit_columns, names_at
 from splatctrl_cli.control.events import (
     Event,
     EventKind,
@@ -211,7 +211,7 @@ class ReplayRecord:
                 self.closest[pair] = float(own[at]), int(part.stamp_ns[at])
         return part
 
-    def _bound(self, part: AuditTrace, velocities: Float64) -> Columns:
+    def _bound(self, part: AuditTrace, velocities: Float64) -> NamedColumns:
         """Bound the clearance since each state before, in this block's scene."""
         known = self._scene.at(int(part.stamp_ns[0])).distances
         name = "certified" if "certified" in known else "exact"
@@ -263,7 +263,7 @@ class ReplayRecord:
             self._was_free = seen.is_free if before is None else before | seen.is_free
         self.fixed_parts.look(known.distances["exact"], part.position[0], was_free)
 
-    def _look_around(self, part: AuditTrace) -> Columns:
+    def _look_around(self, part: AuditTrace) -> NamedColumns:
         num = len(part.stamp_ns)
         columns = {name: np.full((num, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
         if self._scene.has_seen_times:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.control.columns import Columns
+from splatctrl_cli.control.columns import NamedColumns
 from splatctrl_cli.files.spilled_rows import ObjectFile, RowFile, Rows
 from splatctrl_cli.records import Stamps
 
@@ -22,7 +22,7 @@ class Trace(Mapping[str, Any]):
     def __init__(self) -> None:
         self._columns: dict[str, RowFile | ObjectFile[Any]] = {}
 
-    def append(self, columns: Columns) -> None:
+    def append(self, columns: NamedColumns) -> None:
         """Append a block to some columns; the others follow, or are absent."""
         for name, values in columns.items():
             if name not in self._columns:

@@ -11,7 +11,7 @@ import pytest
 
 from splatctrl_cli.config import Config, ControlConfig
 from splatctrl_cli.control.audit import AuditTrace, Clearance
-from splatctrl_cli.control.columns import audit_columns
+from splatctrl_cli.control.columns import audit_columns, step_columns
 from splatctrl_cli.control.events import Event, EventKind, Signal, events_of
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.control.replay import ReplayTrace
@@ -20,6 +20,7 @@ from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replay import evidence_criteria as evidence
 from splatctrl_cli.jobs.replay.criteria import Judged, controller
+from splatctrl_cli.jobs.replay.files import columns_of
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.motion_criteria import surface_clearance
@@ -260,3 +261,10 @@ def test_only_free_space_about_the_arm_is_proof(option: str, broken: Outcome, ki
 def test_what_is_not_recorded_is_no_proof(option: str) -> None:
     run = judged(near_a(EvidenceClass.FREE, 0.01), request={option: "occupied"})
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
+
+
+def test_cells_of_a_state_without_a_step_are_empty() -> None:
+    never = {"q": np.zeros((NUM, 0)), "limit_margin": np.full(NUM, np.nan)}
+    cells = columns_of(judged(never | step_columns([None] * NUM, 0), model=SimpleNamespace(joint_names=())).replay)
+    assert {name for name, values in cells.items() if values == [""] * NUM} >= {"rung", "scale", "num_rows", "slack"}
+    assert "" not in cells["limit_margin"]
