@@ -27,7 +27,7 @@ def names_at(names: Sequence[str], index: Index) -> list[str]:
 def audit_columns(
     part: AuditTrace, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str]
 ) -> NamedColumns:
-    """Columns of audited states, in their units; q: position (T, J); is_blank: 1 where a field has no distance."""
+    """Columns of audited states; q: position (T, J); is_blank: 1 where a field has no distance."""
     blank = np.any([np.isnan(nearest.distance) for nearest in part.clearance.values()], axis=0)
     columns: dict[str, Any] = {"stamp_ns": part.stamp_ns, "q": part.position, "is_blank": blank}
     for field, nearest in part.clearance.items():
@@ -45,9 +45,8 @@ def audit_columns(
 def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> NamedColumns:
     """Columns of a controller's steps, None where it had none.
 
-    v (T, J) [rad/s]: velocity. rung_number: in RUNGS. position_error [m], rotation_error [rad]. shaped: 1 if any row,
-    or one of a kind, shapes the command, NaN for an external controller. multiplier: largest of a kind's rows. who_*:
-    rows, the largest first.
+    v (T, J) [rad/s]: velocity. rung_number: in RUNGS. position_error [m], rotation_error [rad]. shaped: as
+    `is_shaped`, NaN for an external controller. multiplier: largest of a kind. who_*: rows, the largest first.
     """
 
     def number(value: Callable[[ControlStep], float]) -> Float64:

@@ -1,6 +1,6 @@
 """Input of a replay's criteria; criteria of time and of the controller."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.records import Float64
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
 BROKEN, UNKNOWN = "failed", "*not evaluable*"  # in the table of criteria
@@ -48,8 +49,17 @@ def mm(metres: float) -> str:
     return f"{1e3 * metres:.1f} mm"
 
 
+def worst_state(
+    trace: Trace, column: str, who: str, pick: Callable[[Float64], np.intp] = np.nanargmin
+) -> tuple[float, float, str]:
+    """Value, time [s] and name at the state that `pick` takes."""
+    values = trace[column]
+    at = int(pick(values))
+    return float(values[at]), trace.seconds(at), trace[who][at]
+
+
 def nearby(trace: Trace, column: str) -> tuple[float, float, int] | None:
-    """Largest value about the arm, its time [s], and the number of states with one."""
+    """Largest value about the arm, its time [s], and the number of values."""
     values = trace[column]
     num = int(np.isfinite(values).sum())
     return (float(np.nanmax(values)), trace.seconds(int(np.nanargmax(values))), num) if num else None
@@ -192,13 +202,14 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
     duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
     share = float(unbounded.sum()) / duration
     if share > config.unjudged:
-        worst = max(events_of(replay, EventKind.NOT_BOUNDED), key=lambda event: event.worst)
+        longest = int(np.argmax(unbounded))
         yield lacking(
             sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "
-            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {worst.worst:.2f} s, ending",
+            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {unbounded[longest]:.2f} s, "
+            "ending",
             value=share,
             threshold=config.unjudged,
-            time_s=worst.worst_s,
+            time_s=replay.trace.seconds(longest),
             cause=f"expected at most {config.longest_interval:g} s)",
             remedy=SLOW,
             count=len(stamps),

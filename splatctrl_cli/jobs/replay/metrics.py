@@ -49,7 +49,7 @@ class Measure:
     """One figure of a replay: its value, and the number of states, links or points behind it.
 
     running: its value before the first state, and up to each (T,); None if not of states. column: of ``steps.csv``,
-    empty if none shows it; pick: the row there that does: "least", "largest", or a word of the column.
+    if any shows it; pick: its row there: "least", "largest", or a word.
     """
 
     name: str
@@ -74,8 +74,7 @@ def _of(
 ) -> Measure:
     """A fold of a column (T,) of the trace, or of one `part` of it.
 
-    where: fold 1 where it is true, else 0. count: by default of states with a value. shown: the column of
-    ``steps.csv`` that shows it.
+    where: fold 1 where true, else 0. count: by default of states with a value. shown: column of ``steps.csv``.
     """
 
     def values(replay: Replay) -> Float64:

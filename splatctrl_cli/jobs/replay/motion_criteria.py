@@ -23,6 +23,7 @@ from splatctrl_cli.jobs.replay.criteria import (
     goal,
     mm,
     scene_hits,
+    worst_state,
 )
 from splatctrl_cli.jobs.replay.inputs import bare_moving_links, recorded_postures
 from splatctrl_cli.robot.self_margins import least_gap
@@ -124,30 +125,25 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap) unless
     the recording was. By collision surfaces, or by spheres if these cannot be read.
     """
-    least = lowest(judged.replay.trace["self_clearance"])
-    events = events_of(judged.replay, EventKind.SELF_COLLISION)
-    if least is None or not np.isfinite(least):
-        return
-    if not events:
+    least, time_s, pair = worst_state(judged.replay.trace, "self_clearance", "self_pair")
+    if least < 0:
+        yield failed(
+            sentence=f"{pair} overlap by {mm(-least)}",
+            value=least,
+            threshold=0.0,
+            unit="m",
+            time_s=time_s,
+            who=pair,
+            remedy="pairs that may touch are named by --srdf",
+            count=judged.replay.num_states,
+            label=CONTACT,
+        )
+    elif np.isfinite(least):
         yield (
             _check_fixture(judged)
             or _brought_together(judged)
             or held(f"at least {mm(least)}", least, 0.0, "m", judged.replay.num_states)
         )
-        return
-    worst = min(events, key=lambda event: event.worst)
-    yield _locate(
-        worst,
-        failed(
-            sentence=f"{worst.worst_name} overlap by {mm(-worst.worst)}",
-            value=worst.worst,
-            threshold=0.0,
-            unit="m",
-            remedy="pairs that may touch are named by --srdf",
-            count=judged.replay.num_states,
-            label=CONTACT,
-        ),
-    )
 
 
 def _check_fixture(judged: Judged) -> Reason | None:
@@ -219,53 +215,48 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
 
 def position_limits(judged: Judged) -> Iterator[Reason]:
     """Joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise."""
-    least = lowest(judged.replay.trace["limit_margin"])
-    if least is not None and least < -judged.request.config.control.limit_tolerance:
-        worst = min(events_of(judged.replay, EventKind.OUTSIDE_LIMITS), key=lambda event: event.worst)
-        yield _locate(
-            worst,
-            failed(
-                sentence=f"{worst.worst_name} is {-least:.4f} rad or m outside its limits",
-                value=least,
-                threshold=0.0,
-                unit="rad",
-                remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
-                count=judged.replay.num_states,
-                label=LIMITS,
-            ),
+    least, time_s, joint = worst_state(judged.replay.trace, "limit_margin", "limit_joint")
+    if least < -judged.request.config.control.limit_tolerance:
+        yield failed(
+            sentence=f"{joint} is {-least:.4f} rad or m outside its limits",
+            value=least,
+            threshold=0.0,
+            unit="rad",
+            time_s=time_s,
+            who=joint,
+            remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
+            count=judged.replay.num_states,
+            label=LIMITS,
         )
-    elif least is not None:
+    else:
         yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.replay.num_states)
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
     """Velocities of the motion, and a user's commands, exceed the URDF's limits by at most one percent."""
     too_fast = commanded(judged)
-    yield from _share_of_limit(judged, "velocity_share", EventKind.TOO_FAST) if too_fast is None else (too_fast,)
+    yield from _share_of_limit(judged, "velocity") if too_fast is None else (too_fast,)
 
 
 def acceleration_limits(judged: Judged) -> Iterator[Reason]:
     """Accelerations exceed `control.max_acceleration`, where it is set, by at most one percent."""
-    yield from _share_of_limit(judged, "acceleration_share", EventKind.TOO_SUDDEN)
+    yield from _share_of_limit(judged, "acceleration")
 
 
-def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Reason]:
-    values = judged.replay.trace[column]
-    most = float(np.max(values)) if len(values) else 0.0
+def _share_of_limit(judged: Judged, name: str) -> Iterator[Reason]:
+    most, time_s, joint = worst_state(judged.replay.trace, f"{name}_share", f"{name}_joint", np.nanargmax)
     if most > LIMIT_EXCEEDED:
-        worst = max(events_of(judged.replay, kind), key=lambda event: event.worst)
-        yield _locate(
-            worst,
-            failed(
-                sentence=f"{worst.worst_name} reaches {most:.2f} times its limit",
-                value=most,
-                threshold=1.0,
-                remedy="check the stamps and units of the states, and the URDF's limits",
-                count=judged.replay.num_states,
-                label=LIMITS,
-            ),
+        yield failed(
+            sentence=f"{joint} reaches {most:.2f} times its limit",
+            value=most,
+            threshold=1.0,
+            time_s=time_s,
+            who=joint,
+            remedy="check the stamps and units of the states, and the URDF's limits",
+            count=judged.replay.num_states,
+            label=LIMITS,
         )
-    elif len(judged.replay.model.joint_names) and (kind is EventKind.TOO_FAST or most > 0):
+    elif name == "velocity" or most > 0:
         yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.replay.num_states)
 
 

@@ -13,17 +13,16 @@ BLOCK = 1024  # states that are replayed at once
 
 
 class Trace(Mapping[str, Any]):
-    """T states by named column, appended in blocks.
+    """T states as `NamedColumns`, appended in blocks.
 
-    Numbers (T, ...) are NaN without a value. Words, empty without any, name who or where a value is from:
-    `nearest_exact` of `clearance_exact`.
+    Words name who or where: `nearest_exact` of `clearance_exact`.
     """
 
     def __init__(self) -> None:
         self._columns: dict[str, RowFile | ObjectFile[Any]] = {}
 
     def append(self, columns: NamedColumns) -> None:
-        """Append a block to some columns; the others follow, or are absent."""
+        """Append a block to some columns."""
         for name, values in columns.items():
             if name not in self._columns:
                 dtype = np.int64 if name == "stamp_ns" else np.float64

@@ -29,7 +29,7 @@ CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
 def replay_verdict(judged: Judged) -> Verdict:
-    """Judge by every criterion, excuse what a displaced camera may have caused, and add the request's own gates."""
+    """Judge by every criterion, then by the request's gates."""
     replay, metrics = judged.replay, judged.metrics
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     if find_displaced(judged) is not None:
