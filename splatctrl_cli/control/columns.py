@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.control.audit import AuditTrace
-from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.terms import RowKind
@@ -40,6 +39,18 @@ def audit_columns(
         "limit_joint": names_at(joints, part.limit_joint),
         "unknown_share": part.unknown_share,
     }
+
+
+def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:
+    """True if a row (of a kind) shapes the command.
+
+    Without a kind, any fallback or scaling counts, too. False for external controllers.
+    """
+    if step is None or step.rung is Rung.OUTSIDE:
+        return False
+    if kind is not None:
+        return any(row.kind is kind for row in step.interventions)
+    return bool(step.interventions) or step.scale < 1 or step.rung is not Rung.SOLVED
 
 
 def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> NamedColumns:
@@ -90,26 +101,3 @@ def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> NamedC
             tuple(row.name for row in sorted(rows, key=lambda row: -row.multiplier)) for rows in own
         ]
     return columns
-
-
-def open_loop_columns(part: OpenLoopTrace) -> NamedColumns:
-    """Columns of open-loop states: their steps, and the room that the logged velocity left.
-
-    logged, dv (commanded less logged) (T, J) [rad/s]; velocity_difference: its norm, largest_difference: of a joint.
-    """
-    room = [
-        (np.nan, "", np.nan, "") if m is None else (m.barrier, m.barrier_row, m.limit, m.limit_row)
-        for m in part.margins
-    ]
-    barrier, barrier_row, limit, limit_row = zip(*room, strict=True)
-    return {
-        **step_columns(part.steps, part.logged.shape[1]),
-        "logged": part.logged,
-        "dv": part.difference,
-        "velocity_difference": np.linalg.norm(part.difference, axis=1),
-        "largest_difference": np.max(np.abs(part.difference), axis=1),
-        "barrier_margin_logged": np.array(barrier),
-        "barrier_row_logged": list(barrier_row),
-        "velocity_margin_logged": np.array(limit),
-        "velocity_row_logged": list(limit_row),
-    }

@@ -7,7 +7,7 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.barriers import scene_margin
-from splatctrl_cli.control.columns import open_loop_columns, step_columns
+from splatctrl_cli.control.columns import step_columns
 from splatctrl_cli.control.goals import LoggedMotion, PlanDetour, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.outside import OutsideController
@@ -56,7 +56,7 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
     with commander_of(request, model, config.control, console, frame=frame, home=task.home) as commander:
         for stamps, positions, velocities in _blocks(record, states, first):
             part = record.measured(stamps, positions, velocities)
-            trace = open_loop(
+            commanded = open_loop(
                 model,
                 config.control,
                 LoggedMotion(stamp_ns=stamps, position=positions, velocity=velocities),
@@ -66,7 +66,7 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
                 scene_step_at=scene.step_at,
                 commander=commander,
             )
-            record.trace.append(open_loop_columns(trace))
+            record.trace.append(commanded)
     return replace(
         _finish_logged(request, inputs, config, record, first),
         twist_figures=twist_figures(model, config.control, frame, twists, record.trace),

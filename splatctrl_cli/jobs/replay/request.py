@@ -127,8 +127,8 @@ class MapError:
 class Replay:
     """A finished replay of T states in one of MODES; fields: names of distances.
 
-    trace: as in `ReplayRecord`; with a controller `step_columns` or `open_loop_columns`, `divergence_*` of a closed
-    loop from the log (joints [rad], position [m], rotation [rad]), `clearance_true` if known. num_before_scene:
+    trace: as in `ReplayRecord`; `step_columns` or those of `open_loop` with a controller; `divergence_*` of a closed
+    loop from the log (joints [rad], position [m], rotation [rad]); `clearance_true` if known. num_before_scene:
     states left out before the first scene, over lead_in_s [s]. start_time_s: of the first state. statics, closest: as
     in `ReplayRecord`. unwatched, overtaken: from later depth. outside: a user's controller.
     """

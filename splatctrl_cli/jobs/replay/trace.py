@@ -29,7 +29,10 @@ class Trace(Mapping[str, Any]):
                 is_words = isinstance(values, list)
                 self._columns[name] = ObjectFile() if is_words else RowFile(values.shape[1:], dtype=dtype)
             file = self._columns[name]
-            file.append(values) if isinstance(file, RowFile) else file.extend(values)
+            if isinstance(file, RowFile):
+                file.append(values)
+            else:
+                file.extend(values)
 
     def __len__(self) -> int:
         """The number of columns."""
