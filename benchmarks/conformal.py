@@ -137,7 +137,7 @@ def trial_of(seed: int) -> Trial | None:
         )
         record, over = audited(inputs, recording, config)
         reach = config.verdict.evidence_reach
-        measured, exact = (misses_of(sets, inputs, record.audit, reach)[1][:, 0] for sets in evidence_of(recording))
+        measured, exact = (misses_of(sets, inputs, record.trace, reach)[1][:, 0] for sets in evidence_of(recording))
     return judged(seed, measured, exact, over, config.verdict.confidence, time.process_time() - start)
 
 

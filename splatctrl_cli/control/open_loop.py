@@ -6,10 +6,9 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.barriers import FieldAt, SceneStepAt, rate_of
+from splatctrl_cli.control.columns import NamedColumns, step_columns
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
-from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController, VelocityMargin
-from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.robot.model import RobotModel
 
@@ -27,25 +26,6 @@ class OpenLoopTask:
     twists: TwistTrack | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class OpenLoopTrace:
-    """T states: the controller's step, and the room that the logged velocity left.
-
-    Both are None where the field has no distance; the step also after the commander's end. logged, commanded (T, J)
-    [rad/s]; commanded: NaN without a step.
-    """
-
-    logged: Float64
-    commanded: Float64
-    steps: tuple[ControlStep | None, ...]
-    margins: tuple[VelocityMargin | None, ...]
-
-    @property
-    def difference(self) -> Float64:
-        """(T, J) [rad/s] commanded less logged."""
-        return self.commanded - self.logged
-
-
 def open_loop(
     model: RobotModel,
     config: ControlConfig,
@@ -56,16 +36,17 @@ def open_loop(
     has_distance: Bool,
     scene_step_at: SceneStepAt | None = None,
     commander: Commander = OURS,
-) -> OpenLoopTrace:
+) -> NamedColumns:
     """Ask the commander at every logged state, in the field known then; nothing is integrated.
 
-    has_distance (T,): False skips a state. scene_step_at: as in `closed_loop`.
+    has_distance (T,): False skips a state. scene_step_at: as in `closed_loop`. Returns `step_columns`, and by state:
+    logged, dv (commanded less logged) (T, J) [rad/s]; velocity_difference: its norm, largest_difference: of a joint;
+    the room that the logged velocity left, as in `VelocityMargin`.
     """
     field = field_at(int(motion.stamp_ns[0]))
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
     steps: list[ControlStep | None] = [None] * len(motion.stamp_ns)
     margins: list[VelocityMargin | None] = [None] * len(motion.stamp_ns)
-    commanded = np.full(motion.velocity.shape, np.nan)
     for index, (stamp, q, v) in enumerate(zip(motion.stamp_ns, motion.position, motion.velocity, strict=True)):
         if not has_distance[index]:
             continue
@@ -82,20 +63,17 @@ def open_loop(
         if commander.is_over:
             continue
         moment = Moment(stamp_ns=int(stamp), q=q, T_world_goal=goal, guide=guide, last_velocity=v, distance_rate=rate)
-        steps[index] = step = commander.step(controller, moment)
-        commanded[index] = step.velocity
-    return OpenLoopTrace(
-        logged=np.asarray(motion.velocity), commanded=commanded, steps=tuple(steps), margins=tuple(margins)
-    )
-
-
-def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:
-    """True if a row (of a kind) shapes the command.
-
-    Without a kind, any fallback or scaling counts, too. False for external controllers.
-    """
-    if step is None or step.rung is Rung.OUTSIDE:
-        return False
-    if kind is not None:
-        return any(row.kind is kind for row in step.interventions)
-    return bool(step.interventions) or step.scale < 1 or step.rung is not Rung.SOLVED
+        steps[index] = commander.step(controller, moment)
+    columns = step_columns(steps, motion.velocity.shape[1])
+    difference = columns["v"] - motion.velocity
+    return {
+        **columns,
+        "logged": np.asarray(motion.velocity),
+        "dv": difference,
+        "velocity_difference": np.linalg.norm(difference, axis=1),
+        "largest_difference": np.max(np.abs(difference), axis=1),
+        "barrier_margin_logged": np.array([np.nan if room is None else room.barrier for room in margins]),
+        "barrier_row_logged": ["" if room is None else room.barrier_row for room in margins],
+        "velocity_margin_logged": np.array([np.nan if room is None else room.limit for room in margins]),
+        "velocity_row_logged": ["" if room is None else room.limit_row for room in margins],
+    }

@@ -20,6 +20,7 @@ from splatctrl_cli.control.preconditions import (
     static_violations,
 )
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController
+from splatctrl_cli.files.spilled_rows import ObjectFile
 from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
@@ -105,32 +106,6 @@ class ReplayTrace:
     by_surface: tuple[str, ...] = ()
 
 
-class StepRecord:
-    """T steps, with their stamps and the postures before them, in memory."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[int, Float64, ControlStep]] = []
-
-    @property
-    def stamp_ns(self) -> Stamps:
-        """Stamps (T,) [ns]."""
-        return np.array([stamp_ns for stamp_ns, _, _ in self._rows], dtype=np.int64)
-
-    @property
-    def position(self) -> FloatRows:
-        """Postures (T, J) before each step."""
-        return np.array([q for _, q, _ in self._rows])
-
-    @property
-    def steps(self) -> Sequence[ControlStep]:
-        """Steps so far."""
-        return [step for _, _, step in self._rows]
-
-    def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
-        """Append a step."""
-        self._rows.append((stamp_ns, q, step))
-
-
 def closed_loop(
     model: RobotModel,
     config: ControlConfig,
@@ -139,7 +114,7 @@ def closed_loop(
     *,
     scene_step_at: SceneStepAt | None = None,
     plan_detour: PlanDetour | None = None,
-    record: StepRecord | None = None,
+    record: ObjectFile[ControlStep] | None = None,
     commander: Commander = OURS,
     distance_to: DistanceFunction | None = None,
     balls_at: Callable[[int], BallDistance | None] = lambda stamp_ns: None,
@@ -147,7 +122,7 @@ def closed_loop(
     """Integrate the commander's velocities at `config.period` until goal, stall or `config.max_time`.
 
     field_at: field known at a stamp [ns], one object per scene; scene_step_at: for `config.distance_rate`;
-    plan_detour: way out of a stall, `config.max_detours` times; record: None for memory; distance_to: for
+    plan_detour: way out of a stall, `config.max_detours` times; record: of steps, None for memory; distance_to: for
     `check_free`; balls_at: of a stamp's field, None where links' surfaces do not count. Raises InputError for a start
     outside the limits or an unreachable goal, NotEvaluableError for a start in collision or outside the field.
     """
@@ -162,8 +137,8 @@ def closed_loop(
     by_surface: tuple[str, ...] = ()
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
-    kept = StepRecord() if record is None else record
-    changes, anchored = [], []
+    stamps, positions, changes, anchored = [], [], [], []
+    steps: list[ControlStep] | ObjectFile[ControlStep] = [] if record is None else record
     outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
@@ -188,7 +163,9 @@ def closed_loop(
         )
         step = commander.step(controller, moment)
         by_surface = step.by_surface
-        kept.add(stamp, q, step)
+        stamps.append(stamp)
+        positions.append(q)
+        steps.append(step)
         if commander.is_over:
             outcome = Outcome.CONTROLLER_FAILED
             break
@@ -200,9 +177,9 @@ def closed_loop(
             break
         q, last_velocity = q + config.period * step.velocity, step.velocity
     return ReplayTrace(
-        stamp_ns=kept.stamp_ns,
-        position=kept.position,
-        steps=kept.steps,
+        stamp_ns=np.array(stamps, dtype=np.int64),
+        position=np.array(positions),
+        steps=steps,
         outcome=outcome,
         static_violations=statics,
         scene_changes=tuple(changes),
@@ -291,10 +268,10 @@ class _Course:
 
 def divergence(
     model: RobotModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
-) -> tuple[Float64, Float64, Float64]:
-    """Distances of T postures (T, J) from those logged at their stamps.
+) -> dict[str, Float64]:
+    """Distances of T postures (T, J) from those logged at their stamps, as columns.
 
-    Joint norm [rad], frame position [m] and rotation [rad], each (T,); NaN after the log's end.
+    Joint norm [rad], frame position [m] and rotation [rad and degrees], each (T,); NaN after the log's end.
     """
     joints, linear, angular = (np.full(len(stamp_ns), np.nan) for _ in range(3))
     for index in np.flatnonzero(stamp_ns <= motion.last_ns):
@@ -302,7 +279,12 @@ def divergence(
         error = pose_error(model.frame_pose(position[index], frame), model.frame_pose(logged, frame))
         joints[index] = np.linalg.norm(position[index] - logged)
         linear[index], angular[index] = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
-    return joints, linear, angular
+    return {
+        "divergence_joints": joints,
+        "divergence_position": linear,
+        "divergence_rotation": angular,
+        "divergence_rotation_deg": np.degrees(angular),
+    }
 
 
 def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:

@@ -1,10 +1,9 @@
-"""Declared metrics: value, count, fold over states and scale; clearances against the truth."""
+"""Folds of columns, scales of figures, mean changes; clearances against the truth."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -12,9 +11,6 @@ from splatctrl_cli.config.fixed import CLEARANCE_NEAR, MAP_ALLOWANCE
 from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame, Stamps
-
-R = TypeVar("R")  # the result that has the metric
-Column = Callable[[R], Float64]
 
 
 class Better(StrEnum):
@@ -57,36 +53,14 @@ LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shown:
-    """The row of a state table that shows a figure: where `column` is `pick`.
-
-    pick: "least", "largest", or a word of the column.
-    """
-
-    column: str
-    pick: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Metric(Generic[R]):
-    """One figure: its value, and the number of states, views or points behind it.
-
-    running: its value before the first state, and up to each (T,); None if not of states. shown: its row in a table.
-    """
-
-    name: str
-    value: Callable[[R], float | None]
-    count: Callable[[R], int]
-    running: Callable[[R], tuple[float, Float64]] | None = None
-    scale: Scale = DESCRIBES
-    shown: Shown | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class Fold:
-    """A column (T,) folded to a value; accumulate: up to each state, from `start` on."""
+    """A column (T,) folded to a value, most of which the `pick` of its values makes.
+
+    accumulate: up to each state, from `start` on.
+    """
 
     of: Callable[[Float64], float | None]
+    pick: str = "largest"
     start: float = np.nan
     accumulate: Callable[[Float64], Float64] | None = None
 
@@ -119,57 +93,13 @@ def last(values: Float64) -> float | None:
     return float(there[-1]) if len(there) else None
 
 
-LEAST = Fold(of=least, start=np.inf, accumulate=np.fmin.accumulate)
-LOWEST = Fold(of=lowest, start=np.inf, accumulate=np.fmin.accumulate)
+LEAST = Fold(of=least, pick="least", start=np.inf, accumulate=np.fmin.accumulate)
+LOWEST = Fold(of=lowest, pick="least", start=np.inf, accumulate=np.fmin.accumulate)
 LARGEST = Fold(of=largest, start=-np.inf, accumulate=np.fmax.accumulate)
 MEAN, P95 = (Fold(of=partial(_fold_known, fold)) for fold in (np.mean, partial(np.percentile, q=95)))
 LAST = Fold(of=last)
 TOTAL = Fold(of=lambda values: int(np.nansum(values)))
-
-
-def known(values: Float64) -> int:
-    """The number of values except NaN."""
-    return int(np.sum(~np.isnan(values)))
-
-
-def folded(
-    name: str,
-    fold: Fold,
-    column: Column[R],
-    count: Callable[[R], int] | None = None,
-    *,
-    scale: Scale = DESCRIBES,
-    shown: Shown | None = None,
-) -> Metric[R]:
-    """A column's fold; counts all but NaN, unless `count` is given."""
-    accumulate = fold.accumulate
-    return Metric(
-        name=name,
-        value=lambda result: fold.of(column(result)),
-        count=count or (lambda result: known(column(result))),
-        running=None if accumulate is None else lambda result: (fold.start, accumulate(column(result))),
-        scale=scale,
-        shown=shown,
-    )
-
-
-def counted(
-    name: str,
-    column: Column[R],
-    is_on: Callable[[R, Float64], Bool],
-    *,
-    scale: Scale = FAULTS,
-    shown: Shown | None = None,
-) -> Metric[R]:
-    """The number of values where `is_on`."""
-    return Metric(
-        name=name,
-        value=lambda result: int(np.sum(is_on(result, column(result)))),
-        count=lambda result: known(column(result)),
-        running=lambda result: (0.0, np.cumsum(is_on(result, column(result))).astype(np.float64)),
-        scale=scale,
-        shown=shown,
-    )
+NUMBER = Fold(of=TOTAL.of, pick="least", start=0.0, accumulate=lambda values: np.asarray(np.nancumsum(values)))
 
 
 FEWEST = 8  # recordings; of fewer there are too few different resamples for their percentiles to mean anything

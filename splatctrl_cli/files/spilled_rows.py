@@ -1,20 +1,22 @@
-"""Rows of numbers in an unnamed file, read by blocks to bound memory."""
+"""Rows of numbers, and objects, in unnamed files, read by blocks to bound memory."""
 
 import os
+import pickle
 import tempfile
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Generic, TypeVar, cast, overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from splatctrl_cli.records import Float64, Index
 
 IN_MEMORY = 2**20  # [bytes] up to which a file is memory
 BLOCK = 4096  # rows at once
 FEW = 4096  # unrequested rows that may be read along
+T = TypeVar("T")
 
 
 def scratch_folder() -> Path:
@@ -31,9 +33,11 @@ def ranges(num: int) -> Iterator[tuple[int, int]]:
 class RowFile:
     """Rows of one shape, appended; reads return copies, nothing is mapped."""
 
-    def __init__(self, shape: tuple[int, ...] = (), blocks: Iterable[Float64] = ()) -> None:
-        """Start with `blocks` of rows (T, ...); shape: of a row."""
-        self.row_shape = shape
+    def __init__(
+        self, shape: tuple[int, ...] = (), blocks: Iterable[Float64] = (), dtype: DTypeLike = np.float64
+    ) -> None:
+        """Start with `blocks` of rows (T, ...); shape: of a row; dtype: float64 or int64."""
+        self.row_shape, self._dtype = shape, np.dtype(dtype)
         self._row_bytes = 8 * int(np.prod(shape, dtype=np.int64))
         self._num = 0
         self._waiting: list[bytes] = []  # rows that are not in the file yet
@@ -46,7 +50,7 @@ class RowFile:
         return self._num
 
     def append(self, rows: Float64) -> None:
-        block = np.ascontiguousarray(rows, dtype=np.float64)
+        block = np.ascontiguousarray(rows, dtype=self._dtype)
         if block.shape[1:] != self.row_shape:
             raise ValueError(f"rows: expected {self.row_shape}, got {block.shape[1:]}")
         self._waiting.append(block.tobytes())
@@ -59,7 +63,7 @@ class RowFile:
         self._flush()
         num = max(min(last, self._num) - first, 0)
         self._file.seek(first * self._row_bytes)
-        return np.frombuffer(bytearray(self._file.read(num * self._row_bytes)), dtype=np.float64).reshape(
+        return np.frombuffer(bytearray(self._file.read(num * self._row_bytes)), dtype=self._dtype).reshape(
             num, *self.row_shape
         )
 
@@ -124,6 +128,55 @@ class Rows:
 
     def _narrowed(self, rows: Float64) -> Float64:
         return rows if self._columns is None else np.ascontiguousarray(rows[:, self._columns])
+
+
+class ObjectFile(Sequence[T], Generic[T]):
+    """Objects in an unnamed file, read by blocks."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
+        self._starts: list[int] = []  # first object of each block; `_places`: its file offset
+        self._places: list[int] = []
+        self._num = 0
+        self._read: tuple[int, list[T]] = (-1, [])
+
+    def append(self, one: T) -> None:
+        self.extend([one])
+
+    def extend(self, objects: Sequence[T]) -> None:
+        if not objects:
+            return
+        self._starts.append(self._num)
+        self._places.append(self._file.seek(0, 2))
+        pickle.dump(list(objects), self._file, protocol=pickle.HIGHEST_PROTOCOL)
+        self._num += len(objects)
+
+    def __len__(self) -> int:
+        return self._num
+
+    def __iter__(self) -> Iterator[T]:
+        for number in range(len(self._starts)):
+            yield from self._block(number)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(self._num))]
+        at = index + (self._num if index < 0 else 0)
+        if not 0 <= at < self._num:
+            raise IndexError(f"{index} of {self._num}")
+        number = int(np.searchsorted(self._starts, at, side="right")) - 1
+        return self._block(number)[at - self._starts[number]]
+
+    def _block(self, number: int) -> list[T]:
+        if self._read[0] != number:
+            self._file.seek(self._places[number])
+            self._read = number, pickle.load(self._file)
+        return self._read[1]
 
 
 Table = Float64 | Rows

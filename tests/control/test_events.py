@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.audit import DistanceFunction, audit, observed_at
+from splatctrl_cli.control.audit import AuditTrace, DistanceFunction, audit, observed_at
+from splatctrl_cli.control.columns import audit_columns, step_columns
 from splatctrl_cli.control.events import (
     UNREPRESENTED,
     Event,
@@ -19,7 +20,7 @@ from splatctrl_cli.control.events import (
     audit_signals,
     events_of,
     first_intervention,
-    stale_signal,
+    motion_signals,
     step_signals,
 )
 from splatctrl_cli.control.qp import Rung
@@ -39,7 +40,7 @@ def wall(x: float, scale: float = 1.0) -> Plane:
 
 
 NAMES = ("base[0]", "upper[0]", "upper[1]", "fore[0]", "fore[1]")
-JOINTS = ("shoulder", "elbow")
+JOINTS, PAIRS = ("shoulder", "elbow"), ("base and fore", "base and tip", "upper and tip")
 
 
 MANY = np.arange(600, dtype=np.int64)
@@ -106,18 +107,25 @@ def row(name: str, kind: RowKind, multiplier: float) -> Intervention:
 
 def signal(kind: EventKind, is_on: ArrayLike, value: ArrayLike, *names: str) -> Signal:
     on = np.asarray(is_on, np.bool_)
-    return Signal(kind=kind, is_on=on, value=np.broadcast_to(value, len(on)), names=lambda _: [*names])
+    return Signal(kind=kind, is_on=on, value=np.broadcast_to(value, len(on)), who=[names] * len(on))
+
+
+def audit_events(trace: AuditTrace, margin: float) -> tuple[Event, ...]:
+    columns = audit_columns(trace, NAMES, JOINTS, PAIRS)
+    return events_of(trace.stamp_ns, audit_signals(columns, [*trace.clearance], margin))
 
 
 def test_an_event_has_the_worst_value_of_its_run_and_every_name_in_order() -> None:
     """Many names are counted, and not all listed."""
     given = signal(EventKind.SCENE, [0, 1, 1, 1, 0, 1], [9.0, 1, 3, 2, 9, 5])
-    first, second = events_of(STAMPS, [replace(given, names=lambda i: ["a", "b"] if i == 3 else ["b"])])
+    first, second = events_of(STAMPS, [replace(given, who=[("a", "b") if i == 3 else "b" for i in range(6)])])
     assert (first.start_s, first.end_s, first.num_states) == (pytest.approx(0.1), pytest.approx(0.3), 3)
     assert (first.worst, first.worst_s, first.state) == (3.0, pytest.approx(0.2), 2)
     assert first.names == ("b", "a") and first.num_names == 2 and first.worst_name == "b"
     assert second.first_ns == second.last_ns == 500_000_000 and second.worst == 5.0
-    many = replace(given, is_on=given.value < 4, is_high_worse=False, names=lambda i: [f"{i}{j}" for j in "abcde"])
+    many = replace(
+        given, is_on=given.value < 4, is_high_worse=False, who=[tuple(f"{i}{j}" for j in "abcde") for i in range(6)]
+    )
     (low,) = events_of(STAMPS, [many])
     assert (low.worst, len(low.names), low.num_names) == (1.0, 12, 15)
 
@@ -126,7 +134,10 @@ def test_a_clearance_below_the_margin_names_its_sphere_and_a_collision_lies_with
     scene, arm = known(exact=Balls([[0.9, 0.25, 0.0]], [0.1])), PlanarArm()
     positions = np.array([[angle, 0.0] for angle in (-1.0, 0.05, 0.15, 0.25, 0.5, 3.0)])
     trace = audit(arm, STAMPS, positions, lambda _: scene)
-    found = {e.kind: e for e in events_of(trace.stamp_ns, audit_signals(trace, 0.08, NAMES, JOINTS))}
+    found = {
+        e.kind: e
+        for e in events_of(trace.stamp_ns, audit_signals(audit_columns(trace, NAMES, JOINTS, PAIRS), ["exact"], 0.08))
+    }
     below, collision = found.pop(EventKind.BELOW_MARGIN), found.pop(EventKind.IN_COLLISION)
     (outside,) = found.values()
     assert below.first_ns <= collision.first_ns <= collision.last_ns <= below.last_ns
@@ -137,7 +148,7 @@ def test_a_clearance_below_the_margin_names_its_sphere_and_a_collision_lies_with
 
 def test_a_state_without_a_distance_is_an_event_and_not_below_the_margin() -> None:
     trace = audit(PlanarArm(), STAMPS, np.full((6, 2), 0.1), lambda _: known(exact=Nowhere()))
-    (event,) = events_of(trace.stamp_ns, audit_signals(trace, 0.02, NAMES, JOINTS))
+    (event,) = audit_events(trace, 0.02)
     assert event.kind is EventKind.WITHOUT_DISTANCE and event.num_states == 6
 
 
@@ -150,7 +161,7 @@ def test_steps_become_events_by_what_shaped_them() -> None:
         step(rung=Rung.RELAXED, relaxed=(RowSlack(name="fore[1]", slack=0.03),)),
         step(rung=Rung.HOLD, scale=0.0, violated_fixed=("upper[0]",), fixed_distance=-0.02, clearance=0.4),
     ]
-    found = {event.kind: event for event in events_of(STAMPS, step_signals(steps))}
+    found = {event.kind: event for event in events_of(STAMPS, step_signals(step_columns(steps, 2)))}
     assert found.pop(EventKind.HOLD).first_ns == 500_000_000
     assert {kind: (event.worst, event.state) for kind, event in found.items()} == {
         EventKind.SCENE: (3.0, 2),
@@ -162,7 +173,7 @@ def test_steps_become_events_by_what_shaped_them() -> None:
     assert found[EventKind.SCENE].names == ("fore[1]", "upper[1]")
     assert found[EventKind.LIMIT].names == ("elbow highest",) and found[EventKind.CANNOT_ACT].names == ("upper[0]",)
     assert found[EventKind.SCENE].worst_name == "fore[1]"
-    assert not events_of(STAMPS, step_signals([None] * 6))
+    assert not events_of(STAMPS, step_signals(step_columns([None] * 6, 2)))
 
 
 def test_the_first_intervention_is_the_controllers_and_not_the_motions() -> None:
@@ -175,7 +186,9 @@ def test_the_first_intervention_is_the_controllers_and_not_the_motions() -> None
 
 def test_a_map_is_stale_where_it_is_older_than_allowed() -> None:
     age = np.array([np.nan, 0.1, 0.6, 1.2, 0.0, 0.4])
-    (event,) = events_of(STAMPS, [stale_signal(age, 0.5)])
+    never = dict.fromkeys(("velocity_share", "acceleration_share", "unbounded_s"), np.zeros(6))
+    nowhere = {"velocity_joint": [""] * 6, "acceleration_joint": [""] * 6, "clearance_between": np.full(6, np.nan)}
+    (event,) = events_of(STAMPS, motion_signals({**never, **nowhere, "map_age_s": age}, 0.02, 0.5))
     assert (event.kind, event.num_states, event.worst) == (EventKind.STALE_MAP, 2, 1.2)
 
 

@@ -168,7 +168,7 @@ def test_open_loop_counts_accelerations_from_the_logged_velocity() -> None:
     arm, has_distance = PlanarArm(), np.ones(2, dtype=np.bool_)
     task = OpenLoopTask(frame="tip", T_world_goal=arm.frame_pose(np.array([-0.9, 1.4]), "tip"))
     trace = open_loop(arm, LIMITED, steady(2, 10_000_000), task, lambda _: far_away(), has_distance=has_distance)
-    np.testing.assert_allclose(np.abs(trace.difference).max(axis=1), 0.02, atol=1e-9)
+    np.testing.assert_allclose(np.abs(trace["dv"]).max(axis=1), 0.02, atol=1e-9)
 
 
 LIMIT = np.array([2.0, 1.0])

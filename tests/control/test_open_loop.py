@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.columns import NamedColumns
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
-from splatctrl_cli.control.open_loop import OpenLoopTask, OpenLoopTrace, is_shaped, open_loop
+from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
-from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Bool, DistanceField, Float64
 from tests.control.fakes import PlanarArm, Plane, far_away
@@ -39,7 +39,7 @@ def run(
     asked: LoggedMotion | None = None,
     has_distance: Bool = EVERY,
     later: DistanceField | None = None,
-) -> OpenLoopTrace:
+) -> NamedColumns:
     """Drive through a field, which `later` replaces after half a second."""
     fields = field, later or field
     given = asked or motion()
@@ -48,44 +48,44 @@ def run(
 
 def test_what_was_logged_is_what_is_commanded_where_nothing_is_near() -> None:
     trace = run(far_away())
-    np.testing.assert_allclose(trace.difference, 0.0, atol=1e-6)
-    assert not any(is_shaped(step) for step in trace.steps)
-    assert all(margin is not None and margin.barrier > 1 for margin in trace.margins)
+    np.testing.assert_allclose(trace["dv"], 0.0, atol=1e-6)
+    assert not trace["shaped"].any() and trace["barrier_margin_logged"].min() > 1
 
 
 def test_a_wall_shapes_the_command_where_the_logged_velocity_breaks_its_row() -> None:
     trace = run(WALL)
-    room = np.array([np.nan if margin is None else margin.barrier for margin in trace.margins])
+    room, has_shaped = trace["barrier_margin_logged"], trace["shaped_scene"] == 1
     is_broken, is_clear = room < -1e-3, room > 1e-3
-    has_shaped = np.array([is_shaped(step, RowKind.SCENE) for step in trace.steps])
     assert 0 < is_broken.sum() < 21 and np.all(has_shaped[is_broken])
     assert is_clear.any() and not has_shaped[is_clear].any()
-    assert np.abs(trace.difference[is_clear]).max() < 1e-5 < np.abs(trace.difference[is_broken]).max()
-    assert trace.margins[-1].barrier_row == "fore[1]"
+    assert np.abs(trace["dv"][is_clear]).max() < 1e-5 < np.abs(trace["dv"][is_broken]).max()
+    assert trace["barrier_row_logged"][-1] == "fore[1]"
 
 
 def test_a_goal_is_asked_for_at_every_state_alike() -> None:
     goal = PlanarArm().frame_pose(START, "tip")
     trace = run(far_away(), OpenLoopTask(frame="tip", T_world_goal=goal, home=START))
-    assert np.linalg.norm(trace.commanded[0]) < 1e-6
-    assert np.all(np.sum(trace.commanded[1:] * (START - motion().position[1:]), axis=1) > 0)
+    assert np.linalg.norm(trace["v"][0]) < 1e-6
+    assert np.all(np.sum(trace["v"][1:] * (START - motion().position[1:]), axis=1) > 0)
 
 
 def test_a_state_without_a_distance_has_no_command() -> None:
     trace = run(WALL, has_distance=np.arange(21) != 3)
-    assert trace.steps[3] is None and trace.margins[3] is None and not is_shaped(trace.steps[3])
-    assert np.isnan(trace.commanded).any(axis=1).tolist() == [k == 3 for k in range(21)]
+    assert (trace["rung"][3], trace["barrier_row_logged"][3]) == ("", "") and np.isnan(trace["shaped"][3])
+    for name in ("v", "dv"):
+        assert np.isnan(trace[name]).any(axis=1).tolist() == [k == 3 for k in range(21)]
 
 
 def test_each_state_is_asked_in_the_field_of_its_time() -> None:
-    clearances = [step.clearance for step in run(far_away(), later=WALL).steps if step is not None]
-    assert min(clearances[:10]) > 40 and max(clearances[10:]) < 1
+    clearances = run(far_away(), later=WALL)["barrier_clearance"]
+    assert clearances[:10].min() > 40 and clearances[10:].max() < 1
 
 
 def test_a_logged_velocity_above_the_limit_is_named() -> None:
     trace = run(far_away(), asked=replace(motion(), velocity=np.tile([0.0, -1.8], (21, 1))))
-    assert (trace.margins[0].limit_row, trace.margins[0].limit) == ("elbow lowest", pytest.approx(-0.3))
-    assert all(is_shaped(step, RowKind.LIMIT) and not is_shaped(step, RowKind.SCENE) for step in trace.steps)
+    assert trace["velocity_row_logged"][0] == "elbow lowest"
+    assert trace["velocity_margin_logged"][0] == pytest.approx(-0.3)
+    assert trace["shaped_limit"].all() and not trace["shaped_scene"].any()
 
 
 def test_a_logged_motion_is_linear_between_states_and_at_rest_after_the_last() -> None:
@@ -171,5 +171,5 @@ def test_open_loop_asks_for_the_twist_and_not_for_what_was_done(asked: list[floa
     )
     task = OpenLoopTask(frame="tip", twists=track(asked))
     trace = open_loop(PlanarArm(), FLAT_CONFIG, still, task, lambda _: far_away(), has_distance=EVERY[:5])
-    found = trace.commanded @ PlanarArm().frame_jacobian(BENT, "tip").T
+    found = trace["v"] @ PlanarArm().frame_jacobian(BENT, "tip").T
     np.testing.assert_allclose(found[:, :3], np.tile(asked[:3], (5, 1)), atol=2e-3)

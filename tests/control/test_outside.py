@@ -20,8 +20,8 @@ from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.outside import OutsideController, class_command
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
-from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm, far_away
 
 CONFIG = ControlConfig()
@@ -237,10 +237,9 @@ def classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def recorded(classes: Path, steps: Sequence[ControlStep | None]) -> OutsideController:
-    """A class that commands what these steps did."""
-    velocities = [step.velocity.tolist() for step in steps if step is not None]
-    (classes / "recorded.json").write_text(json.dumps(velocities))
+def recorded(classes: Path, velocities: Sequence[Float64]) -> OutsideController:
+    """A class that commands these velocities."""
+    (classes / "recorded.json").write_text(json.dumps([velocity.tolist() for velocity in velocities]))
     return make_controller(class_command("own:Recorded"))
 
 
@@ -249,7 +248,7 @@ def test_the_recorded_commands_of_our_controller_drive_the_same_motion(classes: 
     driving = partial(closed_loop, ARM, replace(CONFIG, max_time=3.0), TASK, lambda _: ball)
     ours = driving()
     assert any(step.interventions for step in ours.steps)
-    with recorded(classes, ours.steps) as commander:
+    with recorded(classes, [step.velocity for step in ours.steps]) as commander:
         theirs = driving(commander=commander)
     assert theirs.outcome is ours.outcome and commander.failure is None
     np.testing.assert_array_equal(theirs.position, ours.position)
@@ -266,13 +265,14 @@ def test_in_open_loop_it_is_asked_at_every_state_until_it_fails(classes: Path) -
     given = ARM, CONFIG, motion, OpenLoopTask(frame="tip"), lambda _: far_away()
     asking = partial(open_loop, *given, has_distance=stamps != stamps[2])  # type: ignore[arg-type]
     ours = asking()
-    with recorded(classes, ours.steps[:4]) as commander:
+    with recorded(classes, ours["v"][[0, 1, 3]]) as commander:
         theirs = asking(commander=commander)
-    np.testing.assert_array_equal(theirs.commanded[:4], ours.commanded[:4])
-    assert commander.failure.fault is Fault.CRASHED
+    np.testing.assert_array_equal(theirs["v"][:4], ours["v"][:4])
+    assert commander.failure is not None and commander.failure.fault is Fault.CRASHED
     assert "StopIteration" in commander.failure.sentence and commander.failure.stamp_ns == stamps[4]
-    assert theirs.steps[4] is not None and theirs.steps[4].rung is Rung.HOLD and theirs.steps[5] is None
-    assert theirs.margins == ours.margins
+    assert theirs["rung"] == ["outside", "outside", "", "outside", "hold", ""]
+    np.testing.assert_array_equal(theirs["barrier_margin_logged"], ours["barrier_margin_logged"])
+    assert theirs["velocity_row_logged"] == ours["velocity_row_logged"]
 
 
 def test_clearance_rows_are_given_on_request_and_broken_ones_are_told(classes: Path) -> None:

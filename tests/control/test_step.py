@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MULTIPLIER
 from splatctrl_cli.control import barriers
-from splatctrl_cli.control.open_loop import is_shaped
+from splatctrl_cli.control.columns import is_shaped
 from splatctrl_cli.control.preconditions import static_violations
 from splatctrl_cli.control.qp import QpSolution, QuadraticProgram, Residuals, Rung, solve_clarabel
 from splatctrl_cli.control.step import QpIkController

@@ -6,7 +6,7 @@ from pathlib import Path
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict
 from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
-from splatctrl_cli.jobs.replay.state_store import Figures
+from splatctrl_cli.jobs.replay.trace import Trace
 
 WORDS = ("safe", "waived", "failed", "contact", "not evaluable", "refused")
 LONGEST = 90  # characters of a reason
@@ -23,11 +23,11 @@ class Word:
     only: str = ""
 
 
-def word_of(verdict: Verdict, near: Figures, margin: float) -> Word:
-    """A failure other than contact is `failed`, what passed by a waiver `waived`. near: what was known about the arm,
-    with a margin [m].
+def word_of(verdict: Verdict, trace: Trace, margin: float) -> Word:
+    """A failure other than contact is `failed`, what passed by a waiver `waived`. trace: with what was known
+    about the arm, within a margin [m].
     """
-    broken = [limit.name for limit in LIMITS if limit.is_broken(near, margin)]
+    broken = [limit.name for limit in LIMITS if limit.is_broken(trace, margin)]
     only = broken[0] if len(broken) == 1 == len(verdict.decisive) else ""
     first = verdict.decisive[0] if verdict.decisive else None
     reason = "" if first is None else f"{first.criterion}: {first.sentence}"[:LONGEST]

@@ -253,7 +253,7 @@ def _judged(trial: Trial, folder: Path, device: str = "cpu") -> tuple[Word, Repl
         if trial.draft.max_map_age is not None:
             request = replace(request, max_map_age=trial.draft.max_map_age)
         result = replay(request)
-        return word_of(result.verdict, result.replay.near, result.replay.margin), result
+        return word_of(result.verdict, result.replay.trace, result.replay.margin), result
     except SplatCtrlError as error:
         return refused(error, folder), None
 
@@ -265,11 +265,11 @@ def _true_clearance(trial: Trial, arm: TrueArm, result: ReplayResult | None) -> 
     first, last = at_s(0.0), at_s(DURATION_S)
     positions: Positions = trial.world.positions
     if result is not None:
-        stamps = np.asarray(result.replay.audit.stamp_ns, dtype=np.int64)
+        stamps = result.replay.trace.stamp_ns
         first = int(stamps[0])
         if trial.mode == "closed-loop":
             last = int(stamps[-1])
-            positions = interpolated(stamps, trial.draft.fault.true_of(np.asarray(result.replay.audit.position)))
+            positions = interpolated(stamps, trial.draft.fault.true_of(result.replay.trace["q"]))
     return least_clearance(arm, trial.world.primitives, positions, first, max(first, last))[0]
 
 

@@ -14,13 +14,13 @@ from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate import field_accuracy, score_report
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
-from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
+from splatctrl_cli.evaluate.metrics import Better, Scale
 from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PARTIAL, output_path
 from splatctrl_cli.jobs.bake.accuracy import SUMMARY_METRICS
 from splatctrl_cli.jobs.batch.run import DONE
 from splatctrl_cli.jobs.reconstruct import verdict as reconstruct_verdict
-from splatctrl_cli.jobs.replay.metrics import metric_scales, shown_metrics
+from splatctrl_cli.jobs.replay.metrics import Measure, metric_scales, shown_metrics
 from splatctrl_cli.jobs.replay.request import MODES
 from splatctrl_cli.jobs.robot import robot
 from splatctrl_cli.jobs.runs.run_folder import BatchFolder, is_batch, open_batch, open_run, read_columns, read_object
@@ -41,7 +41,7 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
 
 
 @cache
-def shown() -> Mapping[str, Shown]:
+def shown() -> Mapping[str, Measure]:
     return {name: where for mode in MODES for name, where in shown_metrics(mode, REPLAY_FIELDS).items()}
 
 
@@ -284,7 +284,7 @@ def worst_state(folder: Path | None, metric: str) -> WorstState | None:
     )
 
 
-def _badness(where: Shown, text: str) -> float:
+def _badness(where: Measure, text: str) -> float:
     """Rank a cell: smaller is worse."""
     if where.pick not in ("least", "largest"):
         return 0.0 if text == where.pick else math.inf

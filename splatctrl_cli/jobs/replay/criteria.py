@@ -1,6 +1,6 @@
 """Input of a replay's criteria; criteria of time and of the controller."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +10,9 @@ from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
-from splatctrl_cli.jobs.replay.metrics import Metrics, is_blank
+from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.records import Float64
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
@@ -37,34 +38,38 @@ class Judged:
     @property
     def past_end_s(self) -> float:
         """Driven time after the log's last state [s]."""
-        return max(int(self.replay.audit.stamp_ns[-1]) - int(self.inputs.states.stamp_ns[-1]), 0) * 1e-9
+        return max(int(self.replay.trace.stamp_ns[-1]) - int(self.inputs.states.stamp_ns[-1]), 0) * 1e-9
 
 
 def events_of(replay: Replay, kind: EventKind, source: str = "") -> Sequence[Event]:
     return [event for event in replay.events if event.kind is kind and event.source == source]
 
 
-def seconds_at(judged: Judged, index: int) -> float:
-    """Time [s] since the first state."""
-    stamps = judged.replay.audit.stamp_ns
-    return float(stamps[index] - stamps[0]) * 1e-9
-
-
 def mm(metres: float) -> str:
     return f"{1e3 * metres:.1f} mm"
 
 
-def nearby(judged: Judged, values: Float64) -> tuple[float, float, int] | None:
-    """Largest of values (T,) about the arm, its time [s], and their count."""
+def worst_state(
+    trace: Trace, column: str, who: str, pick: Callable[[Float64], np.intp] = np.nanargmin
+) -> tuple[float, float, str]:
+    """Value, time [s] and name at the state that `pick` takes."""
+    values = trace[column]
+    at = int(pick(values))
+    return float(values[at]), trace.seconds(at), trace[who][at]
+
+
+def nearby(trace: Trace, column: str) -> tuple[float, float, int] | None:
+    """Largest value about the arm, its time [s], and the number of values."""
+    values = trace[column]
     num = int(np.isfinite(values).sum())
-    return (float(np.nanmax(values)), seconds_at(judged, int(np.nanargmax(values))), num) if num else None
+    return (float(np.nanmax(values)), trace.seconds(int(np.nanargmax(values))), num) if num else None
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
     """The depth about the arm is at most `--max-map-age` old and not newer than the state. After half a second
     without any, the next depth shows nothing where the arm was. A baked field has no times (a note).
     """
-    first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
+    first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
     for found in judged.replay.unwatched:
         since, until, when = ((ns - first_ns) * 1e-9 for ns in (found.since_ns, found.depth_ns, found.stamp_ns))
         yield lacking(
@@ -77,7 +82,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             remedy="its time of arrival is unknown: cameras must give depth all the time",
             count=judged.replay.num_states,
         )
-    ahead = nearby(judged, judged.replay.near["ahead"])
+    ahead = nearby(judged.replay.trace, "evidence_ahead")
     allowed = SAME_MOMENT_NS / 1e9  # frames of one time step differ in time
     if ahead is not None and ahead[0] > allowed:
         yield lacking(
@@ -89,7 +94,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             remedy="a state is judged by what was known then: reconstruct with snapshots, or check the clocks",
             count=ahead[2],
         )
-    near, oldest = nearby(judged, judged.replay.near["age"]), judged.request.max_map_age
+    near, oldest = nearby(judged.replay.trace, "evidence_age"), judged.request.max_map_age
     if near is not None:
         age, time_s, count = near
         words, remedy = _end_words(judged, age, time_s)
@@ -110,7 +115,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
 
 
 def _end_words(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
-    lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
+    lasts = judged.replay.trace.seconds(-1) - judged.past_end_s
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""
     remedy = f"end it with the log (--set control.max_time={max(lasts, 0.01):.3g}), start earlier (--start-time), or"
@@ -122,7 +127,7 @@ def map_age(judged: Judged) -> Iterator[Reason]:
     margin: of a state's own time that a late map (`--latency`) did not contain, or the next after the last state.
     """
     yield from _overtaken(judged)
-    ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
+    ages, allowed = judged.replay.trace["map_age_s"], judged.request.max_map_age
     known = ages[np.isfinite(ages)]
     most = float(known.max(initial=-np.inf))
     if not len(known) and judged.request.field is not None and judged.inputs.source.has_clock:
@@ -149,7 +154,7 @@ def map_age(judged: Judged) -> Iterator[Reason]:
 
 
 def _overtaken(judged: Judged) -> Iterator[Reason]:
-    first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
+    first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
     found = sorted(judged.replay.overtaken, key=lambda each: each.clearance)
     for worst in [each for each in found if each.depth_ns <= each.stamp_ns][:1]:
         yield failed(
@@ -182,7 +187,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
     the first map.
     """
     config, replay = judged.request.config.verdict, judged.replay
-    stamps, unbounded, blank = replay.audit.stamp_ns, replay.between["unbounded"], is_blank(replay)
+    stamps, unbounded, blank = replay.trace.stamp_ns, replay.trace["unbounded_s"], replay.trace["is_blank"]
     if blank.any():
         yield lacking(
             criterion="judged states",
@@ -190,20 +195,21 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
             "the field has no distance, first",
             value=float(blank.mean()),
             threshold=config.unjudged,
-            time_s=seconds_at(judged, int(np.argmax(blank))),
+            time_s=replay.trace.seconds(int(np.argmax(blank))),
             remedy="bake with field.unknown = free or obstacle, over a box that holds the motion",
             count=len(stamps),
         )
     duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
     share = float(unbounded.sum()) / duration
     if share > config.unjudged:
-        worst = max(events_of(replay, EventKind.NOT_BOUNDED), key=lambda event: event.worst)
+        longest = int(np.argmax(unbounded))
         yield lacking(
             sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "
-            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {worst.worst:.2f} s, ending",
+            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {unbounded[longest]:.2f} s, "
+            "ending",
             value=share,
             threshold=config.unjudged,
-            time_s=worst.worst_s,
+            time_s=replay.trace.seconds(longest),
             cause=f"expected at most {config.longest_interval:g} s)",
             remedy=SLOW,
             count=len(stamps),
@@ -263,7 +269,7 @@ def controller(judged: Judged) -> Iterator[Reason]:
                 sentence=f"{failure.fault}: {failure.sentence}; after {counted(num, 'answer')},",
                 value=1.0,
                 threshold=0.0,
-                time_s=float(failure.stamp_ns - judged.replay.audit.stamp_ns[0]) * 1e-9,
+                time_s=float(failure.stamp_ns - judged.replay.trace.stamp_ns[0]) * 1e-9,
                 count=num + 1,
                 label=CONTROL,
             )
@@ -301,7 +307,7 @@ def scene_hits(judged: Judged) -> Iterator[Reason]:
             sentence=f"obstacles appeared inside the arm {int(hits)} times, first",
             value=float(hits),
             threshold=0.0,
-            time_s=float(change.stamp_ns - judged.replay.audit.stamp_ns[0]) * 1e-9,
+            time_s=float(change.stamp_ns - judged.replay.trace.stamp_ns[0]) * 1e-9,
             count=len(trace.scene_changes),
             label=CONTACT,
         )
@@ -328,9 +334,9 @@ def goal(judged: Judged) -> Iterator[Reason]:
 def commanded(judged: Judged) -> Reason | None:
     """A reason if a user's controller commands more than the velocity limits."""
     replay = judged.replay
-    if replay.outside is None or replay.kept_steps is None:
+    if replay.outside is None:
         return None
-    shares = np.abs(np.asarray(replay.kept_steps.figures.rows("velocity"))) / replay.model.velocity_limit
+    shares = np.abs(replay.trace["v"]) / replay.model.velocity_limit
     if not np.nanmax(shares, initial=0.0) > LIMIT_EXCEEDED:
         return None
     state, joint = np.unravel_index(np.nanargmax(shares), shares.shape)
@@ -339,7 +345,7 @@ def commanded(judged: Judged) -> Reason | None:
         sentence=f"{name} is commanded {most:.2f} times its limit",
         value=most,
         threshold=1.0,
-        time_s=seconds_at(judged, int(state)),
+        time_s=replay.trace.seconds(int(state)),
         who=name,
         count=judged.replay.num_states,
         label=LIMITS,

@@ -17,26 +17,27 @@ from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.sections import VerdictConfig
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle, clearance_signals
+from splatctrl_cli.control.columns import names_at
+from splatctrl_cli.control.events import Event, EventKind, Obstacle, clearance_signals, events_of
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.evaluate.metrics import clearance_agreement, mark_seen
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges
+from splatctrl_cli.files.spilled_rows import Rows, ranges
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
 from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.state_store import StoredAudit
+from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
-from splatctrl_cli.simulate.truth import distance_to
+from splatctrl_cli.simulate.truth import Truth, distance_to
 
 EVERY = "held_out_every"  # metric of a lockstep scene: its held-out frame sets
 
@@ -146,8 +147,8 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
     return evidence
 
 
-def map_error(evidence: Evidence, inputs: ReplayInputs, audit: StoredAudit, config: VerdictConfig) -> MapError:
-    stamps_ns, misses, num_points = misses_of(evidence.frame_sets(), inputs, audit, config.evidence_reach)
+def map_error(evidence: Evidence, inputs: ReplayInputs, trace: Trace, config: VerdictConfig) -> MapError:
+    stamps_ns, misses, num_points = misses_of(evidence.frame_sets(), inputs, trace, config.evidence_reach)
     bound = conformal_bound(misses[:, 0], config.confidence)
     error = MapError(
         source=evidence.name,
@@ -162,13 +163,13 @@ def map_error(evidence: Evidence, inputs: ReplayInputs, audit: StoredAudit, conf
     return replace(
         error,
         bound=replace(bound, bound=max(bound.bound, 0.0)),
-        time_s=float(stamps_ns[bound.at] - audit.stamp_ns[0]) * 1e-9,
+        time_s=float(stamps_ns[bound.at] - trace.stamp_ns[0]) * 1e-9,
         place=(x, y, z),
     )
 
 
 def misses_of(
-    frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float
+    frame_sets: Iterable[TimeStep], inputs: ReplayInputs, trace: Trace, reach: float
 ) -> tuple[list[int], Float64, int]:
     """Largest miss of each held-out frame set near the motion, without the robot.
 
@@ -176,8 +177,8 @@ def misses_of(
     points. Near is within `reach` [m]; sets count within the audited time. Each is compared with the map just before
     it: the next one contains other cameras of that moment, and misses less.
     """
-    swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
-    motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
+    swept, cameras = Swept.of(inputs.model, trace, reach), inputs.scene.figures().get("displaced_cameras") or {}
+    motion, first_ns, last_ns = inputs.motion(), int(trace.stamp_ns[0]), int(trace.stamp_ns[-1])
     stamps: list[int] = []
     worst: list[Float64] = []
     num_points = 0
@@ -238,12 +239,12 @@ class Swept:
         self._box = Box(lower=(centers - far).min(axis=0), upper=(centers + far).max(axis=0))
 
     @classmethod
-    def of(cls, model: RobotModel, audit: StoredAudit, reach: float) -> "Swept":
+    def of(cls, model: RobotModel, trace: Trace, reach: float) -> "Swept":
         """Sweep every audited state; memory grows with the space passed alone."""
         moving = np.flatnonzero(model.moving_spheres)
         cells, radii = np.zeros((0, 3)), np.zeros(0)
-        for first, last in ranges(len(audit.stamp_ns)):
-            centers = model.sphere_centers_batch(audit.position[first:last])[:, moving]
+        for first, last in ranges(len(trace.rows("q"))):
+            centers = model.sphere_centers_batch(trace.rows("q")[first:last])[:, moving]
             cells = np.concatenate([cells, np.floor(centers.reshape(-1, 3) / SPHERE_CELL)])
             radii = np.concatenate([radii, np.tile(model.sphere_set.radii[moving], last - first)])
             cells, index = np.unique(cells, axis=0, return_inverse=True)
@@ -278,37 +279,34 @@ def add_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurface
     """Add true clearances and their events; the surfaces are None without a truth."""
     if inputs.truth is None:
         return replay, None
-    model, trace = inputs.model, replay.audit
-    moving = np.flatnonzero(model.moving_spheres)
-    radii = model.sphere_set.radii[moving]
-    clearances, surfaces, nearest_spheres = RowFile(), RowFile((3,)), RowFile()
-    for first, last in ranges(len(trace.stamp_ns)):
+    model, trace = inputs.model, replay.trace
+    names, moving = sphere_names(model.sphere_set), np.flatnonzero(model.moving_spheres)
+    radii, all_stamps = model.sphere_set.radii[moving], trace.stamp_ns
+    for first, last in ranges(len(all_stamps)):
         clearance, surface = np.zeros(last - first), np.zeros((last - first, 3))
-        spheres = np.zeros(last - first)
-        stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
+        spheres = np.zeros(last - first, dtype=np.int64)
+        stamps, positions = all_stamps[first:last].tolist(), trace.rows("q")[first:last]
         for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
             distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
             gap = _drop_expected(inputs, moving, distance - radii, points, stamp, replay.margin)
             nearest = int(np.argmin(gap))
             clearance[index], surface[index] = gap[nearest], points[nearest]
             spheres[index] = moving[nearest]
-        clearances.append(clearance)
-        nearest_spheres.append(spheres)
-        surfaces.append(surface)
-    truth = Rows(clearances)
-    events = _true_events(inputs, replay, np.asarray(truth), Rows(nearest_spheres))
-    merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
-    return replace(replay, true_clearance=truth, events=merged), TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
+        of_truth = {"clearance_true": clearance, "nearest_true": names_at(names, spheres), "surface_true": surface}
+        trace.append(of_truth)
+    events = (*replay.events, *_true_events(inputs, replay, inputs.truth))
+    merged = tuple(sorted(events, key=lambda event: (event.first_ns, -event.last_ns)))
+    return replace(replay, events=merged), TrueSurfaces(trace.rows("surface_true"), all_stamps, inputs)
 
 
 def add_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
     """Compare the audit with the truth near seen surfaces, after the last frame."""
-    truth = np.asarray(replay.true_clearance)
+    truth = replay.trace["clearance_true"]
     return replace(
         replay,
         agreement={
-            name: clearance_agreement(np.asarray(of), truth, surfaces.seen, replay.median_radius)
-            for name, of in replay.audit.clearance.items()
+            name: clearance_agreement(replay.trace[f"clearance_{name}"], truth, surfaces.seen, replay.median_radius)
+            for name in replay.fields
         },
     )
 
@@ -326,23 +324,16 @@ def _drop_expected(
     return np.where(is_meant, np.inf, gap)
 
 
-def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spheres: Rows) -> tuple[Event, ...]:
-    model, truth, audit = inputs.model, inputs.truth, replay.audit
-    assert truth is not None
-    names = sphere_names(model.sphere_set)
-    fold = EventFold()
+def _true_events(inputs: ReplayInputs, replay: Replay, truth: Truth) -> tuple[Event, ...]:
+    model, trace = inputs.model, replay.trace
+    names, stamps = sphere_names(model.sphere_set), trace.stamp_ns
 
     def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
-        stamp, center = int(audit.stamp_ns[at]), model.sphere_centers(audit.position[at])[[names.index(name)]]
+        stamp, center = int(stamps[at]), model.sphere_centers(trace.rows("q")[at])[[names.index(name)]]
         distance, surface = truth.closest(center, stamp)
         there = [p for p in truth.primitives if p.is_present(stamp)]
         least = min(there, key=lambda p: float(distance_to([p], center, stamp)[0]))
         x, y, z = (float(v) for v in surface[0])
         return Obstacle(distance=float(distance[0]), position=(x, y, z), name=least.name)
 
-    fold.add(
-        audit.stamp_ns,
-        clearance_signals("true", clearance, np.asarray(spheres[: len(clearance)], np.int64), replay.margin, names),
-        near,
-    )
-    return fold.events()
+    return events_of(stamps, clearance_signals(trace, "true", replay.margin), near)

@@ -29,10 +29,9 @@ from splatctrl_cli.jobs.replay.criteria import (
     map_age,
     mm,
     nearby,
-    seconds_at,
 )
 from splatctrl_cli.jobs.replay.request import OCCUPIED
-from splatctrl_cli.jobs.replay.state_store import Figures
+from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.records import Float64
 from splatctrl_cli.voxels import EvidenceClass
 
@@ -58,12 +57,12 @@ class Limit:
     def name(self) -> str:
         return self.parts[0].name.lower() if self.parts else self.column
 
-    def values(self, near: Figures) -> Float64:
+    def values(self, near: Trace) -> Float64:
         """The limited column (T,); NaN where space about the arm was not evaluated."""
-        values = near[self.column]
+        values: Float64 = near[self.column]
         return values[:, self.parts].min(axis=1) if self.parts else values
 
-    def is_broken(self, near: Figures, margin: float) -> bool:
+    def is_broken(self, near: Trace, margin: float) -> bool:
         """True if any state breaks it; margin [m]."""
         values = self.values(near)
         return bool(np.any(values <= (self.least or margin)) if self.most is None else np.any(values > self.most))
@@ -106,7 +105,7 @@ LIMITS = (
     Limit(
         asked="unanswered, from the arm",
         why="a dark, shiny or transparent object returns no depth where depth is expected",
-        column="nearest",
+        column="class_distance",
         parts=(EvidenceClass.UNANSWERED,),
         words="cameras got no depth from a place {} from the arm, margin {allowed}",
         remedy="a dark, shiny or transparent object may be there: add a camera that gets depth there",
@@ -114,7 +113,7 @@ LIMITS = (
     Limit(
         asked="contradicted, from the arm",
         why="depth of a shiny object may lie far behind it",
-        column="nearest",
+        column="class_distance",
         parts=(EvidenceClass.CONTRADICTED,),
         words="{} from the arm, margin {allowed}, one camera measures depth behind a surface that another one sees",
         remedy="a shiny object may be there: add a camera that sees it, or check depth scale and poses",
@@ -122,7 +121,7 @@ LIMITS = (
     Limit(
         asked="depth edge, from the arm",
         why="a surface may extend one pixel past an edge without depth",
-        column="nearest",
+        column="class_distance",
         parts=(EvidenceClass.DEPTH_EDGE,),
         words="a depth edge was lost {} from the arm, margin {allowed}: the surface may extend one pixel further",
         remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
@@ -130,7 +129,7 @@ LIMITS = (
     Limit(
         asked="outside of the workspace, from the arm",
         why="the map ends there",
-        column="nearest",
+        column="class_distance",
         parts=(EvidenceClass.OUTSIDE,),
         words="the workspace of the map ends {} from the arm, margin {allowed}",
         remedy="reconstruct with a larger --box",
@@ -139,7 +138,7 @@ LIMITS = (
 PROOF = Limit(
     asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
     why="such a run would be safe by assumption",
-    column="nearest",
+    column="class_distance",
     parts=tuple(kind for kind in EvidenceClass if kind is not EvidenceClass.FREE),
     words="space not seen free within the allowed age is {} from the arm, margin {allowed}",
     remedy="add cameras until they see every side of the arm",
@@ -160,12 +159,12 @@ def known_space(judged: Judged) -> Iterator[Reason]:
 
 
 def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
-    near = judged.replay.near
+    near = judged.replay.trace
     values = limit.values(near)
     if limit is PROOF and np.isnan(near["assumed"]).all():
         yield lacking(sentence="evidence of the space near the arm is not recorded")
     if limit.most is not None:
-        worst = nearby(judged, values)
+        worst = nearby(near, limit.column)
         if worst is None:
             return
         words = f"{100 * worst[0]:.0f} % {limit.words}"
@@ -185,8 +184,8 @@ def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = l
         return
     at, allowed = int(np.nanargmin(values)), limit.least or judged.replay.margin
     if limit.parts:
-        nearest = min(limit.parts, key=lambda kind: float(near["nearest"][at, kind]))
-        place = near["places"].reshape(len(values), -1, 3)[at, nearest]
+        nearest = min(limit.parts, key=lambda kind: float(near["class_distance"][at, kind]))
+        place = near["class_places"].reshape(len(values), -1, 3)[at, nearest]
     else:
         place = near[f"{limit.column}_place"][at]
     yield broken(
@@ -194,7 +193,7 @@ def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = l
         value=float(values[at]),
         threshold=allowed,
         unit="m",
-        time_s=seconds_at(judged, at),
+        time_s=judged.replay.trace.seconds(at),
         place=tuple(place.tolist()),
         cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
         remedy=limit.remedy,
@@ -211,13 +210,13 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
             f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.replay.num_states
         )
     else:
-        at = int(np.argmax(judged.replay.audit.figures["unknown_share"] > allowed))
+        at = int(np.argmax(judged.replay.trace["unknown_share"] > allowed))
         yield lacking(
             sentence=f"{100 * share:.1f} % of the sphere centres lie in unseen space, allowed {100 * allowed:g} %, "
             "first",
             value=share,
             threshold=allowed,
-            time_s=seconds_at(judged, at),
+            time_s=judged.replay.trace.seconds(at),
             remedy="add a camera, or give a larger --max-unknown",
             count=judged.replay.num_states,
         )
@@ -229,7 +228,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
     With a smaller clearance no contact was seen, but the map cannot exclude one: not evaluable, unless another
     criterion fails. The same holds for too little evidence.
     """
-    found, surface = judged.replay.map_error, lowest(judged.replay.between["surface"])
+    found, surface = judged.replay.map_error, lowest(judged.replay.trace["clearance_surface"])
     if found is None and judged.request.require_evidence:
         yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
     if found is not None and found.bound is None:

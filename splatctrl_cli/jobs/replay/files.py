@@ -11,14 +11,13 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, EventKind, first_intervention
-from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.evaluate.worst_frames import Moment, Sight, draw_sight, sights_of, worst_moments
 from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs
-from splatctrl_cli.records import Float64, FloatRows, RgbdFrame
+from splatctrl_cli.records import FloatRows, RgbdFrame
 from splatctrl_cli.report.replay_pictures import (
     clearance_picture,
     commands_picture,
@@ -34,87 +33,41 @@ UNITS = {
 }
 _SPECIAL = re.compile('[,"\r\n]')
 
-Columns = dict[str, list[object]]
+COLUMNS = (  # of the trace in steps.csv, after stamps and clearances; a column per joint for rows (T, J)
+    *("clearance_true", "obstacle", "self_clearance", "limit_margin", "limit_joint", "unknown_share", "map_age_s"),
+    *("v", "barrier_clearance", "barrier_nearest", "rung", "scale", "slack", "relaxed", "intervening", "multipliers"),
+    *("num_rows", "residual", "position_error", "rotation_error", "dv", "velocity_difference"),
+    *("barrier_margin_logged", "barrier_row_logged", "velocity_margin_logged", "velocity_row_logged"),
+    *("divergence_joints", "divergence_position", "divergence_rotation_deg"),
+)
+OF_STEP = (  # columns with empty cells where the controller had no step
+    *("barrier_clearance", "scale", "slack", "residual", "position_error", "rotation_error"),
+    *("barrier_margin_logged", "velocity_margin_logged"),
+)
+Cells = dict[str, list[object]]
 
 
-def chunks_of(replay: Replay) -> Iterator[Columns]:
+def chunks_of(replay: Replay) -> Iterator[Cells]:
     """Columns of all states, BLOCK at a time, to bound memory."""
-    return (columns_of(replay, slice(k, k + BLOCK)) for k in range(0, len(replay.audit.stamp_ns), BLOCK))
+    return (columns_of(replay, slice(k, k + BLOCK)) for k in range(0, replay.num_states, BLOCK))
 
 
-def columns_of(replay: Replay, rows: slice = slice(None)) -> Columns:
-    first, last, _ = rows.indices(len(replay.audit.stamp_ns))
-    audit, names = replay.audit.block(first, last), sphere_names(replay.model.sphere_set)
-    columns: Columns = {
-        "stamp_ns": audit.stamp_ns.tolist(),
-        "time_s": ((audit.stamp_ns - replay.audit.stamp_ns[0]) * 1e-9).tolist(),
-        **{f"q_{joint}": audit.position[:, j].tolist() for j, joint in enumerate(replay.model.joint_names)},
+def columns_of(replay: Replay, rows: slice = slice(None)) -> Cells:
+    trace, stamps = replay.trace, replay.trace.rows("stamp_ns")
+    columns: Cells = {
+        "stamp_ns": stamps[rows].tolist(),
+        "time_s": ((stamps[rows] - stamps[0]) * 1e-9).tolist(),
     }
-    for name, clearance in audit.clearance.items():
-        columns[f"clearance_{name}"] = clearance.distance.tolist()
-        columns[f"nearest_{name}"] = [names[s] for s in clearance.sphere.tolist()]
-    if replay.true_clearance is not None:
-        columns["clearance_true"] = replay.true_clearance[rows].tolist()
-    columns |= {
-        "obstacle": list(replay.obstacles[rows]),
-        "self_clearance": audit.self_clearance.tolist(),
-        "limit_margin": audit.limit_margin.tolist(),
-        "limit_joint": [replay.model.joint_names[j] for j in audit.limit_joint.tolist()],
-        "unknown_share": audit.unknown_share.tolist(),
-        "map_age_s": replay.map_age_s[rows].tolist(),
-    }
-    if len(replay.steps):
-        columns |= _step_columns(replay, rows)
-    if replay.open_loop is not None:
-        columns |= _open_loop_columns(replay, rows)
-    if replay.divergence is not None:
-        apart = replay.divergence
-        columns |= {
-            "divergence_joints": apart.rows("joints")[rows].tolist(),
-            "divergence_position": apart.rows("position")[rows].tolist(),
-            "divergence_rotation_deg": np.degrees(apart.rows("rotation")[rows]).tolist(),
-        }
+    by_field = [name for field in replay.fields for name in (f"clearance_{field}", f"nearest_{field}")]
+    for name in ("q", *by_field, *(name for name in COLUMNS if name in trace)):
+        values = trace.rows(name)[rows]
+        if isinstance(values, list):
+            columns[name] = values
+        elif values.ndim == 1:
+            columns[name] = ["" if name in OF_STEP and np.isnan(v) else v for v in values.tolist()]
+        else:
+            columns |= {f"{name}_{joint}": values[:, j].tolist() for j, joint in enumerate(replay.model.joint_names)}
     return columns
-
-
-def _step_columns(replay: Replay, rows: slice) -> Columns:
-    steps = replay.steps[rows]
-
-    def each(value: Callable[[ControlStep], object]) -> list[object]:
-        return ["" if step is None else value(step) for step in steps]
-
-    return {
-        **{
-            f"v_{joint}": ["" if step is None else float(step.velocity[j]) for step in steps]
-            for j, joint in enumerate(replay.model.joint_names)
-        },
-        "barrier_clearance": each(lambda step: step.clearance),
-        "barrier_nearest": each(lambda step: step.nearest),
-        "rung": each(lambda step: str(step.rung)),
-        "scale": each(lambda step: step.scale),
-        "slack": each(lambda step: max((row.slack for row in step.relaxed), default=0.0)),
-        "relaxed": each(lambda step: " ".join(row.name for row in step.relaxed)),
-        "intervening": each(lambda step: "; ".join(step.intervening)),
-        "multipliers": each(lambda step: "; ".join(f"{row.multiplier:.4g}" for row in step.interventions)),
-        "num_rows": each(lambda step: step.num_rows),
-        "residual": each(lambda step: step.residual),
-        "position_error": each(lambda step: float(np.linalg.norm(step.pose_error[:3]))),
-        "rotation_error": each(lambda step: float(np.linalg.norm(step.pose_error[3:]))),
-    }
-
-
-def _open_loop_columns(replay: Replay, rows: slice) -> Columns:
-    assert replay.open_loop is not None
-    trace = replay.open_loop.block(*rows.indices(len(replay.audit.stamp_ns))[:2])
-    difference, margins = trace.difference, trace.margins
-    return {
-        **{f"dv_{joint}": difference[:, j].tolist() for j, joint in enumerate(replay.model.joint_names)},
-        "velocity_difference": np.linalg.norm(difference, axis=1).tolist(),
-        "barrier_margin_logged": ["" if margin is None else margin.barrier for margin in margins],
-        "barrier_row_logged": ["" if margin is None else margin.barrier_row for margin in margins],
-        "velocity_margin_logged": ["" if margin is None else margin.limit for margin in margins],
-        "velocity_row_logged": ["" if margin is None else margin.limit_row for margin in margins],
-    }
 
 
 def write_replay(
@@ -133,7 +86,7 @@ def write_replay(
     write_json(folder / "events.json", events_document(replay))
     write_json(folder / "summary.json", summary_of(replay, metrics, verdict, robot))
     with stopwatch.stage("picture"):
-        draw_replay(folder, replay, np.asarray((replay.audit.stamp_ns - replay.audit.stamp_ns[0]) * 1e-9))
+        draw_replay(folder, replay)
     write_run(
         folder,
         command="replay",
@@ -181,7 +134,7 @@ def events_document(replay: Replay) -> dict[str, Any]:
 def when_and_why(replay: Replay) -> list[str]:
     """The first intervention and the first event of each kind, with counts, as sentences."""
     lines = []
-    if replay.steps and replay.outside is None:
+    if replay.mode != "audit" and replay.outside is None:
         first = first_intervention(replay.events)
         lines.append("first intervention: none" if first is None else f"first intervention: {describe_event(first)}")
     troubles = [event for event in replay.events if event.kind not in INTERVENTIONS and event.source in SHOWN]
@@ -249,41 +202,43 @@ TITLES = {
 ROWS = ("scene", "self", "limit")  # kinds of rows that shape a command
 
 
-def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
-    """Write the pictures the mode has; seconds (T,) since the first state."""
-    curves: dict[str, FloatRows] = {**replay.audit.clearance}
-    if replay.true_clearance is not None:
-        curves["truth"] = replay.true_clearance
+def draw_replay(folder: Path, replay: Replay) -> None:
+    """Write the pictures the mode has, over seconds since the first state."""
+    trace, names = replay.trace, replay.model.joint_names
+    seconds = (trace.stamp_ns - trace.stamp_ns[0]) * 1e-9
+    curves: dict[str, FloatRows] = {name: trace.rows(f"clearance_{name}") for name in replay.fields}
+    if "clearance_true" in trace:
+        curves["truth"] = trace.rows("clearance_true")
     happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in SHOWN)
     title = TITLES[replay.mode]
     if replay.closed_loop is not None and replay.start_time_s > 0:
         title += f", from {replay.start_time_s:.2f} s of the log"
     clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, title, happened)
-    if np.isfinite(shares := replay.near["shares"]).any():
+    if np.isfinite(shares := trace["class_shares"]).any():
         evidence_picture(folder / "evidence.png", seconds, shares)
-    if replay.kept_steps is not None:
+    if replay.mode != "audit":
         broken = frozenset({EventKind.ROW_BROKEN})
         kinds, rows = (INTERVENTIONS, ROWS) if replay.outside is None else (broken, tuple(broken))
         commands_picture(
             folder / "commands.png",
             seconds,
-            replay.kept_steps.figures.rows("velocity"),
-            replay.model.joint_names,
+            trace.rows("v"),
+            names,
             replay.model.velocity_limit,
             _intervals(replay, lambda event: event.kind in kinds, at_least=rows),
-            None if replay.open_loop is None else replay.open_loop.figures.rows("logged"),
+            trace.rows("logged") if "logged" in trace else None,
         )
-    if replay.open_loop is not None:
+    if replay.mode == "open-loop":
         open_loop_picture(
             folder / "open_loop.png",
             seconds,
-            replay.open_loop.figures.rows("difference"),
-            replay.model.joint_names,
-            replay.open_loop.figures.rows("barrier"),
+            trace.rows("dv"),
+            names,
+            trace.rows("barrier_margin_logged"),
             [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS],
         )
-    if replay.divergence is not None and np.isfinite(replay.divergence["joints"]).any():
-        of = [replay.divergence[name] for name in ("joints", "position", "rotation")]
+    if replay.mode == "closed-loop" and np.isfinite(trace["divergence_joints"]).any():
+        of = [trace[f"divergence_{name}"] for name in ("joints", "position", "rotation")]
         divergence_picture(folder / "divergence.png", seconds, *of)
 
 
@@ -303,11 +258,11 @@ def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterabl
 
     None where no camera has one. Frames after the last moment are not read.
     """
-    audit = replay.audit
-    least = np.asarray(audit.clearance["exact"])
-    if replay.true_clearance is not None:
-        least = np.fmin(least, np.asarray(replay.true_clearance))
-    states = worst_moments(audit.stamp_ns, least, num)
+    trace = replay.trace
+    least = trace["clearance_exact"]
+    if "clearance_true" in trace:
+        least = np.fmin(least, trace["clearance_true"])
+    states = worst_moments(trace.stamp_ns, least, num)
     if not states or not inputs.source.has_clock:
         return []
     return sights_of([_moment(inputs, replay, state) for state in states], frames)
@@ -331,16 +286,17 @@ def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | Non
 
 
 def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:
-    audit, model = replay.audit, replay.model
-    stamp, worst = int(audit.stamp_ns[state]), int(audit.figures["sphere exact"][state])
-    centers = model.sphere_centers(np.asarray(audit.position[state]))
+    trace, model, names = replay.trace, replay.model, sphere_names(replay.model.sphere_set)
+    stamp, sphere = int(trace.stamp_ns[state]), trace["nearest_exact"][state]
+    worst, centers = names.index(sphere), model.sphere_centers(trace.rows("q")[state])
     (obstacle,) = inputs.scene.at(stamp).obstacles(np.ascontiguousarray(centers[[worst]]))
-    figures = [f"{NAMES.get(name, name)} {100 * float(of[state]):.2f} cm" for name, of in audit.clearance.items()]
-    if replay.true_clearance is not None:
-        figures.append(f"truth {100 * float(replay.true_clearance[state]):.2f} cm")
-    step = replay.steps[state] if replay.steps else None
-    rung = "" if step is None else f"   step: {step.rung}" + (f", scaled by {step.scale:g}" if step.scale < 1 else "")
-    seconds = (stamp - int(audit.stamp_ns[0])) * 1e-9
+    of = {NAMES.get(field, field): f"clearance_{field}" for field in replay.fields}
+    of |= {"truth": "clearance_true"} if "clearance_true" in trace else {}
+    figures = [f"{name} {100 * float(trace.rows(column)[state]):.2f} cm" for name, column in of.items()]
+    rung = trace["rung"][state] if "rung" in trace else ""
+    scale = trace.rows("scale")[state] if rung else 1.0
+    step = f"   step: {rung}" if rung else ""
+    step += f", scaled by {scale:g}" if scale < 1 else ""
     return Moment(
         stamp_ns=stamp,
         centers=centers,
@@ -349,7 +305,7 @@ def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:
         worst=worst,
         obstacle=np.array(obstacle.position),
         caption=(
-            f"{seconds:.2f} s   {sphere_names(model.sphere_set)[worst]}   clearance: {', '.join(figures)}{rung}",
+            f"{trace.seconds(state):.2f} s   {sphere}   clearance: {', '.join(figures)}{step}",
             f"nearest: {obstacle}",
         ),
     )

@@ -4,7 +4,7 @@ import csv
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,15 @@ from splatctrl_cli.control.goals import TwistTrack
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController, class_command
 from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.control.replay import Waypoint
-from splatctrl_cli.control.step import OURS, Commander, ControlStep
+from splatctrl_cli.control.step import OURS, Commander
 from splatctrl_cli.errors import InputError, UsageError, refuse_faults
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.state.state_source import read_twists
-from splatctrl_cli.records import Float64, FloatRows, Stamps
+from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
 WORLD = "world"
@@ -176,27 +177,25 @@ def twist_figures(
     config: ControlConfig,
     frame: str,
     track: TwistTrack | None,
-    stamp_ns: Stamps,
-    position: FloatRows,
-    steps: Sequence[ControlStep | None],
+    trace: Trace,
 ) -> Mapping[str, float | None]:
-    """`TWIST_FIGURES` of a controller's T steps; empty without twists.
+    """`TWIST_FIGURES` of a controller's T steps, by columns `q` and `v`; empty without twists.
 
     Share of states with a valid twist, share of these capped, and errors [m/s, rad/s].
     """
     if track is None:
         return {}
+    stamp_ns, states = trace.stamp_ns, zip(trace.stamp_ns, trace.rows("q"), trace.rows("v"), strict=True)
     is_known = track.is_known(stamp_ns, config.twist_timeout)
     num_known = num_capped = 0
-    linear, angular = np.full(len(stamp_ns), np.nan), np.full(len(stamp_ns), np.nan)
-    for i, (stamp, q, step, known) in enumerate(zip(stamp_ns, position, steps, is_known, strict=True)):
+    linear, angular = np.empty(len(stamp_ns)), np.empty(len(stamp_ns))
+    for i, (stamp, q, v) in enumerate(states):
         reference = track.reference(model, config, q, int(stamp))
-        if known:
+        if is_known[i]:
             num_known += 1
             num_capped += not np.array_equal(reference, track.in_world(model, q, int(stamp), config.twist_timeout))
-        if step is not None:
-            missed = model.frame_jacobian(q, frame) @ step.velocity - reference
-            linear[i], angular[i] = np.linalg.norm(missed[:3]), np.linalg.norm(missed[3:])
+        missed = model.frame_jacobian(q, frame) @ v - reference
+        linear[i], angular[i] = np.linalg.norm(missed[:3]), np.linalg.norm(missed[3:])
     values = [float(is_known.mean()), num_capped / num_known if num_known else None]
     for errors in (linear[~np.isnan(linear)], angular[~np.isnan(angular)]):
         values += [float(np.mean(errors)), float(np.max(errors))] if len(errors) else [None, None]

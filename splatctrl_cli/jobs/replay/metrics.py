@@ -1,12 +1,13 @@
-"""Metrics of a replay by predefined names: value, sample count, first failure."""
+"""Figures of a replay by predefined names: value, sample count, first failure."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, fixed
+from splatctrl_cli.control.columns import RUNGS
 from splatctrl_cli.control.events import first_intervention
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
@@ -25,72 +26,96 @@ from splatctrl_cli.evaluate.metrics import (
     LENGTH,
     LOWEST,
     MEAN,
+    NUMBER,
     P95,
     TIME,
     TOTAL,
     Better,
-    Metric,
+    Fold,
     Scale,
-    Shown,
-    counted,
-    folded,
 )
 from splatctrl_cli.jobs.replay.goal import TWIST_FIGURES
 from splatctrl_cli.jobs.replay.inputs import LOG_FIGURES, LoggedStates
 from splatctrl_cli.jobs.replay.request import Replay
-from splatctrl_cli.jobs.replay.state_store import RUNGS
 from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.voxels import EvidenceClass
 
 Metrics = dict[str, float | None]
-Declared = tuple[Metric[Replay], ...]
 num_states: Callable[[Replay], int] = attrgetter("num_states")
 
 
-def is_blank(replay: Replay) -> Bool:
-    """(T,) True where a field has no distance."""
-    return np.asarray(np.any([np.isnan(np.asarray(of)) for of in replay.audit.clearance.values()], axis=0))
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """One figure of a replay: its value, and the number of states, links or points behind it.
+
+    running: its value before the first state, and up to each (T,); None if not of states. column: of ``steps.csv``,
+    if any shows it; pick: its row there: "least", "largest", or a word.
+    """
+
+    name: str
+    value: Callable[[Replay], float | None]
+    count: Callable[[Replay], int] = num_states
+    scale: Scale = DESCRIBES
+    running: Callable[[Replay], tuple[float, Float64]] | None = None
+    column: str = ""
+    pick: str = ""
 
 
-def _single(
+def _of(
+    column: str,
     name: str,
-    value: Callable[[Replay], float | None],
-    count: Callable[[Replay], int] = num_states,
+    fold: Fold,
     scale: Scale = DESCRIBES,
-) -> Metric[Replay]:
-    return Metric(name=name, value=value, count=count, scale=scale)
+    *,
+    part: int | None = None,
+    where: Callable[[Replay, Float64], Bool] | None = None,
+    count: Callable[[Replay], int] | None = None,
+    shown: str = "",
+) -> Measure:
+    """A fold of a column (T,) of the trace, or of one `part` of it.
 
+    where: fold 1 where true, else 0. count: by default of states with a value. shown: column of ``steps.csv``.
+    """
 
-def _clearance(field: str) -> Metric[Replay]:
-    name = "min_clearance" if field == "exact" else f"min_clearance_{field}"
-    return folded(
-        name, LEAST, AUDIT(f"distance {field}"), scale=GAP, shown=Shown(column=f"clearance_{field}", pick="least")
+    def values(replay: Replay) -> Float64:
+        whole = replay.trace.get(column, np.empty(0))
+        own = whole if part is None else whole[:, part]
+        return own if where is None else np.where(np.isnan(own), np.nan, where(replay, own))
+
+    accumulate = fold.accumulate
+    return Measure(
+        name=name,
+        value=lambda replay: fold.of(values(replay)),
+        count=count or (lambda replay: int(np.sum(~np.isnan(values(replay))))),
+        running=None if accumulate is None else lambda replay: (fold.start, accumulate(values(replay))),
+        scale=scale,
+        column=shown,
+        pick=fold.pick,
     )
 
 
-def _column(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
-    figures = attrgetter(columns)
-    return lambda replay: figures(replay)[name] if part is None else figures(replay)[name][:, part]
+Declared = tuple[Measure, ...]
+
+
+def _clearance(field: str) -> Measure:
+    column = f"clearance_{field}"
+    return _of(column, "min_clearance" if field == "exact" else f"min_{column}", LEAST, GAP, shown=column)
 
 
 def _num_sudden(replay: Replay) -> int:
-    since = replay.audit.stamp_ns - replay.audit.stamp_ns[0]
+    since = replay.trace.stamp_ns - replay.trace.stamp_ns[0]
     return (
         int(np.sum(since >= 2 * fixed.MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
     )
 
 
-def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
-    return _single(
-        name,
-        lambda r: getattr(r.map_error.bound, figure) if r.map_error and r.map_error.bound else None,
-        lambda r: r.map_error.num_seen if r.map_error else 0,
-        scale,
+def _map_error(name: str, figure: str, scale: Scale) -> Measure:
+    return Measure(
+        name=name,
+        value=lambda r: getattr(r.map_error.bound, figure) if r.map_error and r.map_error.bound else None,
+        count=lambda r: r.map_error.num_seen if r.map_error else 0,
+        scale=scale,
     )
-
-
-def _intervals(replay: Replay) -> int:
-    return num_states(replay) - 1
 
 
 LIMIT = Scale(unit="rad", better=Better.HIGHER, absolute=1e-3)  # or m, of a prismatic joint
@@ -99,187 +124,143 @@ SLACK = Scale(unit="m/s", better=Better.HIGHER, absolute=1e-3, relative=0.02)  #
 AT_GOAL = Scale(unit="m", better=Better.LOWER, absolute=ControlConfig().goal_position)  # within it, it is reached
 TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_rotation)
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
-NEAREST = Shown(column="clearance_exact", pick="least")
-AUDIT = partial(_column, "audit.figures")
+NEAREST = "clearance_exact"
 OF_AUDIT: Declared = (
-    _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
-    _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links), FAULTS),
-    _single(
-        "coverage_deficit",
-        lambda r: None if r.model.coverage is None else r.model.coverage.max_deficit,
-        lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links),
-        ERROR,
+    Measure(name="num_spheres", value=lambda replay: len(replay.model.sphere_set.radii)),
+    Measure(
+        name="num_bare_links",
+        value=lambda replay: len(replay.model.bare_links),
+        count=lambda replay: len(replay.model.urdf.links),
+        scale=FAULTS,
     ),
-    _single("num_self_pairs", lambda replay: len(replay.model.self_pairs())),
-    _single("num_states", num_states),
-    _single("num_before_scene", lambda replay: replay.num_before_scene, scale=FAULTS),
-    _single(
-        "duration_s", lambda replay: float(replay.audit.stamp_ns[-1] - replay.audit.stamp_ns[0]) * 1e-9, scale=TIME
+    Measure(
+        name="coverage_deficit",
+        value=lambda r: None if r.model.coverage is None else r.model.coverage.max_deficit,
+        count=lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links),
+        scale=ERROR,
     ),
+    Measure(name="num_self_pairs", value=lambda replay: len(replay.model.self_pairs())),
+    Measure(name="num_states", value=num_states),
+    Measure(name="num_before_scene", value=lambda replay: replay.num_before_scene, scale=FAULTS),
+    Measure(name="duration_s", value=lambda replay: replay.trace.seconds(-1), scale=TIME),
 )
 OF_STATES: Declared = (
-    folded(
-        "min_clearance_true",
-        LEAST,
-        lambda r: np.asarray(() if r.true_clearance is None else r.true_clearance),
-        scale=GAP,
-        shown=Shown(column="clearance_true", pick="least"),
-    ),
-    counted(
-        "num_below_margin", AUDIT("distance exact"), lambda replay, values: values < replay.margin, shown=NEAREST
-    ),
-    counted("num_in_collision", AUDIT("distance exact"), lambda _, values: values < 0, shown=NEAREST),
-    folded(
+    _clearance("true"),
+    _of(NEAREST, "num_below_margin", NUMBER, FAULTS, where=lambda replay, d: d < replay.margin, shown=NEAREST),
+    _of(NEAREST, "num_in_collision", NUMBER, FAULTS, where=lambda _, d: d < 0, shown=NEAREST),
+    _of(
+        "self_clearance",
         "min_self_clearance",
         LEAST,
-        AUDIT("self_clearance"),
-        lambda replay: int(np.isfinite(replay.audit.figures["self_clearance"]).sum()),
-        scale=GAP,
-        shown=Shown(column="self_clearance", pick="least"),
+        GAP,
+        count=lambda replay: int(np.isfinite(replay.trace["self_clearance"]).sum()),
+        shown="self_clearance",
     ),
-    folded(
-        "min_limit_margin",
-        LEAST,
-        AUDIT("limit_margin"),
-        num_states,
-        scale=LIMIT,
-        shown=Shown(column="limit_margin", pick="least"),
-    ),
-    folded("max_velocity_share", LARGEST, _column("strain", "velocity"), _intervals, scale=BAD_SHARE),
-    folded("max_acceleration_share", LARGEST, _column("strain", "acceleration"), _num_sudden, scale=BAD_SHARE),
-    folded("min_clearance_surface", LEAST, _column("between", "surface"), scale=GAP, shown=NEAREST),
-    folded("min_clearance_between", LEAST, _column("between", "lower"), scale=GAP, shown=NEAREST),
-    folded("min_clearance_splats", LEAST, _column("between", "represented"), scale=GAP, shown=NEAREST),
-    folded("max_unseen_share", LARGEST, _column("near", "unseen"), scale=BAD_SHARE),
-    folded("max_assumed_share", LARGEST, _column("near", "assumed"), scale=BAD_SHARE),
-    folded("min_unseen_to_surface", LEAST, _column("near", "unseen_to_surface"), num_states, scale=GAP),
-    folded("min_blind_to_surface", LEAST, _column("near", "blind_to_surface"), num_states, scale=GAP),
+    _of("limit_margin", "min_limit_margin", LEAST, LIMIT, shown="limit_margin"),
+    _of("velocity_share", "max_velocity_share", LARGEST, BAD_SHARE, count=lambda replay: replay.num_states - 1),
+    _of("acceleration_share", "max_acceleration_share", LARGEST, BAD_SHARE, count=_num_sudden),
+    _of("clearance_surface", "min_clearance_surface", LEAST, GAP, shown=NEAREST),
+    _of("clearance_between", "min_clearance_between", LEAST, GAP, shown=NEAREST),
+    _of("clearance_splats", "min_clearance_splats", LEAST, GAP, shown=NEAREST),
+    _of("unseen", "max_unseen_share", LARGEST, BAD_SHARE),
+    _of("assumed", "max_assumed_share", LARGEST, BAD_SHARE),
+    _of("unseen_to_surface", "min_unseen_to_surface", LEAST, GAP, count=num_states),
+    _of("blind_to_surface", "min_blind_to_surface", LEAST, GAP, count=num_states),
     *(
         figure
         for kind in EvidenceClass
         for figure in (
-            folded(f"max_share_{kind.name.lower()}", LARGEST, _column("near", "shares", kind), scale=BAD_SHARE),
-            folded(
-                f"min_distance_{kind.name.lower()}", LEAST, _column("near", "nearest", kind), num_states, scale=GAP
+            _of("class_shares", f"max_share_{kind.name.lower()}", LARGEST, BAD_SHARE, part=kind),
+            _of(
+                "class_distance",
+                f"min_distance_{kind.name.lower()}",
+                LEAST,
+                GAP,
+                part=kind,
+                count=num_states,
             ),
         )
     ),
-    folded("max_evidence_age_s", LARGEST, _column("near", "age"), scale=AGE),
-    _single("unjudged_s", lambda r: float(r.between["unbounded"].sum()) + r.lead_in_s, _intervals, AGE),
-    folded(
-        "unknown_share",
-        MEAN,
-        AUDIT("unknown_share"),
-        scale=BAD_SHARE,
-        shown=Shown(column="unknown_share", pick="largest"),
-    ),
-    counted("num_without_distance", lambda r: is_blank(r).astype(np.float64), lambda _, values: values > 0),
-    _single(
-        "num_static_violations",
-        lambda r: len(r.static_violations),
-        lambda r: len(r.statics),
-        Scale(better=Better.LOWER, absolute=2, relative=0.05),
-    ),
-    folded(
-        "max_map_age_s",
-        LARGEST,
-        lambda replay: np.asarray(replay.map_age_s),
+    _of("evidence_age", "max_evidence_age_s", LARGEST, AGE),
+    Measure(
+        name="unjudged_s",
+        value=lambda r: float(r.trace["unbounded_s"].sum()) + r.lead_in_s,
+        count=lambda replay: replay.num_states - 1,
         scale=AGE,
-        shown=Shown(column="map_age_s", pick="largest"),
     ),
+    _of("unknown_share", "unknown_share", MEAN, BAD_SHARE, shown="unknown_share"),
+    _of("is_blank", "num_without_distance", NUMBER, FAULTS),
+    Measure(
+        name="num_static_violations",
+        value=lambda replay: len(replay.static_violations),
+        count=lambda replay: len(replay.statics),
+        scale=Scale(better=Better.LOWER, absolute=2, relative=0.05),
+    ),
+    _of("map_age_s", "max_map_age_s", LARGEST, AGE, shown="map_age_s"),
     _map_error("map_error_bound", "bound", ERROR),
     _map_error("map_error_blocks", "num_stretches", DESCRIBES),
     _map_error("map_error_confidence", "confidence", GOOD_SHARE),
 )
 
 
-LARGEST_DIFFERENCE, LEAST_SLACK = (
-    Shown(column="velocity_difference", pick="largest"),
-    Shown(column="barrier_margin_logged", pick="least"),
-)
-STEPS, ASKED = partial(_column, "kept_steps.figures"), partial(_column, "open_loop.figures")
-
-
-def _rung(rung: Rung) -> Metric[Replay]:
-    name, shown = "num_" + rung.value.replace("-", "_"), Shown(column="rung", pick=rung.value)
-    return counted(
-        name,
-        STEPS("rung"),
-        lambda _, values: values == RUNGS.index(rung),
-        scale=Scale(better=Better.HIGHER, relative=0.05) if rung is Rung.SOLVED else FAULTS,
-        shown=shown,
-    )
+def _rung(rung: Rung) -> Measure:
+    name, scale = "num_" + rung.value.replace("-", "_"), FAULTS
+    if rung is Rung.SOLVED:
+        scale = Scale(better=Better.HIGHER, relative=0.05)
+    number = RUNGS.index(rung)
+    measure = _of("rung_number", name, NUMBER, scale, where=lambda _, rungs: rungs == number, shown="rung")
+    return replace(measure, pick=rung.value)
 
 
 OF_STEPS: Declared = (
-    folded("intervention_share", MEAN, STEPS("shaped")),
-    *(folded(f"intervention_share_{kind}", MEAN, STEPS(f"shaped {kind}")) for kind in RowKind),
-    _single("first_intervention_s", lambda r: getattr(first_intervention(r.events), "start_s", None), scale=TIME),
-    folded(
-        "min_barrier_clearance",
-        LOWEST,
-        STEPS("clearance"),
-        scale=GAP,
-        shown=Shown(column="barrier_clearance", pick="least"),
+    _of("shaped", "intervention_share", MEAN),
+    *(_of(f"shaped_{kind}", f"intervention_share_{kind}", MEAN) for kind in RowKind),
+    Measure(
+        name="first_intervention_s",
+        value=lambda replay: getattr(first_intervention(replay.events), "start_s", None),
+        scale=TIME,
     ),
+    _of("barrier_clearance", "min_barrier_clearance", LOWEST, GAP, shown="barrier_clearance"),
     *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
-    folded("num_refused", TOTAL, STEPS("refused"), scale=FAULTS),
-    counted(
-        "num_scaled_back", STEPS("scale"), lambda _, values: values < 1, shown=Shown(column="scale", pick="least")
-    ),
-    folded(
-        "max_residual",
-        LARGEST,
-        STEPS("residual"),
-        scale=Scale(better=Better.LOWER, absolute=1e-6),
-        shown=Shown(column="residual", pick="largest"),
-    ),
+    _of("num_refused", "num_refused", TOTAL, FAULTS),
+    _of("scale", "num_scaled_back", NUMBER, FAULTS, where=lambda _, scales: scales < 1, shown="scale"),
+    _of("residual", "max_residual", LARGEST, Scale(better=Better.LOWER, absolute=1e-6), shown="residual"),
 )
+DIFFERENCE, BARRIER, VELOCITY = "velocity_difference", "barrier_margin_logged", "velocity_margin_logged"
 OF_OPEN_LOOP: Declared = (
-    folded("mean_velocity_difference", MEAN, ASKED("size"), scale=SPEED, shown=LARGEST_DIFFERENCE),
-    folded("p95_velocity_difference", P95, ASKED("size"), scale=SPEED, shown=LARGEST_DIFFERENCE),
-    folded("max_velocity_difference", LARGEST, ASKED("largest"), scale=SPEED, shown=LARGEST_DIFFERENCE),
-    folded("min_barrier_margin_logged", LOWEST, ASKED("barrier"), scale=SLACK, shown=LEAST_SLACK),
-    counted("num_barrier_broken_logged", ASKED("barrier"), lambda _, values: values < 0, shown=LEAST_SLACK),
-    folded(
-        "min_velocity_margin_logged",
-        LOWEST,
-        ASKED("limit"),
-        scale=SLACK,
-        shown=Shown(column="velocity_margin_logged", pick="least"),
-    ),
+    _of(DIFFERENCE, "mean_velocity_difference", MEAN, SPEED, shown=DIFFERENCE),
+    _of(DIFFERENCE, "p95_velocity_difference", P95, SPEED, shown=DIFFERENCE),
+    _of("largest_difference", "max_velocity_difference", LARGEST, SPEED, shown=DIFFERENCE),
+    _of(BARRIER, "min_barrier_margin_logged", LOWEST, SLACK, shown=BARRIER),
+    _of(BARRIER, "num_barrier_broken_logged", NUMBER, FAULTS, where=lambda _, room: room < 0, shown=BARRIER),
+    _of(VELOCITY, "min_velocity_margin_logged", LOWEST, SLACK, shown=VELOCITY),
 )
 
 
-def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESCRIBES) -> Metric[Replay]:
-    return _single(name, lambda replay: value(replay.closed_loop) if replay.closed_loop else None, scale=scale)
+def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESCRIBES) -> Measure:
+    return Measure(
+        name=name, value=lambda replay: value(replay.closed_loop) if replay.closed_loop else None, scale=scale
+    )
 
 
 OF_CLOSED_LOOP: Declared = (
     _trace("goal_reached", lambda trace: int(trace.outcome is Outcome.GOAL_REACHED), FULFILLED),
     _trace("stalled", lambda trace: int(trace.outcome is Outcome.STALLED), FAULTS),
     _trace("num_goals_reached", lambda trace: trace.num_reached, FULFILLED),
-    _single("start_time_s", lambda replay: replay.start_time_s, scale=TIME),
+    Measure(name="start_time_s", value=attrgetter("start_time_s"), scale=TIME),
     _trace("num_steps", lambda trace: len(trace.steps)),
-    _trace("position_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[:3])), AT_GOAL),
-    _trace("rotation_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[3:])), TURNED),
+    _of("position_error", "position_error", LAST, AT_GOAL),
+    _of("rotation_error", "rotation_error", LAST, TURNED),
     _trace("num_scene_hits", lambda trace: sum(change.is_hit for change in trace.scene_changes), FAULTS),
     _trace("num_anchors", lambda trace: len(trace.anchored)),
     _trace("num_detours", lambda trace: len(trace.detours)),
     *(
-        folded(
-            f"{prefix}_divergence_{name}",
-            fold,
-            column,
-            num_states,
-            scale=Scale(unit=unit),
-            shown=Shown(column=f"divergence_{name}", pick="largest"),
-        )
+        _of(column, f"{prefix}_{column}", fold, Scale(unit=unit), count=num_states, shown=column)
         for prefix, fold in (("max", LARGEST), ("end", LAST))
-        for name, unit, column in (
-            ("joints", "rad", _column("divergence", "joints")),
-            ("position", "m", _column("divergence", "position")),
-            ("rotation_deg", "degrees", lambda replay: np.degrees(_column("divergence", "rotation")(replay))),
+        for column, unit in (
+            ("divergence_joints", "rad"),
+            ("divergence_position", "m"),
+            ("divergence_rotation_deg", "degrees"),
         )
     ),
 )
@@ -311,15 +292,14 @@ def metric_scales(
     return scales
 
 
-def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Shown]:
-    return {metric.name: metric.shown for metric in _list_metrics(mode, of_fields) if metric.shown is not None}
+def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Measure]:
+    """Figures that a column of ``steps.csv`` shows, by name."""
+    return {metric.name: metric for metric in _list_metrics(mode, of_fields) if metric.column}
 
 
 def metrics_of(replay: Replay) -> Metrics:
     """Every printed, written and gated figure by name; None without a value."""
-    metrics: Metrics = {
-        metric.name: metric.value(replay) for metric in _list_metrics(replay.mode, tuple(replay.audit.clearance))
-    }
+    metrics: Metrics = {metric.name: metric.value(replay) for metric in _list_metrics(replay.mode, replay.fields)}
     metrics |= replay.twist_figures
     for name, agreement in replay.agreement.items():
         metrics |= {f"truth_{figure}_{name}": agreement[figure] for figure in agreement if figure != "tolerance"}
@@ -329,10 +309,8 @@ def metrics_of(replay: Replay) -> Metrics:
 
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
     """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
-    found = dict.fromkeys(metrics, num_states(replay))
-    found |= {
-        metric.name: metric.count(replay) for metric in _list_metrics(replay.mode, tuple(replay.audit.clearance))
-    }
+    found = dict.fromkeys(metrics, replay.num_states)
+    found |= {metric.name: metric.count(replay) for metric in _list_metrics(replay.mode, replay.fields)}
     for field, agreement in replay.agreement.items():
         compared = int(agreement["num_compared"] or 0)
         found |= {f"truth_{name}_{field}": compared for name in AGREEMENT if name != "num_compared"}
@@ -344,12 +322,10 @@ def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> f
 
     None for metrics that are not of single states.
     """
-    running = next(
-        (of.running for of in _list_metrics(replay.mode, tuple(replay.audit.clearance)) if of.name == metric), None
-    )
-    start, values = (np.nan, ()) if running is None else running(replay)
-    if running is None or not holds(start):
+    measure = next((of for of in _list_metrics(replay.mode, replay.fields) if of.name == metric), None)
+    if measure is None or measure.running is None:
         return None
-    stamps = replay.audit.stamp_ns
-    times = (float(stamps[index] - stamps[0]) * 1e-9 for index, value in enumerate(values) if not holds(float(value)))
-    return next(times, None)
+    start, values = measure.running(replay)
+    broken = (index for index, value in enumerate(values) if not holds(float(value)))
+    first = next(broken, None) if holds(start) else None
+    return None if first is None else replay.trace.seconds(first)

@@ -7,19 +7,21 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.barriers import scene_margin
+from splatctrl_cli.control.columns import step_columns
 from splatctrl_cli.control.goals import LoggedMotion, PlanDetour, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.outside import OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
+from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.files.spilled_rows import ObjectFile
 from splatctrl_cli.jobs.recordings.provenance import times_apart
 from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, twist_figures, twist_track
 from splatctrl_cli.jobs.replay.inputs import check_inside
 from splatctrl_cli.jobs.replay.known_scene import Certified, KnownScene, certified_distance
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
-from splatctrl_cli.jobs.replay.state_store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.planner.planned import planned_detours
 from splatctrl_cli.recording.log.state_columns import StateColumns
@@ -37,7 +39,7 @@ def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, conso
 def _audit(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     for stamps, positions, velocities in _blocks(record, inputs.states, first):
-        record.explain(record.measured(stamps, positions, velocities))
+        record.measured(stamps, positions, velocities)
     return _finish_logged(request, inputs, config, record, first)
 
 
@@ -51,11 +53,10 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
         goals = goal_waypoints(request, model, frame, states.position[-1])
         task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
     console.log(f"replay: asking the controller at {len(states) - first} states")
-    asked = StoredOpenLoop()
     with commander_of(request, model, config.control, console, frame=frame, home=task.home) as commander:
         for stamps, positions, velocities in _blocks(record, states, first):
             part = record.measured(stamps, positions, velocities)
-            trace = open_loop(
+            commanded = open_loop(
                 model,
                 config.control,
                 LoggedMotion(stamp_ns=stamps, position=positions, velocity=velocities),
@@ -65,16 +66,10 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
                 scene_step_at=scene.step_at,
                 commander=commander,
             )
-            asked.add(trace)
-            record.explain(part, trace.steps)
-    audit = record.audit
+            record.trace.append(commanded)
     return replace(
         _finish_logged(request, inputs, config, record, first),
-        open_loop=asked,
-        kept_steps=asked.kept,
-        twist_figures=twist_figures(
-            model, config.control, frame, twists, audit.stamp_ns, audit.position, asked.steps
-        ),
+        twist_figures=twist_figures(model, config.control, frame, twists, record.trace),
         outside=commander if isinstance(commander, OutsideController) else None,
     )
 
@@ -103,7 +98,6 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
     start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
     limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
-    loop = StoredLoop(model.num_joints)
     with commander_of(request, model, config.control, console, frame=task.frame, home=task.home) as commander:
         trace = closed_loop(
             model,
@@ -112,27 +106,22 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
             lambda stamp: scene.at(stamp).barrier,
             scene_step_at=scene.step_at,
             plan_detour=planned_ways_out(inputs, task, config),
-            record=loop,
+            record=ObjectFile[ControlStep](),
             commander=commander,
             distance_to=scene.at(task.stamp_ns).distances["exact"],
             balls_at=lambda stamp: scene.at(stamp).balls,
         )
     trace = _add_next_scene(trace, scene, model)
-    apart = Figures()
     for first, last in record.blocks(trace.stamp_ns):
         stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])
         straight = np.zeros_like(positions)  # the driven arm moves straight from state to state
-        record.explain(record.measured(stamps, positions, straight), trace.steps[first:last])
-        joints, position, rotation = divergence(model, task.frame, stamps, positions, motion)
-        apart.append(joints=joints, position=position, rotation=rotation)
+        record.measured(stamps, positions, straight)
+        apart = divergence(model, task.frame, stamps, positions, motion)
+        record.trace.append({**step_columns(trace.steps[first:last], model.num_joints), **apart})
     return replace(
         _finish(request, inputs, config, record, trace.static_violations, radius_of=0),
         closed_loop=trace,
-        kept_steps=loop.kept,
-        divergence=apart,
-        twist_figures=twist_figures(
-            model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
-        ),
+        twist_figures=twist_figures(model, config.control, task.frame, task.twists, record.trace),
         outside=commander if isinstance(commander, OutsideController) else None,
     )
 
@@ -181,7 +170,7 @@ def _finish(
     *,
     radius_of: int,
 ) -> Replay:
-    stamps = record.audit.stamp_ns
+    stamps = record.trace.stamp_ns
     requested, logged = _requested_ns(request, inputs), inputs.states.stamp_ns
     before = logged[(logged >= requested) & (logged < stamps[0])]
     record.newer_depth.finish()
@@ -189,22 +178,19 @@ def _finish(
     return Replay(
         model=inputs.model,
         config=config,
-        audit=record.audit,
+        mode=request.mode,
+        fields=record.fields,
+        trace=record.trace,
         num_before_scene=len(before),
         lead_in_s=float(int(stamps[0]) - int(before[0])) * 1e-9 if len(before) else 0.0,
         median_radius=inputs.scene.at(int(stamps[radius_of])).median_radius,
         static_violations=statics,
-        obstacles=record.obstacles,
-        map_age_s=record.ages.rows("map_age_s"),
         start_time_s=float(int(stamps[0]) - int(inputs.states.stamp_ns[0])) * 1e-9,
-        between=record.between,
-        near=record.near,
         unwatched=tuple(record.hindsight.found),
         overtaken=tuple(record.newer_depth.found),
-        strain=record.strain,
         statics=record.fixed_parts.found,
         closest=record.closest,
-        events=record.events.events(),
+        events=record.events(),
     )
 
 

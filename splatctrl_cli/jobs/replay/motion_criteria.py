@@ -23,7 +23,7 @@ from splatctrl_cli.jobs.replay.criteria import (
     goal,
     mm,
     scene_hits,
-    seconds_at,
+    worst_state,
 )
 from splatctrl_cli.jobs.replay.inputs import bare_moving_links, recorded_postures
 from splatctrl_cli.robot.self_margins import least_gap
@@ -31,17 +31,16 @@ from splatctrl_cli.robot.self_margins import least_gap
 
 def clearance(judged: Judged) -> Iterator[Reason]:
     """The exact distance of every moving sphere to the splats keeps the margin."""
-    represented = lowest(judged.replay.between["represented"])
+    represented = lowest(judged.replay.trace["clearance_splats"])
     is_starved = represented is not None and represented >= judged.threshold
     yield from _check_source(judged, "exact", represented if is_starved else None)
 
 
 def certified_clearance(judged: Judged) -> Iterator[Reason]:
     """The bound between grid cells keeps the margin; judged with a grid alone."""
-    clearance = judged.replay.audit.clearance
-    if "certified" not in clearance:
+    if "certified" not in judged.replay.fields:
         return
-    least, exact = (lowest(np.asarray(clearance[name])) for name in ("certified", "exact"))
+    least, exact = (lowest(judged.replay.trace[f"clearance_{name}"]) for name in ("certified", "exact"))
     if least is None or exact is None or not least < judged.threshold <= exact:
         yield from _check_source(judged, "certified")
         return
@@ -66,14 +65,14 @@ def clearance_of_people(judged: Judged) -> Iterator[Reason]:
 
 def true_clearance(judged: Judged) -> Iterator[Reason]:
     """The true clearance of every moving sphere keeps the margin; judged with `--truth`."""
-    if judged.replay.true_clearance is not None:
+    if "clearance_true" in judged.replay.trace:
         yield from _check_source(judged, "true")
 
 
 def _check_source(judged: Judged, source: str, represented: float | None = None) -> Iterator[Reason]:
     """represented [m]: clearance to splats, if voxels without one alone break the margin."""
     replay = judged.replay
-    least = lowest(np.asarray(replay.true_clearance if source == "true" else replay.audit.clearance[source]))
+    least = lowest(replay.trace[f"clearance_{source}"])
     if least is None:
         return
     if least >= judged.threshold:
@@ -126,30 +125,25 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap) unless
     the recording was. By collision surfaces, or by spheres if these cannot be read.
     """
-    least = lowest(judged.replay.audit.figures["self_clearance"])
-    events = events_of(judged.replay, EventKind.SELF_COLLISION)
-    if least is None or not np.isfinite(least):
-        return
-    if not events:
+    least, time_s, pair = worst_state(judged.replay.trace, "self_clearance", "self_pair")
+    if least < 0:
+        yield failed(
+            sentence=f"{pair} overlap by {mm(-least)}",
+            value=least,
+            threshold=0.0,
+            unit="m",
+            time_s=time_s,
+            who=pair,
+            remedy="pairs that may touch are named by --srdf",
+            count=judged.replay.num_states,
+            label=CONTACT,
+        )
+    elif np.isfinite(least):
         yield (
             _check_fixture(judged)
             or _brought_together(judged)
             or held(f"at least {mm(least)}", least, 0.0, "m", judged.replay.num_states)
         )
-        return
-    worst = min(events, key=lambda event: event.worst)
-    yield _locate(
-        worst,
-        failed(
-            sentence=f"{worst.worst_name} overlap by {mm(-worst.worst)}",
-            value=worst.worst,
-            threshold=0.0,
-            unit="m",
-            remedy="pairs that may touch are named by --srdf",
-            count=judged.replay.num_states,
-            label=CONTACT,
-        ),
-    )
 
 
 def _check_fixture(judged: Judged) -> Reason | None:
@@ -164,7 +158,7 @@ def _check_fixture(judged: Judged) -> Reason | None:
         threshold=pair.apart,
         unit="m",
         who=" and ".join(pair.links),
-        time_s=float(stamp - int(judged.replay.audit.stamp_ns[0])) * 1e-9,
+        time_s=float(stamp - int(judged.replay.trace.stamp_ns[0])) * 1e-9,
         remedy="pairs that may touch are named by --srdf",
         count=judged.replay.num_states,
         label=MARGIN,
@@ -191,7 +185,7 @@ def _brought_together(judged: Judged) -> Reason | None:
                 remedy="fit finer spheres there (splatctrl robot spheres), or lower control.self_margin",
                 count=judged.replay.num_states,
                 label=MARGIN,
-                time_s=float(stamp - int(replay.audit.stamp_ns[0])) * 1e-9,
+                time_s=float(stamp - int(replay.trace.stamp_ns[0])) * 1e-9,
                 who=" and ".join(pair.links),
             )
     return None
@@ -221,53 +215,48 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
 
 def position_limits(judged: Judged) -> Iterator[Reason]:
     """Joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise."""
-    least = lowest(judged.replay.audit.figures["limit_margin"])
-    if least is not None and least < -judged.request.config.control.limit_tolerance:
-        worst = min(events_of(judged.replay, EventKind.OUTSIDE_LIMITS), key=lambda event: event.worst)
-        yield _locate(
-            worst,
-            failed(
-                sentence=f"{worst.worst_name} is {-least:.4f} rad or m outside its limits",
-                value=least,
-                threshold=0.0,
-                unit="rad",
-                remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
-                count=judged.replay.num_states,
-                label=LIMITS,
-            ),
+    least, time_s, joint = worst_state(judged.replay.trace, "limit_margin", "limit_joint")
+    if least < -judged.request.config.control.limit_tolerance:
+        yield failed(
+            sentence=f"{joint} is {-least:.4f} rad or m outside its limits",
+            value=least,
+            threshold=0.0,
+            unit="rad",
+            time_s=time_s,
+            who=joint,
+            remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
+            count=judged.replay.num_states,
+            label=LIMITS,
         )
-    elif least is not None:
+    else:
         yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.replay.num_states)
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
     """Velocities of the motion, and a user's commands, exceed the URDF's limits by at most one percent."""
     too_fast = commanded(judged)
-    yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST) if too_fast is None else (too_fast,)
+    yield from _share_of_limit(judged, "velocity") if too_fast is None else (too_fast,)
 
 
 def acceleration_limits(judged: Judged) -> Iterator[Reason]:
     """Accelerations exceed `control.max_acceleration`, where it is set, by at most one percent."""
-    yield from _share_of_limit(judged, "acceleration", EventKind.TOO_SUDDEN)
+    yield from _share_of_limit(judged, "acceleration")
 
 
-def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Reason]:
-    values = judged.replay.strain[column]
-    most = float(np.max(values)) if len(values) else 0.0
+def _share_of_limit(judged: Judged, name: str) -> Iterator[Reason]:
+    most, time_s, joint = worst_state(judged.replay.trace, f"{name}_share", f"{name}_joint", np.nanargmax)
     if most > LIMIT_EXCEEDED:
-        worst = max(events_of(judged.replay, kind), key=lambda event: event.worst)
-        yield _locate(
-            worst,
-            failed(
-                sentence=f"{worst.worst_name} reaches {most:.2f} times its limit",
-                value=most,
-                threshold=1.0,
-                remedy="check the stamps and units of the states, and the URDF's limits",
-                count=judged.replay.num_states,
-                label=LIMITS,
-            ),
+        yield failed(
+            sentence=f"{joint} reaches {most:.2f} times its limit",
+            value=most,
+            threshold=1.0,
+            time_s=time_s,
+            who=joint,
+            remedy="check the stamps and units of the states, and the URDF's limits",
+            count=judged.replay.num_states,
+            label=LIMITS,
         )
-    elif len(judged.replay.model.joint_names) and (kind is EventKind.TOO_FAST or most > 0):
+    elif name == "velocity" or most > 0:
         yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.replay.num_states)
 
 
@@ -297,7 +286,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             value=surface,
             threshold=judged.replay.margin,
             unit="m",
-            time_s=seconds_at(judged, int(np.nanargmin(judged.replay.between["surface"]))),
+            time_s=judged.replay.trace.seconds(int(np.nanargmin(judged.replay.trace["clearance_surface"]))),
             remedy="use spheres that cover the robot: splatctrl robot spheres",
             count=judged.replay.num_states,
         )
@@ -307,19 +296,19 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
     """A lower bound by the spheres' lever arms keeps the margin; intervals with too low a bound are halved."""
-    model, columns = judged.replay.model, judged.replay.between
+    model, trace = judged.replay.model, judged.replay.trace
     _, surface, between = _body_clearance(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
         return
     if between < judged.threshold <= surface:
         yield lacking(
             sentence=f"on a straight path between two states the arm is at most {mm(between)} from the scene"
-            if bool(columns["met"][int(np.nanargmin(columns["lower"]))])
+            if bool(trace["is_met"][int(np.nanargmin(trace["clearance_between"]))])
             else f"the arm may have come within {mm(between)} between two states",
             value=between,
             threshold=judged.replay.margin,
             unit="m",
-            time_s=seconds_at(judged, int(np.nanargmin(columns["lower"]))),
+            time_s=trace.seconds(int(np.nanargmin(trace["clearance_between"]))),
             remedy=SLOW,
             count=judged.replay.num_states,
         )
@@ -329,11 +318,11 @@ def _body_clearance(judged: Judged) -> tuple[float, float | None, float | None]:
     """Least clearance [m] of spheres, surface, and between states. The last two are None if unknown, or if the
     spheres, then NaN, break the margin.
     """
-    clearance = judged.replay.audit.clearance
-    spheres = lowest(np.asarray(clearance["certified" if "certified" in clearance else "exact"]))  # as `surface` is
+    trace, field = judged.replay.trace, "certified" if "certified" in judged.replay.fields else "exact"
+    spheres = lowest(trace[f"clearance_{field}"])  # as `surface` is
     if spheres is None or spheres < judged.threshold:
         return np.nan, None, None
-    return spheres, lowest(judged.replay.between["surface"]), lowest(judged.replay.between["lower"])
+    return spheres, lowest(trace["clearance_surface"]), lowest(trace["clearance_between"])
 
 
 OF_MOTION: tuple[Criterion[Judged], ...] = (

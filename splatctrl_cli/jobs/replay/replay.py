@@ -89,7 +89,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
             found, sights = _watch(request, inputs, found)
         if evidence is not None:
             with stopwatch.stage("evidence"):
-                found = replace(found, map_error=map_error(evidence, inputs, found.audit, config.verdict))
+                found = replace(found, map_error=map_error(evidence, inputs, found.trace, config.verdict))
         metrics = metrics_of(found) | logged.metrics()
         with stopwatch.stage("verdict"):
             verdict = replay_verdict(

@@ -1,6 +1,6 @@
 """A replay's request, inputs and result."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as made_by
 from pathlib import Path
@@ -11,18 +11,17 @@ from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
-from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Reason
 from splatctrl_cli.jobs.reconstruct.verdict import LONGEST_BLIND
 from splatctrl_cli.jobs.replay.hindsight import LaterDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
-from splatctrl_cli.jobs.replay.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
+from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.device import RunOptions
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import FloatRows, RecordSource
+from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces
@@ -126,36 +125,29 @@ class MapError:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """A finished replay of T states: audit, trace of its mode, and truth if known.
+    """A finished replay of T states in one of MODES; fields: names of distances.
 
-    num_before_scene: states left out before the first scene, over lead_in_s [s]. start_time_s: of the first state.
-    between, near, strain, statics, closest: as in `ReplayRecord`. unwatched, overtaken: from later depth. obstacles
-    (T,): nearest to the nearest sphere, in words. map_age_s (T,): of the scene in use. divergence: of a closed loop
-    from the log: joints [rad], position [m], rotation [rad]. outside: a user's controller.
+    trace: as in `ReplayRecord`; `step_columns` or those of `open_loop` with a controller; `divergence_*` of a closed
+    loop from the log (joints [rad], position [m], rotation [rad]); `clearance_true` if known. num_before_scene:
+    states left out before the first scene, over lead_in_s [s]. start_time_s: of the first state. statics, closest: as
+    in `ReplayRecord`. unwatched, overtaken: from later depth. outside: a user's controller.
     """
 
     model: RobotModel
     config: Config
-    audit: StoredAudit
+    mode: str
+    fields: tuple[str, ...]
+    trace: Trace
     num_before_scene: int
     lead_in_s: float
     median_radius: float
     static_violations: tuple[StaticViolation, ...]
-    obstacles: Sequence[str]
-    map_age_s: FloatRows
     start_time_s: float
-    between: Figures
-    near: Figures
     unwatched: tuple[LaterDepth, ...]
     overtaken: tuple[LaterDepth, ...]
-    strain: Figures
     statics: Mapping[str, tuple[float, float]]
     closest: Mapping[KeptMargin, tuple[float, int]]
-    open_loop: StoredOpenLoop | None = None
     closed_loop: ReplayTrace | None = None
-    divergence: Figures | None = None
-    kept_steps: StoredSteps | None = None
-    true_clearance: FloatRows | None = None
     agreement: Mapping[str, Mapping[str, float | None]] = made_by(default_factory=dict)
     events: tuple[Event, ...] = ()
     twist_figures: Mapping[str, float | None] = made_by(default_factory=dict)
@@ -164,19 +156,9 @@ class Replay:
 
     @property
     def num_states(self) -> int:
-        return len(self.audit.stamp_ns)
+        return len(self.trace.rows("stamp_ns"))
 
     @property
     def margin(self) -> float:
         """The least clearance allowed [m]."""
         return self.config.control.margin
-
-    @property
-    def mode(self) -> str:
-        return "closed-loop" if self.closed_loop else "open-loop" if self.open_loop else "audit"
-
-    @property
-    def steps(self) -> Sequence[ControlStep | None]:
-        """The controller's steps; empty in an audit."""
-        trace = self.closed_loop or self.open_loop
-        return () if trace is None else trace.steps

@@ -1,4 +1,4 @@
-"""States of a replay, measured, explained and stored block by block."""
+"""States of a replay, measured and stored block by block."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -10,7 +10,6 @@ import numpy as np
 from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.audit import (
     AuditTrace,
-    Between,
     Clearance,
     Reach,
     audit,
@@ -20,23 +19,22 @@ from splatctrl_cli.control.audit import (
     observed_at,
     part_clearances,
 )
+from splatctrl_cli.control.columns import NamedColumns, audit_columns, names_at
 from splatctrl_cli.control.events import (
-    EventFold,
+    Event,
     EventKind,
     Obstacle,
     audit_signals,
-    interval_signals,
-    limit_signals,
-    stale_signal,
+    events_of,
+    motion_signals,
     step_signals,
 )
 from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace
 from splatctrl_cli.control.preconditions import FixedParts
-from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene
-from splatctrl_cli.jobs.replay.state_store import BLOCK, Figures, StoredAudit, StoredObjects
+from splatctrl_cli.jobs.replay.trace import BLOCK, Trace
 from splatctrl_cli.records import Bool, Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -46,27 +44,22 @@ from splatctrl_cli.voxels import EvidenceClass
 
 KINDS = len(EvidenceClass)
 NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # columns of evidence about the arm, with their shapes at a state
-    **dict.fromkeys(("age", "ahead", "unseen", "assumed", "unseen_to_surface", "blind_to_surface"), ()),
-    **{
-        "unseen_to_surface_place": (3,),
-        "blind_to_surface_place": (3,),
-        "shares": (KINDS,),
-        "nearest": (KINDS,),
-        "places": (KINDS * 3,),
-    },
+    **dict.fromkeys(("evidence_age", "evidence_ahead", "unseen", "assumed"), ()),
+    **{"unseen_to_surface": (), "unseen_to_surface_place": (3,)},
+    **{"blind_to_surface": (), "blind_to_surface_place": (3,)},
+    **{"class_shares": (KINDS,), "class_distance": (KINDS,), "class_places": (KINDS * 3,)},
 }
 
 
 class ReplayRecord:
     """Audit of T states in the scenes known at their times, with what happened.
 
-    obstacles: in words, the nearest to the nearest sphere.
-    between: clearance bound since the state before (`lower` [m], NaN at the first). `met`: 1 if a posture on the way
-    has it. `unbounded` [s]: time without a bound. `surface` [m]: clearance of the body. `represented` [m]: of the
-    spheres to splats alone.
-    near: `NEAR_COLUMNS`, NaN where not evaluated. hindsight: later depth about unwatched times. newer_depth: states
-    judged by a late map. strain: shares of the velocity and acceleration limits. closest: of link pairs below their
-    margin, gap [m] and stamp.
+    trace: `audit_columns`, and by state: `obstacle`, in words, the nearest to the nearest sphere; `map_age_s`;
+    `clearance_between` [m]: bound since the state before, NaN at the first, `is_met`: 1 if a posture on the way has
+    it; `unbounded_s`: time without a bound; `clearance_surface` [m]: of the body; `clearance_splats` [m]: of the
+    spheres to splats alone; `velocity_share`, `acceleration_share` of the limits, with their joints; `NEAR_COLUMNS`,
+    NaN where not evaluated. hindsight: later depth about unwatched times. newer_depth: states judged by a late map.
+    closest: of link pairs below their margin, gap [m] and stamp.
     """
 
     def __init__(
@@ -88,15 +81,13 @@ class ReplayRecord:
         contact, its times from `first_state_ns`. surfaces: for self-collision; None uses the spheres.
         """
         self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
-        self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
-        self.between, self.strain = Figures(), Figures()
-        self.events = EventFold()
+        self.trace = Trace()
+        self.fields: tuple[str, ...] = ()
         self._robot = self._model = model
         self._scene, self._max_map_age = scene, max_map_age
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
         self.fixed_parts = FixedParts(model, 2.0 * (self._margin - fixed.SLIGHTLY_UNDER))
         self._spheres = sphere_names(model.sphere_set)
-        self._number = {name: number for number, name in enumerate(self._spheres)}
         self._surfaces, self._kept = surfaces, kept
         self._enough = max(config.control.self_margin, config.control.margin)
         self.closest: dict[KeptMargin, tuple[float, int]] = {}
@@ -108,7 +99,7 @@ class ReplayRecord:
             np.asarray(model.velocity_limit),
             np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
         )
-        self.near, self._near = Figures(), NearSpace(model, config.control.margin, max_map_age)
+        self._near = NearSpace(model, config.control.margin, max_map_age)
         self._posture_before: Float64 | None = None  # at the end of the last block
         self.hindsight = Hindsight(scene, self._near, config.control.margin, self._clearance_in)
         self.newer_depth = NewerDepth(scene, config.control.margin - fixed.SLIGHTLY_UNDER, self._clearance_in)
@@ -133,37 +124,43 @@ class ReplayRecord:
         scene, self._model = self._scene, self._robot.at(int(stamps[0]))
         part = audit(self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed)
         part = self._look_at_self(self._without_expected(part))
-        self.audit.add(part)
+        self.fields = tuple(part.clearance)
         self.newer_depth.add(stamps, positions, part.clearance["exact"].distance)
-        self.obstacles.extend(["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)])
-        self.ages.append(map_age_s=np.array([scene.age_s(stamp) for stamp in stamps.tolist()]))
-        self._bound(part, velocities)
         strain = self._limits.add(stamps, positions if self._is_continuous else np.zeros_like(positions))
-        self.strain.append(velocity=strain.velocity, acceleration=strain.acceleration)
-        self._strain = strain
+        joints = self._model.joint_names
         self._look_at_statics(part)
-        self._look_around(part)
-        self._tell_represented(part)
+        columns = {
+            **audit_columns(part, self._spheres, joints, self._pairs),
+            "obstacle": ["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)],
+            "map_age_s": np.array([scene.age_s(stamp) for stamp in stamps.tolist()]),
+            **self._bound(part, velocities),
+            "velocity_share": strain.velocity,
+            "velocity_joint": names_at(joints, strain.velocity_joint),
+            "acceleration_share": strain.acceleration,
+            "acceleration_joint": names_at(joints, strain.acceleration_joint),
+            **self._look_around(part),
+            "clearance_splats": self._clearance_of_splats(part),
+        }
+        self.trace.append(columns)
         return part
 
-    def explain(self, part: AuditTrace, steps: Sequence[ControlStep | None] = ()) -> None:
-        """Find the events of the block measured last, with the controller's `steps` there."""
-        age_s = np.array([self._scene.age_s(stamp) for stamp in part.stamp_ns.tolist()])
+    def events(self) -> tuple[Event, ...]:
+        """Events of all states, and of a controller's `step_columns` if the trace has them."""
+        trace, number = self.trace, {name: number for number, name in enumerate(self._spheres)}
         signals = [
-            *audit_signals(part, self._margin, self._spheres, self._model.joint_names, self._pairs),
-            *limit_signals(self._strain, self._model.joint_names),
-            *interval_signals(self._lower, self._unbounded, self._margin - fixed.SLIGHTLY_UNDER),
-            stale_signal(age_s, self._max_map_age),
-            *(step_signals(steps) if steps else ()),
+            *audit_signals(trace, self.fields, self._margin),
+            *motion_signals(trace, self._margin - fixed.SLIGHTLY_UNDER, self._max_map_age),
+            *(step_signals(trace) if "rung" in trace else ()),
         ]
 
         def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
-            if name not in self._number or kind is EventKind.WITHOUT_DISTANCE:
+            if name not in number or kind is EventKind.WITHOUT_DISTANCE:
                 return None
-            center = self._model.sphere_centers(part.position[at])[[self._number[name]]]
-            return self._scene.at(int(part.stamp_ns[at])).obstacles(center)[0]
+            stamp = int(trace.rows("stamp_ns")[at])
+            center = self._robot.at(stamp).sphere_centers(trace.rows("q")[at])[[number[name]]]
+            return self._scene.at(stamp).obstacles(center)[0]
 
-        self.events.add(part.stamp_ns, signals, near)
+        return events_of(trace.stamp_ns, signals, near)
 
     def _without_expected(self, part: AuditTrace) -> AuditTrace:
         if not self._declared.expected_contact:
@@ -214,7 +211,7 @@ class ReplayRecord:
                 self.closest[pair] = float(own[at]), int(part.stamp_ns[at])
         return part
 
-    def _bound(self, part: AuditTrace, velocities: Float64) -> None:
+    def _bound(self, part: AuditTrace, velocities: Float64) -> NamedColumns:
         """Bound the clearance since each state before, in this block's scene."""
         known = self._scene.at(int(part.stamp_ns[0])).distances
         name = "certified" if "certified" in known else "exact"
@@ -229,33 +226,29 @@ class ReplayRecord:
             stamps, positions = np.concatenate([[stamp], stamps]), np.concatenate([q[None], positions])
             velocities = np.concatenate([velocity[None], velocities])
             at_states = np.concatenate([earlier, at_states])
-        self._keep_bounds(
-            between_states(
-                self._model,
-                self._reach,
-                stamps,
-                positions,
-                velocities,
-                at_states,
-                known[name],
-                margin=self._margin - fixed.SLIGHTLY_UNDER,
-                longest=self._longest,
-            ),
+        between = between_states(
+            self._model,
+            self._reach,
             stamps,
+            positions,
+            velocities,
             at_states,
-            is_first=self._before is None,
+            known[name],
+            margin=self._margin - fixed.SLIGHTLY_UNDER,
+            longest=self._longest,
         )
         self._before = int(stamps[-1]), positions[-1], velocities[-1]
-
-    def _keep_bounds(self, between: Between, stamps: Stamps, at_states: Float64, *, is_first: bool) -> None:
-        unbounded = np.where(between.is_bounded | (not self._is_continuous), 0.0, np.diff(stamps) * 1e-9)
+        first = (
+            [] if len(between.lower) == len(part.stamp_ns) else [np.nan]
+        )  # the motion's first state has none before
+        seconds = np.where(between.is_bounded | (not self._is_continuous), 0.0, np.diff(stamps) * 1e-9)
         lower = np.where(between.is_bounded & self._is_continuous, between.lower, np.nan)
-        surface = at_states.min(axis=1) if is_first else at_states[1:].min(axis=1)
-        met = between.is_met.astype(np.float64)
-        if is_first:
-            lower, unbounded, met = np.insert(lower, 0, np.nan), np.insert(unbounded, 0, 0.0), np.insert(met, 0, 0.0)
-        self._lower, self._unbounded = lower, unbounded
-        self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
+        return {
+            "clearance_between": np.concatenate([first, lower]),
+            "unbounded_s": np.nan_to_num(np.concatenate([first, seconds])),
+            "is_met": np.nan_to_num(np.concatenate([first, between.is_met])),
+            "clearance_surface": at_states[-len(part.stamp_ns) :].min(axis=1),
+        }
 
     def _look_at_statics(self, part: AuditTrace) -> None:
         stamp = int(part.stamp_ns[0])
@@ -270,7 +263,7 @@ class ReplayRecord:
             self._was_free = seen.is_free if before is None else before | seen.is_free
         self.fixed_parts.look(known.distances["exact"], part.position[0], was_free)
 
-    def _look_around(self, part: AuditTrace) -> None:
+    def _look_around(self, part: AuditTrace) -> NamedColumns:
         num = len(part.stamp_ns)
         columns = {name: np.full((num, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
         if self._scene.has_seen_times:
@@ -287,18 +280,18 @@ class ReplayRecord:
                 if not self._scene.has_seen_times:
                     columns["assumed"][at] = np.nan  # space seen free once may be occupied now
                 elif is_timed:
-                    columns["age"][at], columns["ahead"][at] = accounts[0].age, accounts[0].ahead
+                    columns["evidence_age"][at], columns["evidence_ahead"][at] = accounts[0].age, accounts[0].ahead
                     self.hindsight.looked(stamp, accounts[0].age)
         self._posture_before = part.position[-1]
-        self.near.append(**columns)
+        return columns
 
-    def _tell_represented(self, part: AuditTrace) -> None:
+    def _clearance_of_splats(self, part: AuditTrace) -> Float64:
         exact = part.clearance["exact"].distance
         alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
         low = np.flatnonzero(exact < self._margin - fixed.SLIGHTLY_UNDER)
         if splats_alone is not None and len(low):
             alone[low] = moving_clearance(self._model, part.position[low], splats_alone)[0].distance
-        self.between.append(represented=alone)
+        return alone
 
     def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
         nearest = part.clearance["barrier"]
@@ -322,9 +315,9 @@ def _folded(accounts: Sequence[Account]) -> dict[str, float | Float64]:
     least, places = nearest.argmin(axis=0), np.array([each.places for each in accounts])
     unseen, blind = (min(accounts, key=attrgetter(f"{name}_to_surface")) for name in ("unseen", "blind"))
     return {
-        "shares": shares[0],
-        "nearest": nearest.min(axis=0),
-        "places": places[least, np.arange(KINDS)].ravel(),
+        "class_shares": shares[0],
+        "class_distance": nearest.min(axis=0),
+        "class_places": places[least, np.arange(KINDS)].ravel(),
         "unseen": float(shares[:, NEVER_SEEN].sum(axis=1).max()),
         "assumed": max(each.assumed for each in accounts),
         "unseen_to_surface": unseen.unseen_to_surface,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 
 from splatctrl_cli.control.line_process import shown
@@ -28,7 +29,8 @@ CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
 def replay_verdict(judged: Judged) -> Verdict:
-    replay, request = judged.replay, judged.request
+    """Judge by every criterion, then by the request's gates."""
+    replay, metrics = judged.replay, judged.metrics
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     if find_displaced(judged) is not None:
         by_map = (*BY_MAP, *(() if replay.outside else BY_OUR_CONTROLLER))
@@ -40,21 +42,12 @@ def replay_verdict(judged: Judged) -> Verdict:
         ]
         reasons.sort(key=lambda reason: reason.criterion != "calibration")
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # contact by any measure precedes a broken margin
-    counts = counts_of(replay, judged.logged, judged.metrics)
-    reasons += gate_reasons(
-        request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)
-    )
-    stamps = replay.audit.stamp_ns
-    first, last = replay.start_time_s, replay.start_time_s + float(stamps[-1] - stamps[0]) * 1e-9
-    motion = "driven" if replay.closed_loop else "logged"
-    span, past = f"{motion} motion from {first:.2f} to {last:.2f} s of the log", judged.past_end_s
-    if past > 0:
-        span = f"{motion} motion from {first:.2f} s of the log to {past:.2f} s past its end"
-    who = "" if replay.outside is None else f", controller {shown(replay.outside.name)}"
+    counts = counts_of(replay, judged.logged, metrics)
+    reasons += gate_reasons(judged.request.require, metrics, counts, first_time=partial(first_time, replay))
     return verdict_of(
         "replay",
         reasons,
-        scope=f"{span}, {len(stamps)} states{who}",
+        scope=_scope(judged),
         passed=SAFE,
         how=_how(judged),
         notes=tuple(_notes(judged)),
@@ -63,11 +56,22 @@ def replay_verdict(judged: Judged) -> Verdict:
     )
 
 
+def _scope(judged: Judged) -> str:
+    replay, past = judged.replay, judged.past_end_s
+    first = replay.start_time_s
+    end = f"s of the log to {past:.2f} s past its end"
+    if past <= 0:
+        end = f"to {first + replay.trace.seconds(-1):.2f} s of the log"
+    motion = "driven" if replay.closed_loop else "logged"
+    who = "" if replay.outside is None else f", controller {shown(replay.outside.name)}"
+    return f"{motion} motion from {first:.2f} {end}, {replay.num_states} states{who}"
+
+
 def _how(judged: Judged) -> str:
     """Return "waived", "proven" (all space within the margin seen free), or an empty text."""
     if any(waivers(judged.request)):
         return "waived"
-    assumed = nearby(judged, judged.replay.near["assumed"])
+    assumed = nearby(judged.replay.trace, "assumed")
     return "proven" if assumed is not None and assumed[0] <= 0 else ""
 
 
@@ -78,12 +82,12 @@ def _notes(judged: Judged) -> Iterator[str]:
         yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
-    unseen, assumed = (nearby(judged, judged.replay.near[name]) for name in ("unseen", "assumed"))
+    unseen, assumed = (nearby(judged.replay.trace, name) for name in ("unseen", "assumed"))
     if unseen is None:
         yield "space about the arm not judged"
     if assumed is not None and assumed[0] > 0:
         yield f"at most {100 * assumed[0]:.0f} % of the space within the margin of the arm was assumed to be free"
-    if nearby(judged, judged.replay.near["age"]) is None:
+    if nearby(judged.replay.trace, "evidence_age") is None:
         yield "age of the evidence about the arm not judged"
     yield from _declared_notes(judged)
     yield from waivers(judged.request)

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -197,9 +196,8 @@ def test_the_map_is_made_with_the_poses_at_which_the_cameras_truly_stand(
 
 
 def test_the_verdict_names_the_corrected_cameras_and_holds(metrics: dict[str, Any]) -> None:
-    rows, run = metrics["displaced_cameras"], judged()
-    run.inputs.scene = SimpleNamespace(figures=lambda: {"displaced_cameras": rows})
-    reasons = list(calibration(run))
+    rows = metrics["displaced_cameras"]
+    reasons = list(calibration(judged(figures={"displaced_cameras": rows})))
     assert all(is_corrected(row) for row in rows.values())
     assert [(reason.outcome, reason.is_note, reason.who) for reason in reasons] == [
         (Outcome.PASSED, True, camera) for camera in rows

@@ -1,64 +1,82 @@
 """Criteria of a replay's verdict on made-up figures: those that a whole run seldom breaks alone."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import Config
-from splatctrl_cli.control.events import EventKind
+from splatctrl_cli.config import Config, ControlConfig
+from splatctrl_cli.control.audit import AuditTrace, Clearance
+from splatctrl_cli.control.columns import audit_columns, step_columns
+from splatctrl_cli.control.events import Event, EventKind, Signal, events_of
+from splatctrl_cli.control.replay import Outcome as LoopOutcome
+from splatctrl_cli.control.replay import ReplayTrace
+from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replay import evidence_criteria as evidence
-from splatctrl_cli.jobs.replay.criteria import controller
+from splatctrl_cli.jobs.replay.criteria import Judged, controller
+from splatctrl_cli.jobs.replay.files import columns_of
+from splatctrl_cli.jobs.replay.inputs import LoggedStates
+from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.motion_criteria import surface_clearance
+from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
+from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.scene.self_mask import self_mask_metrics
-from splatctrl_cli.scene.time_steps import AuditRow
 from splatctrl_cli.voxels import EvidenceClass
+from tests.cli.replay_desk import FakeSource
 
 NUM = 11
-UNKNOWN = np.full(NUM, np.nan)
 NOTHING_NEAR = {name: np.full((NUM, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
+FIVE_STEPS = ReplayTrace(
+    stamp_ns=np.arange(5),
+    position=np.zeros((5, 0)),
+    steps=[cast("ControlStep", None)] * 5,
+    outcome=LoopOutcome.TIMEOUT,
+    static_violations=(),
+    scene_changes=(),
+)
+CONTROLLER = dict.fromkeys(("num_relaxed", "num_minimum_violation", "num_hold"), 0)
 
 
-def judged(**replay: Any) -> Any:
-    """What the criteria look at, of a run with nothing broken but `replay`."""
-    stamps = np.arange(NUM, dtype=np.int64) * 100_000_000
-    run = {
-        "outside": None,
-        "audit": SimpleNamespace(stamp_ns=stamps, clearance={}, unknown_share=np.zeros(NUM)),
-        "between": {"unbounded": np.zeros(NUM - 1), "surface": np.full(NUM, 0.1)},
-        "margin": 0.02,
-        "num_states": NUM,
-        "near": NOTHING_NEAR,
-        "unwatched": (),
-        "overtaken": (),
-        "map_age_s": np.zeros(NUM),
-        "events": [],
-        "lead_in_s": 0.0,
-        "num_before_scene": 0,
-        "map_error": None,
-        "closed_loop": None,
+def judged(
+    columns: Mapping[str, Any] | None = None,
+    *,
+    figures: Mapping[str, Any] | None = None,
+    metrics: Mapping[str, float | None] | None = None,
+    margin: float = 0.02,
+    request: Mapping[str, Any] | None = None,
+    **replay: Any,
+) -> Judged:
+    """What the criteria look at, of a run with nothing broken but these columns, a scene's figures, and `replay`."""
+    stamps, trace = np.arange(NUM, dtype=np.int64) * 100_000_000, Trace()
+    safe = dict.fromkeys(("unknown_share", "unbounded_s", "map_age_s", "is_blank"), np.zeros(NUM))
+    surface = {"clearance_surface": np.full(NUM, 0.1)}
+    trace.append({"stamp_ns": stamps, **safe, **surface, **NOTHING_NEAR, **(columns or {})})
+    config = Config(control=ControlConfig(margin=margin))
+    nothing: Any = None
+    run: dict[str, Any] = {
+        **{"model": nothing, "config": config, "mode": "audit", "fields": (), "trace": trace},
+        **{"num_before_scene": 0, "lead_in_s": 0.0, "median_radius": 0.0, "start_time_s": 0.0, "statics": {}},
+        **{"static_violations": (), "unwatched": (), "overtaken": (), "closest": {}},
     }
-    return SimpleNamespace(
-        replay=SimpleNamespace(**run | replay),
-        request=SimpleNamespace(
-            max_map_age=1.0,
-            max_unknown=0.05,
-            require_proof=False,
-            unseen="judge",
-            config=Config(),
-            field=None,
-            follow=True,
-            twist_topic=None,
-        ),
-        inputs=SimpleNamespace(source=SimpleNamespace(loss=SimpleNamespace(conflicting_states=0), has_clock=True)),
-        metrics={"unknown_share": 0.0, "num_scene_hits": 0},
-        past_end_s=0.0,
+    states = StateColumns(stamp_ns=stamps, position=np.zeros((NUM, 0)), velocity=np.zeros((NUM, 0)))
+    scene = KnownScene(
+        at=nothing, observed=None, first_ns=None, cameras=None, digests={}, figures=lambda: figures or {}
+    )
+    source = FakeSource(states=())
+    return Judged(
+        request=ReplayRequest(log=Path(), out=Path(), config=config, **(request or {})),
+        inputs=ReplayInputs(source=source, states=states, model=nothing, scene=scene, truth=None, digests={}),
+        logged=LoggedStates(source=source, states=states, poses=None),
+        replay=Replay(**run | replay),
+        metrics={"unknown_share": 0.0, "num_scene_hits": 0, **(metrics or {})},
     )
 
 
@@ -66,18 +84,16 @@ def outcomes(criterion: Callable[[Any], Iterator[Reason]], of: Any) -> list[Outc
     return [reason.outcome for reason in criterion(of)]
 
 
-def event(kind: EventKind) -> SimpleNamespace:
-    return SimpleNamespace(
-        kind=kind, source="", first_ns=0, start_s=0.2, end_s=0.4, worst_s=0.3, worst=1.5, worst_name="", obstacle=None
-    )
+def event(kind: EventKind) -> Event:
+    (found,) = events_of(np.arange(3), [Signal(kind=kind, is_on=np.ones(3, bool), value=np.full(3, 1.5))])
+    return found
 
 
 @pytest.mark.parametrize(("residual", "outcome"), [(4.9, Outcome.PASSED), (5.1, Outcome.NOT_EVALUABLE)])
 def test_a_robot_seen_off_where_its_joints_put_it_is_no_evidence(residual: float, outcome: Outcome) -> None:
-    run = judged()
     links = {"hand": {"median_mm": -residual, "sign": -1, "num_pixels": 500}}
-    run.inputs.scene = SimpleNamespace(figures=lambda: {"self_mask_residual_mm": residual, "self_mask": links})
-    (reason,) = evidence.calibration(run)
+    figures = {"self_mask_residual_mm": residual, "self_mask": links}
+    (reason,) = evidence.calibration(judged(figures=figures))
     assert reason.outcome is outcome
     assert outcome is Outcome.PASSED or (reason.who, reason.count) == ("hand", 500)
 
@@ -85,37 +101,35 @@ def test_a_robot_seen_off_where_its_joints_put_it_is_no_evidence(residual: float
 def test_a_link_that_holds_a_thing_is_not_judged_by_the_things_surface() -> None:
     seen = {"median_mm": 2.0, "sign": 1, "num_pixels": 5000, "reach_mm": 12.0}
     finger, few = seen | {"median_mm": -9.0, "sign": -1}, seen | {"median_mm": 30.0, "num_pixels": 99}
-    rows = [SimpleNamespace(self_mask={"arm": seen, "finger": finger, "tip": few}, inside_robot={}, stamp_ns=0)]
-    figures = self_mask_metrics(cast("list[AuditRow]", rows), {"finger"})
+    rows: list[Any] = [
+        SimpleNamespace(self_mask={"arm": seen, "finger": finger, "tip": few}, inside_robot={}, stamp_ns=0)
+    ]
+    figures = self_mask_metrics(rows, {"finger"})
     assert figures["self_mask_residual_mm"] == 2.0
-    assert self_mask_metrics(cast("list[AuditRow]", rows))["self_mask_residual_mm"] == 9.0
-    run = judged()
-    run.inputs.scene = SimpleNamespace(figures=lambda: figures | {"self_mask_residual_mm": 6.0})
-    (reason,) = evidence.calibration(run)
+    assert self_mask_metrics(rows)["self_mask_residual_mm"] == 9.0
+    (reason,) = evidence.calibration(judged(figures=figures | {"self_mask_residual_mm": 6.0}))
     assert reason.who == "arm"
 
 
 @pytest.mark.parametrize(("sigma", "is_off"), [(0.9, True), (1.1, False)])
 def test_a_camera_that_sees_the_robot_elsewhere_is_no_evidence(sigma: float, is_off: bool) -> None:
-    run = judged()
     rows = {
         "left": {"distance_mm": 6.0, "sigma_mm": sigma, "num_pixels": 2000},
         "right": {"distance_mm": 0.3, "sigma_mm": 0.2, "num_pixels": 4000},
     }
-    run.inputs.scene = SimpleNamespace(figures=lambda: {"displaced_cameras": rows})
-    found = list(evidence.calibration(run))
+    found = list(evidence.calibration(judged(figures={"displaced_cameras": rows})))
     assert [(r.outcome, r.who, r.count) for r in found] == [(Outcome.NOT_EVALUABLE, "left", 2000)] * is_off
 
 
 @pytest.mark.parametrize("what", ["relaxed", "minimum_violation", "hold"])
 def test_a_step_of_any_kind_that_is_not_solved_fails_the_controller(what: str) -> None:
-    run = judged(closed_loop=SimpleNamespace(steps=[None] * 5), events=[event(EventKind(what.replace("_", "-")))])
-    run.metrics |= {f"num_{name}": 0 for name in ("relaxed", "minimum_violation", "hold")} | {f"num_{what}": 2}
+    happened = (event(EventKind(what.replace("_", "-"))),)
+    run = judged(closed_loop=FIVE_STEPS, events=happened, metrics=CONTROLLER | {f"num_{what}": 2})
     (reason,) = controller(run)
     assert reason.outcome is Outcome.FAILED and f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
 
 
-def bodied(deficit: tuple[float, float], surface: float) -> Any:
+def bodied(deficit: tuple[float, float], surface: float) -> Judged:
     """A run whose spheres keep 30 mm and whose surface keeps less, by two spheres of which each leaves something."""
     model = SimpleNamespace(
         moving_spheres=np.array([True, True]),
@@ -123,11 +137,8 @@ def bodied(deficit: tuple[float, float], surface: float) -> Any:
         coverage=None,
         coverage_unknown="no meshes",
     )
-    between = {"surface": np.full(NUM, surface), "lower": np.full(NUM - 1, surface)}
-    run = judged(model=model, margin=0.02, between=between)
-    run.replay.audit.clearance = {"exact": np.full(NUM, 0.03)}
-    run.threshold = 0.019
-    return run
+    columns = {"clearance_surface": np.full(NUM, surface), "clearance_between": np.full(NUM, surface)}
+    return judged(columns | {"clearance_exact": np.full(NUM, 0.03)}, fields=("exact",), model=model)
 
 
 @pytest.mark.parametrize(("surface", "outcome"), [(0.015, Outcome.NOT_EVALUABLE), (0.025, Outcome.PASSED)])
@@ -143,23 +154,26 @@ def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
 
 def test_one_state_judged_by_an_old_map_is_enough() -> None:
     ages = np.array([0.1] * 10 + [1.5])
-    assert outcomes(evidence.map_age, judged(map_age_s=ages, events=[event(EventKind.STALE_MAP)])) == [
-        Outcome.NOT_EVALUABLE
-    ]
+    run = judged({"map_age_s": ages}, events=(event(EventKind.STALE_MAP),))
+    assert outcomes(evidence.map_age, run) == [Outcome.NOT_EVALUABLE]
 
 
 def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
-    near = NOTHING_NEAR | {"age": np.full(NUM, 1.5)}
-    assert outcomes(evidence.evidence_age, judged(near=near)) == [Outcome.NOT_EVALUABLE]
+    assert outcomes(evidence.evidence_age, judged({"evidence_age": np.full(NUM, 1.5)})) == [Outcome.NOT_EVALUABLE]
 
 
 def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:
-    run = judged()
-    there, blank = np.full(NUM, 0.2), np.full(NUM, 0.2)
+    there, blank, nowhere = np.full(NUM, 0.2), np.full(NUM, 0.2), np.full(NUM, -1)
     blank[3] = np.nan
     for fields in ((there, blank), (blank, there)):
-        run.replay.audit.clearance = dict(zip("ab", fields, strict=True))
-        (reason,) = evidence.judged_time(run)
+        part = AuditTrace(
+            stamp_ns=np.arange(NUM),
+            position=np.zeros((NUM, 0)),
+            clearance={name: Clearance(distance=d, sphere=nowhere) for name, d in zip("ab", fields, strict=True)},
+            **dict.fromkeys(("limit_margin", "self_clearance", "unknown_share"), there),
+            **dict.fromkeys(("limit_joint", "self_pair"), nowhere),
+        )
+        (reason,) = evidence.judged_time(judged({"is_blank": audit_columns(part, (), (), ())["is_blank"]}))
         assert (reason.outcome, reason.time_s) == (Outcome.NOT_EVALUABLE, pytest.approx(0.3))
 
 
@@ -170,15 +184,13 @@ def test_a_lead_in_longer_than_is_allowed_is_not_judged(share: float) -> None:
 
 
 def test_space_that_was_not_recorded_is_not_known() -> None:
-    run = judged()
-    run.metrics["unknown_share"] = None
-    assert outcomes(evidence.known_space, run) == [Outcome.NOT_EVALUABLE]
+    assert outcomes(evidence.known_space, judged(metrics={"unknown_share": None})) == [Outcome.NOT_EVALUABLE]
 
 
 @pytest.mark.parametrize(("miss", "outcome"), [(0.09, Outcome.PASSED), (0.11, Outcome.NOT_EVALUABLE)])
 def test_the_surface_must_keep_the_whole_map_error(miss: float, outcome: Outcome) -> None:
     bound = ConformalBound(bound=miss, confidence=0.9, num_stretches=9, length=1, at=0)
-    found = SimpleNamespace(bound=bound, num_points=5, time_s=0.1, place=None, source="cam3")
+    found = MapError(source="cam3", num_sets=9, num_seen=9, num_points=5, bound=bound, time_s=0.1)
     assert outcomes(evidence.map_error, judged(map_error=found)) == [outcome]
 
 
@@ -191,14 +203,14 @@ def near_a(kind: EvidenceClass, distance: float) -> dict[str, Any]:
     nearest, places = np.full((NUM, len(EVIDENCE)), np.inf), np.zeros((NUM, 3 * len(EVIDENCE)))
     nearest[4, kind] = distance
     places[4, 3 * kind : 3 * kind + 3] = 0.25
-    return NOTHING_NEAR | {"nearest": nearest, "places": places}
+    return {"class_distance": nearest, "class_places": places}
 
 
 def from_a_surface(column: str, distance: float) -> dict[str, Any]:
     """At one state unseen space is so far [m] from a surface of the map."""
     near = np.where(np.arange(NUM) == 4, distance, np.inf)
     place = {f"{column}_to_surface_place": np.full((NUM, 3), 0.25)}
-    return NOTHING_NEAR | {f"{column}_to_surface": near} | place
+    return {f"{column}_to_surface": near} | place
 
 
 @pytest.mark.parametrize(
@@ -215,7 +227,7 @@ def from_a_surface(column: str, distance: float) -> dict[str, Any]:
 def test_a_place_of_which_too_little_is_known_near_the_arm_is_no_evidence(
     near: Callable[[float], dict[str, Any]], distance: float, count: int
 ) -> None:
-    run = judged(near=near(distance))
+    run = judged(near(distance))
     found = [r for r in evidence.known_space(run) if r.outcome is Outcome.NOT_EVALUABLE]
     assert [r.count for r in found] == [1] * count
     assert not found or (found[0].time_s, found[0].place) == (pytest.approx(0.4), (0.25, 0.25, 0.25))
@@ -224,7 +236,7 @@ def test_a_place_of_which_too_little_is_known_near_the_arm_is_no_evidence(
 
 @pytest.mark.parametrize("kind", STRICT)
 def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(kind: EvidenceClass) -> None:
-    run = judged(margin=0.0, near=near_a(kind, 0.0))
+    run = judged(near_a(kind, 0.0), margin=0.0)
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
 
 
@@ -232,21 +244,27 @@ def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(kind: Ev
 @pytest.mark.parametrize(("more", "count"), [(-0.01, 0), (0.01, 1)])
 def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, more: float, count: int) -> None:
     share = np.where(np.arange(NUM) == 4, allowed + more, 0.1)
-    run = judged(near=NOTHING_NEAR | {column: share})
+    run = judged({column: share})
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
 
 
 @pytest.mark.parametrize("kind", [kind for kind in EvidenceClass if kind not in STRICT])
 @pytest.mark.parametrize(("option", "broken"), [("require_proof", Outcome.NOT_EVALUABLE), ("unseen", Outcome.FAILED)])
 def test_only_free_space_about_the_arm_is_proof(option: str, broken: Outcome, kind: EvidenceClass) -> None:
-    run = judged(near=near_a(kind, 0.01) | {"assumed": np.zeros(NUM)})
-    assert set(outcomes(evidence.known_space, run)) == {Outcome.PASSED}
-    setattr(run.request, option, "occupied")
+    columns = near_a(kind, 0.01) | {"assumed": np.zeros(NUM)}
+    assert set(outcomes(evidence.known_space, judged(columns))) == {Outcome.PASSED}
+    run = judged(columns, request={option: "occupied"})
     assert (broken in outcomes(evidence.known_space, run)) == (kind is not EvidenceClass.FREE)
 
 
 @pytest.mark.parametrize("option", ["require_proof", "unseen"])
 def test_what_is_not_recorded_is_no_proof(option: str) -> None:
-    run = judged(near=near_a(EvidenceClass.FREE, 0.01))
-    setattr(run.request, option, "occupied")
+    run = judged(near_a(EvidenceClass.FREE, 0.01), request={option: "occupied"})
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
+
+
+def test_cells_of_a_state_without_a_step_are_empty() -> None:
+    never = {"q": np.zeros((NUM, 0)), "limit_margin": np.full(NUM, np.nan)}
+    cells = columns_of(judged(never | step_columns([None] * NUM, 0), model=SimpleNamespace(joint_names=())).replay)
+    assert {name for name, values in cells.items() if values == [""] * NUM} >= {"rung", "scale", "num_rows", "slack"}
+    assert "" not in cells["limit_margin"]

@@ -116,10 +116,10 @@ def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_c
     )
     record = ReplayRecord(model, scene, config=Config(), max_map_age=1.0, is_continuous=is_continuous)
     record.measured(np.array([0, SECOND // 10]), np.array([q - turn, q + turn]), np.zeros((2, 7)))
-    first, second = record.near["nearest"][:, EvidenceClass.DEPTH_EDGE]
+    first, second = record.trace["class_distance"][:, EvidenceClass.DEPTH_EDGE]
     assert first > 0.02
     assert (second == 0.0) if is_continuous else (second > 0.02)
-    place = record.near["places"][1].reshape(-1, 3)[EvidenceClass.DEPTH_EDGE]
+    place = record.trace["class_places"][1].reshape(-1, 3)[EvidenceClass.DEPTH_EDGE]
     assert np.isinf(second) or place == pytest.approx(edge)
 
 
@@ -144,8 +144,8 @@ def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measur
     record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
     record.measured(np.array([0]), q, np.zeros((1, 7)))
     gap = model.surface_gaps(q, scene.centers, scene.radii)[link][0]
-    assert record.audit.clearance["exact"][0] == pytest.approx(gap)
-    assert record.between["surface"][0] == pytest.approx(gap)
+    assert record.trace["clearance_exact"][0] == pytest.approx(gap)
+    assert record.trace["clearance_surface"][0] == pytest.approx(gap)
 
 
 def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> None:
@@ -174,7 +174,7 @@ def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> Non
     robots = (base, model.at(SECOND // 2))
     alone, holding = (robot.surface_gaps(q[None], scene.centers, scene.radii)[link][0] for robot in robots)
     assert holding == pytest.approx(0.17, abs=2e-3) and alone > 0.2
-    assert np.asarray(record.audit.clearance["exact"]) == pytest.approx([alone] * 3 + [holding] * 3 + [alone] * 2)
+    assert record.trace["clearance_exact"] == pytest.approx([alone] * 3 + [holding] * 3 + [alone] * 2)
     posture = posture_of(model, q, dict.fromkeys(stamps.tolist(), q))
     counts = [len(posture.seen_at(stamp)[0].triangles) for stamp in stamps.tolist()]
     faces = len(ball.triangles)

@@ -3,7 +3,6 @@
 import json
 import re
 from argparse import Namespace
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,10 @@ import pytest
 import trimesh
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.files import spilled_rows
 from splatctrl_cli.geometry import transform_points
-from splatctrl_cli.jobs.replay import files, state_pass, state_store
+from splatctrl_cli.jobs.replay import files, state_pass
 from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, doubts_of, measured_robot
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.recording.log import state_columns
@@ -231,7 +229,7 @@ def test_blocks_of_any_size_give_the_same_files(
     truth = ("--truth", str(desk.folder / "truth.json"))
     more = {"audit": truth, "open-loop": (), "closed-loop": ("--follow",)}[mode]
     for num in (1, 7, 10_000):
-        for module in (files, state_pass, state_store, spilled_rows, state_columns):
+        for module in (files, state_pass, spilled_rows, state_columns):
             monkeypatch.setattr(module, "BLOCK", num)
         assert desk.replay("--scene", str(scene), "-q", "--mode", mode, *more, out=str(num)) == 0
     for file in FILES:
@@ -239,32 +237,8 @@ def test_blocks_of_any_size_give_the_same_files(
         assert all((desk.folder / out / file).read_bytes() == whole for out in ("1", "7")), file
 
 
-def signals(values: Sequence[float], names: Sequence[str]) -> list[Signal]:
-    value = np.array(values)
-    low = Signal(
-        kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, names=lambda i: [names[i]], is_high_worse=False
-    )
-    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, names=lambda i: [names[i]])]
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 5, 12])
-def test_an_event_that_crosses_blocks_is_one(size: int) -> None:
-    values = [0.5, 0.2, 0.9, 0.2, 3.0, 4.0, 4.0, 1.5, 0.1, 5.0, 5.0, 0.3]
-    names = list("abacddefghij")
-    stamps = np.arange(12, dtype=np.int64) * 1_000_000
-    fold = EventFold()
-    for first in range(0, 12, size):
-        part = slice(first, first + size)
-        fold.add(stamps[part], signals(values[part], names[part]))
-    found = fold.events()
-    assert found == events_of(stamps, signals(values, names))
-    first = found[0]
-    assert (first.num_states, first.worst, first.state, first.worst_name) == (4, 0.2, 1, "b")
-    assert first.names == ("a", "b", "c") and [event.num_states for event in found] == [4, 3, 1, 2, 1]
-
-
 def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None:
-    stored: state_store.StoredObjects[int] = state_store.StoredObjects()
+    stored: spilled_rows.ObjectFile[int] = spilled_rows.ObjectFile()
     for block in ([0, 1], [], [2, 3, 4], [5]):
         stored.extend(block)
     whole = list(range(6))
