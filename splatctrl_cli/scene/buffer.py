@@ -134,10 +134,15 @@ class SplatBuffer:
         self.moments.num_steps[slots] = 0
         self.num_uncertain[slots] = 0
 
-    def splats(self, num_threads: int) -> SplatSet:
-        """Live splats, in slot order."""
+    @property
+    def is_mapped(self) -> Bool:
+        """Live slots (M,), without the backdrop."""
+        return np.asarray(self.is_alive & (self.labels != Label.BACKDROP))
+
+    def splats(self, num_threads: int, slots: Bool | None = None) -> SplatSet:
+        """Splats of `slots` (M,), by default `is_mapped`, in slot order."""
         centers, radii, colors, opacities = unpack_parameters(self.parameters, num_threads)
-        alive = self.is_alive
+        alive = self.is_mapped if slots is None else slots
         return SplatSet(
             centers=centers[alive],
             radii=radii[alive],

@@ -12,6 +12,7 @@ from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
+from splatctrl_cli.scene.backdrop import backdrop_seeds
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.contradicted import mask_frames, take_in_evidence
@@ -66,6 +67,7 @@ class SceneFitter:
         threads: int = 0,
         device: DeviceFit | None = None,
         has_shell: bool = False,
+        has_backdrop: bool = False,
     ) -> None:
         check_voxel(config, occupancy)
         self.config = config
@@ -79,6 +81,7 @@ class SceneFitter:
         self.people = PeopleMemory((human or HumanConfig()).memory)
         self.window = Window(config)
         self.shell = Shell(config, occupancy, workspace, seed, self.num_threads) if has_shell else None
+        self.has_backdrop = has_backdrop
         self.num_steps = 0
         self.density: SeedDensity | None = None  # chosen by the first time step with seeds
         self.posture: RobotPosture | None = None
@@ -116,6 +119,8 @@ class SceneFitter:
         self._carry(robot)
         removed = self._remove(self._relabel(robot, seen), self._floating(views))
         filled = self._seed(views, masks)
+        if self.has_backdrop and not self.num_steps:
+            filled += self._seed_backdrop(views)
         is_first = self.descent.num_iterations == 0 and bool(self.buffer.is_alive.any())
         self.window.advance(views)
         self.descent.keep([*self.window.newest, *self.window.keyframes])
@@ -187,8 +192,11 @@ class SceneFitter:
         return self.buffer.splats(self.num_threads)
 
     def shell_splats(self) -> SplatSet | None:
-        """Splats beyond the workspace, for pictures only; None without a shell."""
-        return None if self.shell is None else self.shell.splats()
+        """Splats for pictures only: the shell beyond the workspace, or the backdrop; None without any."""
+        if self.shell is not None:
+            return self.shell.splats()
+        found = self.buffer.splats(self.num_threads, self._standing_for(Label.BACKDROP))
+        return replace(found, labels=np.zeros_like(found.labels)) if len(found) else None
 
     @property
     def unrepresented(self) -> Balls:
@@ -254,7 +262,7 @@ class SceneFitter:
 
     def _floating(self, views: Sequence[View]) -> Bool:
         is_floating = np.zeros(len(self.buffer.centers), bool)
-        for label in (Label.OBJECT, Label.ROBOT):
+        for label in (Label.OBJECT, Label.ROBOT, Label.BACKDROP):
             slots = np.flatnonzero(self._standing_for(label))
             is_floating[slots] = ~self._is_grounded(self.buffer.centers[slots], views, label)
         return is_floating
@@ -267,7 +275,7 @@ class SceneFitter:
         buffer = self.buffer
         removed["robot"] += buffer.kill(self._relabel(robot, seen))
         removed["seen_through"] += buffer.kill(self._floating(views))
-        removed["workspace"] += buffer.kill(buffer.is_alive & ~self.workspace.contains(buffer.centers))
+        removed["workspace"] += buffer.kill(buffer.is_mapped & ~self.workspace.contains(buffer.centers))
         removed["opacity"] += buffer.kill(buffer.is_alive & (buffer.opacities < self.config.min_opacity))
 
     def _remove(self, is_trail: Bool, is_floating: Bool, *, counts_time: bool = True) -> dict[str, int]:
@@ -320,6 +328,12 @@ class SceneFitter:
             filled += self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve, label=label)
         return filled
 
+    def _seed_backdrop(self, views: Sequence[View]) -> Filled:
+        opacities = [self.descent.rendering(view).opacity for view in views]
+        most = min(int(self.config.shell * self.config.max_splats), int((~self.buffer.is_alive).sum()))
+        seeds = backdrop_seeds([view.frame for view in views], opacities, self.descent.background or BLACK, most)
+        return self.buffer.fill(seeds, self.config.initial_opacity, label=Label.BACKDROP)
+
     def _fill_gaps(
         self,
         views: Sequence[View],
@@ -335,7 +349,7 @@ class SceneFitter:
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
-            splats = self.splats().select(self._standing_for(label)[self.buffer.is_alive])
+            splats = self.buffer.splats(self.num_threads, self._standing_for(label))
             bare = np.zeros((0, 3), np.float32)
             if label == Label.OBJECT:
                 bare = bare_voxels(self.occupancy, splats, self.workspace, self.config, half)
@@ -361,8 +375,9 @@ class SceneFitter:
         return filled
 
     def _standing_for(self, label: Label) -> Bool:
-        is_robot: Bool = self.buffer.labels == Label.ROBOT
-        return self.buffer.is_alive & (is_robot if label == Label.ROBOT else ~is_robot)
+        """Live splats (M,) of a label; people count as objects."""
+        labels = np.where(self.buffer.labels == Label.HUMAN, np.uint8(Label.OBJECT), self.buffer.labels)
+        return np.asarray(self.buffer.is_alive & (labels == label))
 
     def _show_contact(
         self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, steady: Sequence[Bool]
@@ -377,7 +392,7 @@ class SceneFitter:
         slots = np.flatnonzero(is_object)
         is_near = robot.distance_to_moving(self.buffer.centers[slots]) < fixed.CONTACT_REACH
         self.buffer.set_radius(slots[is_near], radius)
-        splats = self.splats().select(is_object[self.buffer.is_alive])
+        splats = self.buffer.splats(self.num_threads, is_object)
         mappable = [view.mappable & pixels for view, pixels in zip(views, steady, strict=True)]
         seeds = contact_seeds(
             seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
@@ -433,7 +448,7 @@ class SceneFitter:
         return AuditRow(
             stamp_ns=max(view.frame.stamp_ns for view in views),
             cameras=tuple(view.frame.camera for view in views),
-            alive=int(buffer.is_alive.sum()),
+            alive=int(buffer.is_mapped.sum()),
             dead=int((buffer.was_used & ~buffer.is_alive).sum()),
             added=filled.added,
             relocated=filled.relocated,

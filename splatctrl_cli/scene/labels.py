@@ -30,6 +30,7 @@ def relabel(
     else:
         is_robot, is_shown = robot_splats(buffer, occupancy, robot, seen)
         labels[is_robot] = Label.ROBOT
+    labels[buffer.labels == Label.BACKDROP] = Label.BACKDROP
     was_robot = buffer.labels == Label.ROBOT
     is_trail: Bool = (buffer.labels != Label.OBJECT) & (labels == Label.OBJECT) & ~(was_robot & is_shown)
     turned = np.flatnonzero(was_robot & is_shown & (labels != Label.ROBOT))

@@ -60,7 +60,7 @@ def removals(
         buffer.num_uncertain[:] = np.where(is_uncertain, buffer.num_uncertain + 1, 0)
     masks = {
         "broken": is_broken,
-        "workspace": ~workspace.contains(centers),
+        "workspace": buffer.is_mapped & ~workspace.contains(centers),
         "opacity": buffer.opacities < min_opacity,
         "free": is_free,
         "seen_through": is_floating,
@@ -86,7 +86,7 @@ def room_for(
     Only object splats go: redundant ones that show least, then, for seeds near the robot's path, far ones. shown
     (M,): by slot; tolerance [m]: of `find_redundant`.
     """
-    splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
+    splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_mapped)
     stands = splats.labels != Label.ROBOT
     others, may_go = live[stands], live[splats.labels == Label.OBJECT]
     weakest = may_go[np.argsort(shown[may_go], kind="stable")][: fixed.EVICT_ASKED * num]
