@@ -15,8 +15,16 @@ from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Color
 from splatctrl_cli.scene.seeding import NO_SEEDS
 
-RADIUS = 0.6  # of a seed, in cells
-BLOCKS = (4, 2, 1)  # cells along the side of a seed's square, while its colours are alike
+COLUMNS = (60, 48, 40, 32, 26, 22, 18, 15)  # cells across an image: the first for which seeds are few enough
+BLOCKS = (4, 2, 1)  # cells along the side of a seed's square, if its colours are alike
+RADIUS = 0.6  # of a seed, in sides of its square
+DEPTHS = (0.5, 10.0)  # times the median depth, between which seeds are placed
+NUM_DEPTHS = 40  # evenly in inverse depth
+ASKED_VIEWS = 16  # views that compare their colour with a seed's
+SAME_COLOR, OTHER_COLOR = 0.03, 0.1  # mean difference of channels in [0, 1]
+NEAR_DEPTH = 0.03  # share of a measured depth, before or behind which a seed is off that surface
+LEAST_VOTES = 1.0  # one full vote: a near place needs two views
+BLANK = 0.02  # share of a cell's pixels with depth
 
 
 def backdrop_seeds(frames: Sequence[RgbdFrame], opacities: Sequence[Float32], background: Color, most: int) -> Seeds:
@@ -27,25 +35,26 @@ def backdrop_seeds(frames: Sequence[RgbdFrame], opacities: Sequence[Float32], ba
     depth = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     if not len(depth):
         return NO_SEEDS
-    nearest, farthest = np.multiply(fixed.BACKDROP_DEPTHS, float(np.median(depth)))
-    depths = 1 / np.linspace(1 / farthest, 1 / nearest, fixed.BACKDROP_PLANES)
-    found = NO_SEEDS
-    for columns in fixed.BACKDROP_COLUMNS:
+    nearest, farthest = np.multiply(DEPTHS, float(np.median(depth)))
+    depths = 1 / np.linspace(1 / farthest, 1 / nearest, NUM_DEPTHS)
+    for columns in COLUMNS:
         cells = [_Cells(frame, opacity, columns) for frame, opacity in zip(frames, opacities, strict=True)]
         found = NO_SEEDS
         for one in cells:
-            found = found.joined(_seeds_of(one, cells, found, np.array(background, np.float32), depths))
-            if len(found) > most:
-                break
+            if len(found) <= most:
+                found = found.joined(_seeds_of(one, cells, found, np.array(background, np.float32), depths))
         if len(found) <= most:
-            break
-    return found.select(np.arange(min(len(found), most)))
+            return found
+    return found.select(np.arange(most))
 
 
 def _seeds_of(one: "_Cells", cells: Sequence["_Cells"], found: Seeds, background: Float32, depths: Float64) -> Seeds:
-    """Seeds of cells that `found` does not cover, each at the depth (D,) [m] where most views agree."""
+    """Seeds of cells that `found` does not cover.
+
+    They lie at that of `depths` (D,) [m] where most views agree, else at the first.
+    """
     is_missing = one.is_blank & ~one.covered(found)
-    is_missing &= np.abs(one.color - background).mean(axis=2) > fixed.BACKDROP_ALIKE
+    is_missing &= np.abs(one.color - background).mean(axis=2) > SAME_COLOR
     v, u, size, color = (np.concatenate(parts) for parts in zip(*one.squares(is_missing), strict=True))
     if not len(v):
         return NO_SEEDS
@@ -54,12 +63,13 @@ def _seeds_of(one: "_Cells", cells: Sequence["_Cells"], found: Seeds, background
     points = transform_points(one.frame.T_world_camera, (rays[:, None] * depths[:, None]).reshape(-1, 3))
     colors = np.repeat(color, len(depths), axis=0)
     votes = np.zeros(len(points))
-    for other in cells[:: max(len(cells) // fixed.BACKDROP_ASKED, 1)]:
+    for other in cells[:: max(len(cells) // ASKED_VIEWS, 1)]:
         if other is not one:
             difference, counts = other.compare(points, colors)
-            votes += counts * (1 - difference / fixed.BACKDROP_CONTRAST)
+            votes += counts * (1 - difference / OTHER_COLOR)
     votes = votes.reshape(len(v), -1)
-    best = np.argmax(votes, axis=1)  # the farthest of the best
+    is_agreed = votes.max(axis=1) > LEAST_VOTES
+    best = np.where(is_agreed, np.argmax(votes, axis=1), 0)  # the farthest of the best
     return Seeds(
         centers=points.reshape(*votes.shape, 3)[np.arange(len(v)), best].astype(np.float32),
         radii=(RADIUS * size * depths[best] / k.fx).astype(np.float32),
@@ -75,7 +85,7 @@ class _Cells:
         has_depth, is_open = self._mean(frame.depth > 0), self._mean(opacity) < fixed.OPAQUE_ENOUGH
         self.color = self._mean(frame.color).astype(np.float32) / 255
         self.depth = self._mean(frame.depth) / np.maximum(has_depth, 1e-9)
-        self.is_blank = (has_depth < fixed.BACKDROP_BLANK) & is_open & (self._mean(frame.in_view) == 1)
+        self.is_blank = (has_depth < BLANK) & is_open & (self._mean(frame.in_view) == 1)
         self.T_camera_world = invert_transform(frame.T_world_camera)
 
     def _mean(self, image: NDArray[np.generic]) -> Float64:
@@ -90,7 +100,7 @@ class _Cells:
             part = np.s_[: h * block, : w * block]
             shape = (h, block, w, block)
             color = self.color[part].reshape(*shape, 3)
-            is_alike = np.ptp(color, axis=(1, 3)).max(axis=2) < 3 * fixed.BACKDROP_ALIKE
+            is_alike = np.ptp(color, axis=(1, 3)).max(axis=2) < OTHER_COLOR
             chosen = is_missing[part].reshape(shape).all(axis=(1, 3)) & (is_alike | (block == 1))
             v, u = np.nonzero(chosen)
             is_missing[part] &= ~np.kron(chosen, np.ones((block, block), bool))
@@ -107,13 +117,13 @@ class _Cells:
         """Cells (h, w) behind a seed of their colour."""
         found = np.zeros(self.depth.shape, bool)
         u, v, z = self._locate(seeds.centers)
-        reach = np.maximum(seeds.radii * self.frame.intrinsics.fx / (2 * RADIUS * self.side) / z, 0.5) + 0.01
-        h, w = found.shape
+        half = seeds.radii * self.frame.intrinsics.fx / (2 * RADIUS * self.side) / np.maximum(z, 1e-6)
+        reach, (h, w) = np.maximum(half, 0.5) + 0.01, found.shape
         for n in np.flatnonzero((z > 0) & (u > -reach) & (u < w + reach) & (v > -reach) & (v < h + reach)):
             rows, columns = (
                 slice(max(int(np.ceil(at[n] - reach[n])), 0), max(int(at[n] + reach[n]) + 1, 0)) for at in (v, u)
             )
-            found[rows, columns] |= np.abs(self.color[rows, columns] - seeds.colors[n]).mean(axis=2) < 0.1
+            found[rows, columns] |= np.abs(self.color[rows, columns] - seeds.colors[n]).mean(axis=2) < OTHER_COLOR
         return found
 
     def compare(self, points: Float64, colors: Float32) -> tuple[Float64, Bool]:
@@ -123,7 +133,7 @@ class _Cells:
         is_in = (z > 0) & (u > -0.5) & (v > -0.5) & (u < w - 0.5) & (v < h - 0.5)
         at = np.where(is_in, np.round(v) * w + np.round(u), 0).astype(np.intp)
         depth = self.depth.ravel()[at]
-        is_before = (depth > 0) & (z < (1 - fixed.BACKDROP_ALIKE) * depth)
-        is_behind = (depth > 0) & (z > (1 + fixed.BACKDROP_ALIKE) * depth)
+        is_before = (depth > 0) & (z < (1 - NEAR_DEPTH) * depth)
+        is_behind = (depth > 0) & (z > (1 + NEAR_DEPTH) * depth)
         difference = np.abs(self.color.reshape(-1, 3)[at] - colors).mean(axis=1)
         return np.where(is_before, 1.0, difference), np.asarray(is_in & ~is_behind)

@@ -5,8 +5,9 @@ import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.geometry import back_project_pixels, project, transform_points
-from splatctrl_cli.records import Box, Float64, Intrinsics, Label, RgbdFrame
+from splatctrl_cli.records import Box, Intrinsics, Label, RgbdFrame
 from splatctrl_cli.scene.backdrop import backdrop_seeds
+from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.render import BLACK
@@ -41,26 +42,24 @@ def views() -> list[RgbdFrame]:
     return [view(x, n) for n, x in enumerate(np.linspace(-0.3, 0.3, 7))]
 
 
-def seeds_of(frames: list[RgbdFrame], most: int = MOST, shown: float = 0.0) -> Float64:
-    seeds = backdrop_seeds(frames, [np.full(f.depth.shape, shown, np.float32) for f in frames], BLACK, most)
-    assert len(seeds.radii) == len(seeds.colors) == len(seeds.centers)
-    return seeds.centers.astype(np.float64)
+def seeds_of(frames: list[RgbdFrame], most: int = MOST, shown: float = 0.0) -> Seeds:
+    """Seeds before a black background, where the map shows `shown` of each pixel."""
+    return backdrop_seeds(frames, [np.full(f.depth.shape, shown, np.float32) for f in frames], BLACK, most)
 
 
 def test_seeds_lie_where_the_views_agree() -> None:
-    """To a plane or two of the sweep; the background explains black tiles."""
-    centers = seeds_of(views(), 3000)
-    centers = centers[np.abs(centers[:, 0]) < 0.5]  # in all views
-    assert len(centers) > 100
-    assert np.mean(np.abs(centers[:, 2] - WALL) < 0.3) > 0.8
-    row = np.floor(centers[:, 1] / TILE).astype(int) + 32
-    assert np.mean(row % 3 == 0) < 0.1
+    """To a plane of the sweep; the background explains black tiles."""
+    seeds = seeds_of(views(), 3000)
+    z = seeds.centers[np.abs(seeds.centers[:, 0]) < 0.5, 2]  # in all views
+    assert len(z) > 100
+    assert np.median(np.abs(z - WALL)) < 0.2
+    assert seeds.colors.mean(axis=1).min() > 0.03
 
 
 def test_no_seed_lies_before_measured_depth() -> None:
     frames = views()
     for frame in frames:
-        local = transform_points(np.linalg.inv(frame.T_world_camera), seeds_of(frames))
+        local = transform_points(np.linalg.inv(frame.T_world_camera), seeds_of(frames).centers)
         u, v = np.round(project(LENS, local)).astype(int).T
         is_in = (u >= 0) & (v >= 0) & (u < LENS.width) & (v < LENS.height)
         depth = frame.depth[v[is_in], u[is_in]]
@@ -92,7 +91,7 @@ def test_views_without_any_depth_have_no_scale_to_place_a_backdrop() -> None:
 
 
 def fitted(*, has_backdrop: bool) -> SceneFitter:
-    config = SceneConfig(max_splats=1500, first_iterations=60, refine_iterations=60, window=10)
+    config = SceneConfig(max_splats=1500, first_iterations=60, refine_iterations=60, window=10, shell=0.3)
     fitter = SceneFitter(config, OccupancyConfig(), WORKSPACE, threads=1, has_backdrop=has_backdrop)
     fitter.step(views())
     fitter.refine(60)
@@ -110,7 +109,7 @@ def test_a_backdrop_is_rendered_beside_a_map_that_knows_nothing_of_it() -> None:
     assert set(backdrop.labels.tolist()) == {Label.OBJECT}
     held_out = behind.view(view(0.05))
     errors = [fitter.descent.evaluate(held_out).squared for fitter in (plain, behind)]
-    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < 0.75 * errors[0]
 
 
 def test_a_resumed_fitter_keeps_its_backdrop() -> None:

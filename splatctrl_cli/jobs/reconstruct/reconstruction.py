@@ -385,7 +385,7 @@ class Reconstruction:
             seed=self.request.seed,
             threads=self.request.threads,
             has_shell=self.robot is not None and scene.shell > 0,
-            has_backdrop=self.robot is None and not self.source.has_clock,
+            has_backdrop=self.robot is None and not self.source.has_clock and scene.shell > 0,
         )
 
     def _workspace(self, first: TimeStep) -> Box:
