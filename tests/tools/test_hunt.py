@@ -300,7 +300,8 @@ def test_what_passed_by_a_waiver_is_no_safe_run(how: str, word: str) -> None:
 
 def known_near(**changes: float) -> Any:
     """The account of one state about which all was seen free, with `changes` to its columns."""
-    near = {name: np.full((1, *shape), np.inf if name == "class_distance" else 0.0) for name, shape in NEAR_COLUMNS.items()}
+    near = {name: np.zeros((1, *shape)) for name, shape in NEAR_COLUMNS.items()}
+    near["class_distance"] += np.inf
     far = {name: np.array([np.inf]) for name in near if name.endswith("_to_surface")}
     return near | far | {name: np.array([value]) for name, value in changes.items()}
 
