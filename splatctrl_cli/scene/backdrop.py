@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Floats, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Color
 from splatctrl_cli.scene.seeding import NO_SEEDS
@@ -67,11 +67,11 @@ def _seeds_of(one: "_Cells", cells: Sequence["_Cells"], found: Seeds, background
         if other is not one:
             difference, counts = other.compare(points, colors)
             votes += counts * (1 - difference / OTHER_COLOR)
-    votes = votes.reshape(len(v), -1)
-    is_agreed = votes.max(axis=1) > LEAST_VOTES
-    best = np.where(is_agreed, np.argmax(votes, axis=1), 0)  # the farthest of the best
+    by_depth = votes.reshape(len(v), -1)
+    is_agreed = by_depth.max(axis=1) > LEAST_VOTES
+    best = np.where(is_agreed, np.argmax(by_depth, axis=1), 0)  # the farthest of the best
     return Seeds(
-        centers=points.reshape(*votes.shape, 3)[np.arange(len(v)), best].astype(np.float32),
+        centers=points.reshape(*by_depth.shape, 3)[np.arange(len(v)), best].astype(np.float32),
         radii=(RADIUS * size * depths[best] / k.fx).astype(np.float32),
         colors=color,
     )
@@ -104,21 +104,24 @@ class _Cells:
             chosen = is_missing[part].reshape(shape).all(axis=(1, 3)) & (is_alike | (block == 1))
             v, u = np.nonzero(chosen)
             is_missing[part] &= ~np.kron(chosen, np.ones((block, block), bool))
-            size = float(block * self.side)
-            yield (v + 0.5) * size - 0.5, (u + 0.5) * size - 0.5, np.full(len(v), size), color.mean(axis=(1, 3))[v, u]
+            middles = (np.stack([v, u]) + 0.5) * block * self.side - 0.5
+            means = np.asarray(color.mean(axis=(1, 3))[v, u], np.float32)
+            yield middles[0], middles[1], np.full(len(v), float(block * self.side)), means
 
-    def _locate(self, points: Float64) -> tuple[Float64, Float64, Float64]:
+    def _locate(self, points: Floats) -> tuple[Float64, Float64, Float64]:
         """Columns, rows (K,) in cells, and depths (K,) [m] of points (K, 3) [m], world."""
         local = transform_points(self.T_camera_world, points)
-        u, v = project(self.frame.intrinsics, np.where(local[:, 2:] > 0, local, 1.0)).T
-        return (u + 0.5) / self.side - 0.5, (v + 0.5) / self.side - 0.5, local[:, 2]
+        pixels = project(self.frame.intrinsics, np.where(local[:, 2:] > 0, local, 1.0))
+        cells = (pixels + 0.5) / self.side - 0.5
+        return cells[:, 0], cells[:, 1], local[:, 2]
 
     def covered(self, seeds: Seeds) -> Bool:
         """Cells (h, w) behind a seed of their colour."""
-        found = np.zeros(self.depth.shape, bool)
+        h, w = self.depth.shape
+        found = np.zeros((h, w), bool)
         u, v, z = self._locate(seeds.centers)
         half = seeds.radii * self.frame.intrinsics.fx / (2 * RADIUS * self.side) / np.maximum(z, 1e-6)
-        reach, (h, w) = np.maximum(half, 0.5) + 0.01, found.shape
+        reach = np.maximum(half, 0.5) + 0.01
         for n in np.flatnonzero((z > 0) & (u > -reach) & (u < w + reach) & (v > -reach) & (v < h + reach)):
             rows, columns = (
                 slice(max(int(np.ceil(at[n] - reach[n])), 0), max(int(at[n] + reach[n]) + 1, 0)) for at in (v, u)
