@@ -49,7 +49,6 @@ class Label(IntEnum):
     OBJECT = 0b00
     ROBOT = 0b01
     HUMAN = 0b10
-    BACKDROP = 0b11  # behind what has depth: rendered only
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ from splatctrl_cli.records import (
     Values,
 )
 
+BACKDROP = 0b11  # beside the labels: a slot that is rendered only
 CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
 
 
@@ -92,7 +93,7 @@ class SplatBuffer:
         """Set radii (K,) [m] of slots (K,)."""
         self.parameters[slots, LOG_RADIUS] = np.log(radius)
 
-    def fill(self, seeds: Seeds, opacity: float, keep_free: int = 0, label: Label = Label.OBJECT) -> Filled:
+    def fill(self, seeds: Seeds, opacity: float, keep_free: int = 0, label: int = Label.OBJECT) -> Filled:
         """Put seeds into dead slots, in slot order, with `opacity` and `label`.
 
         The last `keep_free` dead slots stay free. Seeds without a slot are unmet.
@@ -137,7 +138,7 @@ class SplatBuffer:
     @property
     def is_mapped(self) -> Bool:
         """Live slots (M,), without the backdrop."""
-        return np.asarray(self.is_alive & (self.labels != Label.BACKDROP))
+        return np.asarray(self.is_alive & (self.labels != BACKDROP))
 
     def splats(self, num_threads: int, slots: Bool | None = None) -> SplatSet:
         """Splats of `slots` (M,), by default `is_mapped`, in slot order."""

@@ -13,7 +13,7 @@ from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.backdrop import backdrop_seeds
-from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
+from splatctrl_cli.scene.buffer import BACKDROP, Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.contradicted import mask_frames, take_in_evidence
 from splatctrl_cli.scene.descent import Descent
@@ -195,7 +195,7 @@ class SceneFitter:
         """Splats for pictures only: the shell beyond the workspace, or the backdrop; None without any."""
         if self.shell is not None:
             return self.shell.splats()
-        found = self.buffer.splats(self.num_threads, self._standing_for(Label.BACKDROP))
+        found = self.buffer.splats(self.num_threads, self._standing_for(BACKDROP))
         return replace(found, labels=np.zeros_like(found.labels)) if len(found) else None
 
     @property
@@ -262,7 +262,7 @@ class SceneFitter:
 
     def _floating(self, views: Sequence[View]) -> Bool:
         is_floating = np.zeros(len(self.buffer.centers), bool)
-        for label in (Label.OBJECT, Label.ROBOT, Label.BACKDROP):
+        for label in (Label.OBJECT, Label.ROBOT, BACKDROP):
             slots = np.flatnonzero(self._standing_for(label))
             is_floating[slots] = ~self._is_grounded(self.buffer.centers[slots], views, label)
         return is_floating
@@ -332,7 +332,7 @@ class SceneFitter:
         opacities = [self.descent.rendering(view).opacity for view in views]
         most = min(int(self.config.shell * self.config.max_splats), int((~self.buffer.is_alive).sum()))
         seeds = backdrop_seeds([view.frame for view in views], opacities, self.descent.background or BLACK, most)
-        return self.buffer.fill(seeds, self.config.initial_opacity, label=Label.BACKDROP)
+        return self.buffer.fill(seeds, self.config.initial_opacity, label=BACKDROP)
 
     def _fill_gaps(
         self,
@@ -374,7 +374,7 @@ class SceneFitter:
             filled += self.buffer.fill(seeds, self.config.initial_opacity, label=label)
         return filled
 
-    def _standing_for(self, label: Label) -> Bool:
+    def _standing_for(self, label: int) -> Bool:
         """Live splats (M,) of a label; people count as objects."""
         labels = np.where(self.buffer.labels == Label.HUMAN, np.uint8(Label.OBJECT), self.buffer.labels)
         return np.asarray(self.buffer.is_alive & (labels == label))
@@ -425,7 +425,7 @@ class SceneFitter:
         return filled
 
     def _is_grounded(
-        self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf
+        self, points: Float32, views: Sequence[View], label: int = Label.OBJECT, *, least: float = np.inf
     ) -> Bool:
         """Points (K,) that no view sees through by the smaller of `see_through` and `least` [m].
 

@@ -69,7 +69,7 @@ def make_view(
 
 
 def seen_through(
-    centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1, label: Label = Label.OBJECT
+    centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1, label: int = Label.OBJECT
 ) -> Bool:
     """Splats (N,) that float: nearer than every valid depth around their pixel in some view.
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
-from splatctrl_cli.scene.buffer import SplatBuffer
+from splatctrl_cli.scene.buffer import BACKDROP, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at, tolerance_at
@@ -30,7 +30,7 @@ def relabel(
     else:
         is_robot, is_shown = robot_splats(buffer, occupancy, robot, seen)
         labels[is_robot] = Label.ROBOT
-    labels[buffer.labels == Label.BACKDROP] = Label.BACKDROP
+    labels[buffer.labels == BACKDROP] = BACKDROP
     was_robot = buffer.labels == Label.ROBOT
     is_trail: Bool = (buffer.labels != Label.OBJECT) & (labels == Label.OBJECT) & ~(was_robot & is_shown)
     turned = np.flatnonzero(was_robot & is_shown & (labels != Label.ROBOT))

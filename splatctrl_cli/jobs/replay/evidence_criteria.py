@@ -1,7 +1,7 @@
 """Criteria of the evidence behind a replay's verdict."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -14,6 +14,7 @@ from splatctrl_cli.config.fixed import (
     HIDDEN,
     MISPLACED,
     UNSEEN,
+    UNSEEN_ALONE,
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.metrics import lowest
@@ -135,6 +136,12 @@ LIMITS = (
         remedy="reconstruct with a larger --box",
     ),
 )
+ALONE = replace(
+    LIMITS[0],
+    asked="never seen by a lone camera, of all points within the margin",
+    why="it sees no far side of the arm, where a whole object may be",
+    most=UNSEEN_ALONE,
+)
 PROOF = Limit(
     asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
     why="such a run would be safe by assumption",
@@ -149,7 +156,8 @@ def known_space(judged: Judged) -> Iterator[Reason]:
     """Every class of evidence within the margin of the arm keeps its limit (listed below); at most `--max-unknown`
     of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
-    for limit in LIMITS:
+    first = ALONE if len(judged.inputs.scene.cameras or ()) == 1 else LIMITS[0]
+    for limit in (first, *LIMITS[1:]):
         yield from _check_limit(judged, limit)
     if judged.request.unseen == OCCUPIED:
         yield from _check_limit(judged, PROOF, partial(failed, label=MARGIN))

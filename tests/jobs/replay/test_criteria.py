@@ -1,6 +1,7 @@
 """Criteria of a replay's verdict on made-up figures: those that a whole run seldom breaks alone."""
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -245,6 +246,13 @@ def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(kind: Ev
 def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, more: float, count: int) -> None:
     share = np.where(np.arange(NUM) == 4, allowed + more, 0.1)
     run = judged({column: share})
+    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
+
+
+@pytest.mark.parametrize(("cameras", "count"), [(("front",), 1), (("front", "side"), 0), (None, 0)])
+def test_a_lone_camera_must_see_more_of_the_space_about_the_arm(cameras: Any, count: int) -> None:
+    run = judged({"unseen": np.full(NUM, 0.5 * (evidence.UNSEEN + evidence.UNSEEN_ALONE))})
+    run = replace(run, inputs=replace(run.inputs, scene=replace(run.inputs.scene, cameras=cameras)))
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
 
 
