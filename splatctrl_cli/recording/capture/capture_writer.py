@@ -286,7 +286,7 @@ def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, n
 
 def encode_png(pixels: np.ndarray[Any, Any]) -> bytes:
     is_written, data = cv2.imencode(".png", pixels, _FILTERED)
-    refuse_if(not is_written, f"an image of shape {pixels.shape} could not be encode_png as PNG", error=WriteError)
+    refuse_if(not is_written, f"an image of shape {pixels.shape} could not be encoded as PNG", error=WriteError)
     return bytes(data)
 
 
