@@ -1,4 +1,4 @@
-"""Columns of a replay's states, by name: what was audited, commanded and left."""
+"""Named columns of audited states and of a controller's steps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -13,7 +13,7 @@ from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Float64, Index
 
 NamedColumns = Mapping[str, Any]
-"""By name: numbers (T, ...), NaN without a value; or T words, or tuples of words, empty without any."""
+"""Columns by name: arrays (T, ...) with NaN for no value, or T words or tuples of words, empty for none."""
 
 RUNGS = tuple(Rung)
 

@@ -54,9 +54,9 @@ LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """A column (T,) folded to a value, most of which the `pick` of its values makes.
+    """A rule that makes one value of a column (T,).
 
-    accumulate: up to each state, from `start` on.
+    pick: the value that contributes most. accumulate: values up to each state, beginning with `start`.
     """
 
     of: Callable[[Float64], float | None]

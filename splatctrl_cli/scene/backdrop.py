@@ -53,9 +53,9 @@ def _seeds_of(one: "_Cells", cells: Sequence["_Cells"], found: Seeds, background
 
     They lie at that of `depths` (D,) [m] where most views agree, else at the first.
     """
-    is_missing = one.is_blank & ~one.covered(found)
+    is_missing = one.is_blank & ~one.find_covered(found)
     is_missing &= np.abs(one.color - background).mean(axis=2) > SAME_COLOR
-    v, u, size, color = (np.concatenate(parts) for parts in zip(*one.squares(is_missing), strict=True))
+    v, u, size, color = (np.concatenate(parts) for parts in zip(*one.missing_squares(is_missing), strict=True))
     if not len(v):
         return NO_SEEDS
     k = one.frame.intrinsics
@@ -93,7 +93,7 @@ class _Cells:
         cut = image[: h * self.side, : w * self.side]
         return np.asarray(cut.reshape(h, self.side, w, self.side, *image.shape[2:]).mean(axis=(1, 3)), np.float64)
 
-    def squares(self, is_missing: Bool) -> Iterator[tuple[Float64, Float64, Float64, Float32]]:
+    def missing_squares(self, is_missing: Bool) -> Iterator[tuple[Float64, Float64, Float64, Float32]]:
         """Middles v, u [px] (K,), sides [px] (K,) and colours (K, 3) of squares of missing cells alike in colour."""
         for block in BLOCKS:
             h, w = (size // block for size in is_missing.shape)
@@ -115,7 +115,7 @@ class _Cells:
         cells = (pixels + 0.5) / self.side - 0.5
         return cells[:, 0], cells[:, 1], local[:, 2]
 
-    def covered(self, seeds: Seeds) -> Bool:
+    def find_covered(self, seeds: Seeds) -> Bool:
         """Cells (h, w) behind a seed of their colour."""
         h, w = self.depth.shape
         found = np.zeros((h, w), bool)

@@ -83,7 +83,7 @@ def command_of(words: tuple[str, ...]) -> Command:
 
 
 def declared(words: tuple[str, ...]) -> dict[str, set[str]]:
-    """By option, the names of which one has to be read: its own, or those of the fields that it gives."""
+    """Names by option, of which a command reads at least one: its own and those of its fields."""
     parser: argparse.ArgumentParser = build_parser(words[0])
     for word in words:
         below = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))

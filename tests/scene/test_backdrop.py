@@ -22,7 +22,7 @@ MOST = 200
 
 
 def view(x: float, stamp_ns: int = 0) -> RgbdFrame:
-    """What a camera at (x, 0, 0) that looks along z sees: a red block of 30 cm, with depth, before the wall."""
+    """Frame of a camera at (x, 0, 0), looking along z: a red block of 30 cm, with depth, before the wall."""
     v, u = np.mgrid[: LENS.height, : LENS.width]
     wall = back_project_pixels(LENS, u, v, np.full(u.shape, WALL))
     color = np.random.default_rng(3).integers(0, 256, (64, 64, 3), np.uint8)
@@ -50,7 +50,7 @@ def seeds_of(frames: list[RgbdFrame], most: int = MOST, shown: float = 0.0) -> S
 
 
 def test_seeds_lie_where_the_views_agree() -> None:
-    """To a plane of the sweep; the background explains black tiles."""
+    """They are at most one step of depth off. Black tiles get none, as the background is black."""
     seeds = seeds_of(views(), 3000)
     z = seeds.centers[np.abs(seeds.centers[:, 0]) < 0.5, 2]  # in all views
     assert len(z) > 100

@@ -71,7 +71,7 @@ Recorded = Callable[[Fault], tuple[Shown, Path]]
 
 @pytest.fixture(scope="module")
 def recorded(model: RobotModel, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """What images show of the target in view under a fault, and the folder of their log; each is recorded once."""
+    """Record a fault once; return what its images show of the target, and the log's folder."""
     found: dict[str, tuple[Shown, Path]] = {}
 
     def record_once(fault: Fault) -> tuple[Shown, Path]:

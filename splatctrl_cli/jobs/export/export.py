@@ -42,7 +42,15 @@ from splatctrl_cli.formats.splat.splats import (
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, beside, open_run
+from splatctrl_cli.jobs.runs.run_folder import (
+    REPLAY,
+    FolderRequest,
+    RunFolder,
+    States,
+    WrittenFile,
+    open_run,
+    sibling_path,
+)
 from splatctrl_cli.jobs.score.views import render_splats
 from splatctrl_cli.recording.container.mcap_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
@@ -101,7 +109,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     errors above the format's rounding.
     """
     source = _splat_file(request.scene)
-    out = request.out or beside(request.scene, ".ply")
+    out = request.out or sibling_path(request.scene, ".ply")
     kind = _format(out, request.layout)
     refuse_if(
         os.path.realpath(out) == os.path.realpath(source),
@@ -289,7 +297,7 @@ class ExportRunResult(WrittenFile):
 def export_run(request: ExportRunRequest) -> ExportRunResult:
     """Write the MCAP. Raises InputError for another folder, UsageError for a missing library."""
     parts = sorted(_parts(open_run(request.path), request.roots), key=lambda part: part[:2])
-    out = request.out or beside(request.path.absolute(), ".mcap")
+    out = request.out or sibling_path(request.path.absolute(), ".mcap")
     with output_path(out, force=request.force, is_folder=False) as written:
         with foxglove_log(written) as log:
             for _, _, write in parts:

@@ -67,8 +67,8 @@ def scene_answers(
 ) -> Callable[..., Answers]:
     """Answers of a scene's splats, and balls around unrepresented voxels, as a field by `config`.
 
-    A function of points (Q, 3) [m], world, and perhaps a grid's answers, which it completes, with the probability at
-    the grid's distance. Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
+    The function takes points (Q, 3) [m], world. It completes a grid's answers if they are given, with the probability
+    at the grid's distance. Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
     """
     refuse_if(
         config.field.unknown != "free",

@@ -139,7 +139,7 @@ LIMITS = (
 ALONE = replace(
     LIMITS[0],
     asked="never seen by a lone camera, of all points within the margin",
-    why="it sees no far side of the arm, where a whole object may be",
+    why="it never sees the far side of the arm, which may hide a whole object",
     most=UNSEEN_ALONE,
 )
 PROOF = Limit(

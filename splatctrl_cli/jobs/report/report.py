@@ -20,10 +20,10 @@ from splatctrl_cli.jobs.runs.run_folder import (
     FolderRequest,
     RunFolder,
     WrittenFile,
-    beside,
     is_batch,
     open_batch,
     open_run,
+    sibling_path,
 )
 from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, pack, picture, render_page
 
@@ -84,7 +84,7 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
 
 
 def _write(request: FolderRequest, page: Page) -> Path:
-    out = request.out or beside(request.path, ".html")
+    out = request.out or sibling_path(request.path, ".html")
     with output_path(out, force=request.force, is_folder=False) as partial:
         partial.write_text(render_page(page), encoding="utf-8")
     return out

@@ -136,8 +136,8 @@ class WrittenFile:
     bytes: int
 
 
-def beside(path: Path, ending: str) -> Path:
-    """Output of the same name next to an input, with another ending."""
+def sibling_path(path: Path, ending: str) -> Path:
+    """Path of the same name in the same folder, with another ending."""
     place = path if path.name.strip(".") else Path(os.path.realpath(path))  # . and .. have no name of their own
     return place.with_name(f"{place.name if place.is_dir() else place.stem}{ending}")
 

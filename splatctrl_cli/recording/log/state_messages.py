@@ -45,7 +45,7 @@ class RawJoints:
 
 
 _Read = tuple[str, Any, Any, Any, Any, Float64 | None]
-"""What it is, joint names, positions, velocities, commanded velocities, and T_base_ee."""
+"""Kind of message, joint names, positions, velocities, commanded velocities, T_base_ee."""
 
 
 def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:

@@ -55,7 +55,7 @@ def judged(
     request: Mapping[str, Any] | None = None,
     **replay: Any,
 ) -> Judged:
-    """What the criteria look at, of a run with nothing broken but these columns, a scene's figures, and `replay`."""
+    """A run in which nothing is broken but what is given; figures: of the scene, replay: fields of `Replay`."""
     stamps, trace = np.arange(NUM, dtype=np.int64) * 100_000_000, Trace()
     safe = dict.fromkeys(("unknown_share", "unbounded_s", "map_age_s", "is_blank"), np.zeros(NUM))
     surface = {"clearance_surface": np.full(NUM, 0.1)}
