@@ -47,7 +47,13 @@ class SceneConfig(Section, section="scene"):
     )
     shell: Annotated[
         float,
-        Within(0, 1, "", "share of max_splats, beside these, for what lies beyond a robot's reach: rendered only"),
+        Within(
+            0,
+            1,
+            "",
+            "share of max_splats that is only rendered: beside them for what lies beyond a robot's reach, among them"
+            " for pixels without depth in still pictures",
+        ),
     ] = 0.1
     background: Annotated[
         str, OneOf(("median", "black"), "colour behind the splats: median of pixels without depth nearby, or black")
