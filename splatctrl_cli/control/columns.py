@@ -78,6 +78,7 @@ def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> NamedC
         "rung_number": number(lambda step: RUNGS.index(step.rung)),
         "scale": number(lambda step: step.scale),
         "slack": number(lambda step: max((row.slack for row in step.relaxed), default=0.0)),
+        "relaxed_near": number(lambda step: any(row.is_near for row in step.relaxed)),
         "relaxed": words(lambda step: " ".join(row.name for row in step.relaxed)),
         "who_relaxed": words(
             lambda step: tuple(row.name for row in sorted(step.relaxed, key=lambda row: -row.slack))

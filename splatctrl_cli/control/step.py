@@ -28,13 +28,16 @@ from splatctrl_cli.control.terms import (
 from splatctrl_cli.records import Bool, DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel
 
+RELAXED_NEAR = 2.0  # [margins]: beyond, slack costs speed of approach, and every state's distance is judged
+
 
 @dataclass(frozen=True, kw_only=True)
 class RowSlack:
-    """A barrier row relaxed by `slack` [m/s]."""
+    """A barrier row relaxed by `slack` [m/s]; is_near: at most `RELAXED_NEAR` of its margins away."""
 
     name: str
     slack: float
+    is_near: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,6 +314,7 @@ class QpIkController:
 
     def _report(self, error: Float64, rows: Rows, choice: Choice, rest: Float64, scale: float) -> ControlStep:
         slack = rows.spread(choice.slack)
+        is_near = rows.distance <= RELAXED_NEAR * rows.margin
         violated_fixed = rows.is_fixed & (rows.distance < rows.margin)
         return ControlStep(
             velocity=_blend(choice.velocity, rest, scale),
@@ -321,7 +325,7 @@ class QpIkController:
             nearest=self.row_names[int(np.argmin(rows.external.distance))],
             self_clearance=float(np.min(rows.own.distance, initial=np.inf)),
             relaxed=tuple(
-                RowSlack(name=self.row_names[i], slack=float(slack[i]))
+                RowSlack(name=self.row_names[i], slack=float(slack[i]), is_near=bool(is_near[i]))
                 for i in np.flatnonzero(slack > self._config.slack_tolerance)
             ),
             interventions=self._interventions(choice, rows),

@@ -158,7 +158,7 @@ def test_steps_become_events_by_what_shaped_them() -> None:
         step(interventions=(row("fore[1]", RowKind.SCENE, 0.5), row("elbow highest", RowKind.LIMIT, 0.1))),
         step(interventions=(row("upper[1]", RowKind.SCENE, 0.5), row("fore[1]", RowKind.SCENE, 3.0))),
         step(interventions=(row("fore[1]", RowKind.SCENE, 2.5),), scale=0.5),
-        step(rung=Rung.RELAXED, relaxed=(RowSlack(name="fore[1]", slack=0.03),)),
+        step(rung=Rung.RELAXED, relaxed=(RowSlack(name="fore[1]", slack=0.03, is_near=True),)),
         step(rung=Rung.HOLD, scale=0.0, violated_fixed=("upper[0]",), fixed_distance=-0.02, clearance=0.4),
     ]
     found = {event.kind: event for event in events_of(STAMPS, step_signals(step_columns(steps, 2)))}

@@ -93,6 +93,15 @@ def test_rows_that_cannot_all_hold_are_relaxed_and_named() -> None:
     assert step.rung is Rung.RELAXED or step.rung is Rung.HOLD
     assert {row.name for row in step.relaxed} & {"fore[0]", "fore[1]"}
     assert all(row.slack > CONFIG.slack_tolerance for row in step.relaxed)
+    assert all(row.is_near for row in step.relaxed)
+
+
+def test_a_row_that_gives_way_to_a_fast_approach_far_away_is_not_near_its_margin() -> None:
+    q = np.array([0.3, 0.0])
+    beside = Balls([ARM.sphere_centers(q)[4] + np.array([0, 0.25, 0])], [0.05])
+    step = controller(beside).step(q, goal(*q), distance_rate=-20.0)
+    assert step.relaxed
+    assert not any(row.is_near for row in step.relaxed)
 
 
 def test_spheres_that_no_joint_moves_stay_out_of_the_program_and_are_reported() -> None:

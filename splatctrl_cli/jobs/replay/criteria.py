@@ -258,7 +258,9 @@ def clocks(judged: Judged) -> Iterator[Reason]:
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
-    """Every step of the closed loop is solved; a user's controller always answers validly."""
+    """Every step of the closed loop is solved, and rows are relaxed only over twice their margin away; a user's
+    controller always answers validly.
+    """
     outside, trace, metrics = judged.replay.outside, judged.replay.closed_loop, judged.metrics
     if outside is not None:
         num, failure = outside.num_answers, outside.failure
@@ -277,11 +279,13 @@ def controller(judged: Judged) -> Iterator[Reason]:
         return
     if trace is None:
         return
-    bad = {name: metrics[f"num_{name}"] or 0 for name in ("relaxed", "minimum_violation", "hold")}
+    num_relaxed, num_near = int(metrics["num_relaxed"] or 0), int(np.nansum(judged.replay.trace["relaxed_near"]))
+    bad = {"relaxed": num_near, **{name: metrics[f"num_{name}"] or 0 for name in ("minimum_violation", "hold")}}
     if not sum(bad.values()):
-        yield held(f"all {len(trace.steps)} steps solved", 0.0, 0.0, "", len(trace.steps))
+        far = f", {num_relaxed} of them with rows relaxed, all over twice their margin away" if num_relaxed else ""
+        yield held(f"all {len(trace.steps)} steps solved{far}", 0.0, 0.0, "", len(trace.steps))
         return
-    kinds = (EventKind.RELAXED, EventKind.MINIMUM_VIOLATION, EventKind.HOLD)
+    kinds = [kind for kind in EventKind if bad.get(kind.replace("-", "_"))]
     first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)
     found = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
     yield failed(

@@ -122,12 +122,26 @@ def test_a_camera_that_sees_the_robot_elsewhere_is_no_evidence(sigma: float, is_
     assert [(r.outcome, r.who, r.count) for r in found] == [(Outcome.NOT_EVALUABLE, "left", 2000)] * is_off
 
 
-@pytest.mark.parametrize("what", ["relaxed", "minimum_violation", "hold"])
-def test_a_step_of_any_kind_that_is_not_solved_fails_the_controller(what: str) -> None:
-    happened = (event(EventKind(what.replace("_", "-"))),)
-    run = judged(closed_loop=FIVE_STEPS, events=happened, metrics=CONTROLLER | {f"num_{what}": 2})
-    (reason,) = controller(run)
-    assert reason.outcome is Outcome.FAILED and f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
+def loop_of(kind: str, metrics: Mapping[str, float], num_near: int = 0) -> Judged:
+    """A closed loop with an event; num_near: states with rows relaxed near their margin."""
+    columns, happened = {"relaxed_near": np.arange(NUM) < num_near}, (event(EventKind(kind.replace("_", "-"))),)
+    return judged(columns, closed_loop=FIVE_STEPS, events=happened, metrics=CONTROLLER | metrics)
+
+
+@pytest.mark.parametrize("what", ["minimum_violation", "hold"])
+def test_a_step_that_is_not_solved_fails_the_controller(what: str) -> None:
+    (reason,) = controller(loop_of(what, {f"num_{what}": 2}))
+    assert reason.outcome is Outcome.FAILED
+    assert f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
+
+
+def test_a_row_relaxed_within_twice_the_margin_fails_the_controller() -> None:
+    (reason,) = controller(loop_of("relaxed", {"num_relaxed": 3}, num_near=2))
+    assert reason.outcome is Outcome.FAILED
+    assert "at 2 relaxed of 5 steps" in reason.sentence
+    (passed,) = controller(loop_of("relaxed", {"num_relaxed": 3}))
+    assert passed.outcome is Outcome.PASSED
+    assert passed.sentence == "all 5 steps solved, 3 of them with rows relaxed, all over twice their margin away"
 
 
 def bodied(deficit: tuple[float, float], surface: float) -> Judged:
