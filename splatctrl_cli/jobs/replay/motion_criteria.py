@@ -28,6 +28,8 @@ from splatctrl_cli.jobs.replay.criteria import (
 from splatctrl_cli.jobs.replay.inputs import bare_moving_links, recorded_postures
 from splatctrl_cli.robot.self_margins import least_gap
 
+SAME_GAP = 0.01  # [m]: change of a part's distance from its own link that is the sensor's
+
 
 def clearance(judged: Judged) -> Iterator[Reason]:
     """The exact distance of every moving sphere to the splats keeps the margin."""
@@ -93,6 +95,9 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
         )
         yield _locate(worst, starved)
         return
+    if (doubt := _part_or_object(judged, source, worst.worst_name)) is not None:
+        yield _locate(worst, doubt)
+        return
     states = sum(event.num_states for event in events)
     apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
     yield _locate(
@@ -106,6 +111,24 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
             count=judged.replay.num_states,
             label=CONTACT if least < 0 else MARGIN,
         ),
+    )
+
+
+def _part_or_object(judged: Judged, source: str, who: str) -> Reason | None:
+    """A reason if the object may be a part of its link: beside it in every state, and the link was not learned."""
+    trace, learned, link = judged.replay.trace, judged.inputs.model.self_model, who.rpartition("[")[0]
+    distance = trace[f"clearance_{source}"]
+    is_beside = distance.max() < judged.threshold and np.ptp(distance) <= SAME_GAP
+    if learned is None or link not in learned.unknown or not is_beside:
+        return None
+    return lacking(
+        sentence=f"{who} is {mm(distance.min())} from an object in every state, margin {mm(judged.replay.margin)}; "
+        f"it may be a part of {link}, which {learned.unknown[link]},",
+        value=float(distance.min()),
+        threshold=judged.replay.margin,
+        unit="m",
+        remedy=f"record {link} moving by 100 mm in view of the cameras, or give --self-model",
+        count=judged.replay.num_states,
     )
 
 
@@ -330,7 +353,7 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
         name="clearance",
         find=clearance,
         broken=f"{BROKEN}; {UNKNOWN} where only voxels that are occupied and have no splat break it (a starved map: "
-        "raise `--max-splats`)",
+        "raise `--max-splats`), or where it is by an object that may be a part of its link, beside it in every state",
     ),
     Criterion(
         name="certified clearance",

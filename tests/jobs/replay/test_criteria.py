@@ -24,7 +24,7 @@ from splatctrl_cli.jobs.replay.criteria import Judged, controller
 from splatctrl_cli.jobs.replay.files import columns_of
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
-from splatctrl_cli.jobs.replay.motion_criteria import surface_clearance
+from splatctrl_cli.jobs.replay.motion_criteria import clearance, surface_clearance
 from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
 from splatctrl_cli.jobs.replay.trace import Trace
@@ -53,6 +53,7 @@ def judged(
     metrics: Mapping[str, float | None] | None = None,
     margin: float = 0.02,
     request: Mapping[str, Any] | None = None,
+    self_model: Any = None,
     **replay: Any,
 ) -> Judged:
     """A run in which nothing is broken but what is given; figures: of the scene, replay: fields of `Replay`."""
@@ -71,10 +72,10 @@ def judged(
     scene = KnownScene(
         at=nothing, observed=None, first_ns=None, cameras=None, digests={}, figures=lambda: figures or {}
     )
-    source = FakeSource(states=())
+    source, model = FakeSource(states=()), cast("Any", SimpleNamespace(self_model=self_model))
     return Judged(
         request=ReplayRequest(log=Path(), out=Path(), config=config, **(request or {})),
-        inputs=ReplayInputs(source=source, states=states, model=nothing, scene=scene, truth=None, digests={}),
+        inputs=ReplayInputs(source=source, states=states, model=model, scene=scene, truth=None, digests={}),
         logged=LoggedStates(source=source, states=states, poses=None),
         replay=Replay(**run | replay),
         metrics={"unknown_share": 0.0, "num_scene_hits": 0, **(metrics or {})},
@@ -142,6 +143,30 @@ def test_a_row_relaxed_within_twice_the_margin_fails_the_controller() -> None:
     (passed,) = controller(loop_of("relaxed", {"num_relaxed": 3}))
     assert passed.outcome is Outcome.PASSED
     assert passed.sentence == "all 5 steps solved, 3 of them with rows relaxed, all over twice their margin away"
+
+
+@pytest.mark.parametrize(
+    ("unknown", "last", "outcome"),
+    [
+        ({"fore": "moves too little (3 of 5 configurations)"}, 0.010, Outcome.NOT_EVALUABLE),
+        ({"fore": "moves too little (3 of 5 configurations)"}, 0.021, Outcome.FAILED),
+        ({"fore": "moves too little (3 of 5 configurations)"}, -0.002, Outcome.FAILED),
+        ({"upper": "moves too little (3 of 5 configurations)"}, 0.010, Outcome.FAILED),
+    ],
+)
+def test_an_object_always_beside_a_link_that_hardly_moves_may_be_its_part(
+    unknown: dict[str, str], last: float, outcome: Outcome
+) -> None:
+    distance = np.append(np.full(NUM - 1, 0.009), last)
+    happened = replace(event(EventKind.BELOW_MARGIN), source="exact", worst_name="fore[1]", worst=0.009)
+    if last < 0:
+        happened = replace(happened, kind=EventKind.IN_COLLISION, worst=last)
+    columns = {"clearance_exact": distance, "clearance_splats": distance}
+    run = judged(columns, events=(happened,), self_model=SimpleNamespace(unknown=unknown))
+    (reason,) = clearance(run)
+    assert reason.outcome is outcome
+    if outcome is Outcome.NOT_EVALUABLE:
+        assert "a part of fore, which moves too little (3 of 5 configurations)" in reason.sentence
 
 
 def bodied(deficit: tuple[float, float], surface: float) -> Judged:
