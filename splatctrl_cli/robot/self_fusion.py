@@ -33,7 +33,8 @@ from splatctrl_cli.robot.surface import RobotSurface
 REACH = 0.06  # [m] outside a link's visual surface: search distance for its parts
 MOST_REACH = 0.24  # [m]: its limit when parts extend as far
 STEP = 0.02  # [m] of some corner of a link's box between clearly different configurations
-SAME = 0.01  # [m] within which views of one moment share a configuration
+FINE = 0.5  # of STEP, for a link that moves too little; its parts must leave their place by `AWAY`
+SAME = 0.5  # of the step, within which views of one moment share a configuration
 PATH_SHARE = 0.5  # of a link's way between two moments, which separates them even if it returned
 AWAY = 0.04  # [m] from a cell's old place, beyond which a surface there is another object
 MOST_ASKED = 8  # configurations with places to check in the others
@@ -79,8 +80,8 @@ def learn(
     T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
     link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
     `NUM_CONFIGURATIONS` show it as a surface, at most `FREE_SHARE` see through it (most views of one decide), it
-    leaves its place in the world with the link, and moves against each nearer link. Raises InputError where no link
-    can be learned.
+    leaves its place in the world with the link, and moves against each nearer link. A link that moves too little gets
+    configurations half as far apart, for parts that move by `AWAY`. Raises InputError where no link can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
@@ -97,13 +98,17 @@ def learn(
     learned: list[LearnedLink] = []
     unknown = {}
     for number, link in enumerate(surface.links):
-        configurations = _configurations(placed[:, number])
+        configurations = _configurations(placed[:, number], STEP)
         num = int(configurations.max(initial=-1)) + 1
+        if is_fine := num < NUM_CONFIGURATIONS:
+            configurations = _configurations(placed[:, number], FINE * STEP)
         used = [(view, int(k)) for view, k in zip(views, configurations, strict=True) if k >= 0]
-        if num < NUM_CONFIGURATIONS:
+        is_enough = configurations.max(initial=-1) + 1 >= NUM_CONFIGURATIONS
+        found = _grow_link(surface, number, boxes[number], used, reach, is_fine) if is_enough else []
+        if parts := [part for part in found if len(part.triangles) or not is_fine]:
+            learned += parts
+        elif is_fine:
             unknown[link] = f"moves too little ({num} of {NUM_CONFIGURATIONS} configurations)"
-        elif found := _grow_link(surface, number, boxes[number], used, reach):
-            learned += found
         else:
             unknown[link] = f"seen in fewer than {NUM_CONFIGURATIONS} configurations"
     if not learned:
@@ -167,17 +172,17 @@ def _views(
 
 
 def _grow_link(
-    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
+    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float, is_fine: bool
 ) -> list[LearnedLink]:
     """`_learn_link`, with the reach doubled while parts extend that far."""
-    found = _learn_link(surface, number, box, used, reach)
+    found = _learn_link(surface, number, box, used, reach, is_fine)
     if 2 * reach <= MOST_REACH and any(part.outside_most > reach - VOXEL for part in found):
-        return _grow_link(surface, number, box, used, 2 * reach)
+        return _grow_link(surface, number, box, used, 2 * reach, is_fine)
     return found
 
 
 def _learn_link(
-    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
+    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float, is_fine: bool
 ) -> list[LearnedLink]:
     points = [transform_points(invert_transform(v.T_world_link[number]), v.points_world) for v, _ in used]
     points = [part[_is_in(box, part, reach)] for part in points]
@@ -205,7 +210,7 @@ def _learn_link(
         stays[is_solid], moves[is_solid] = _stays_in_world(*its, shown, poses[run, number])
         is_other[is_solid] = _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
         grid = _without_scene(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, stays, 0) > 0)
-        is_elsewhere = spread_cells(mask, is_other | (stays & moves), 0) > 0
+        is_elsewhere = spread_cells(mask, is_other | (~moves if is_fine else False) | (stays & moves), 0) > 0
         grid = _without_scene(np.where(is_elsewhere, np.float32(TRUNCATION), grid), np.zeros_like(mask))
         is_part = (grid < 0)[mask]
         if not is_part.any() and (index or len(np.unique(at[num_own >= LEAST_CELLS])) < NUM_CONFIGURATIONS):
@@ -349,14 +354,14 @@ def _is_in(box: Float64, points: Float64, reach: float) -> Bool:
     return np.asarray(np.all((points >= box[0] - reach) & (points <= box[1] + reach), axis=1))
 
 
-def _configurations(placed: Float64) -> Index:
-    """A link's configuration by view (V,), -1: none."""
+def _configurations(placed: Float64, step: float) -> Index:
+    """A link's configuration by view (V,), -1: none; step [m] as `STEP`."""
     newest, num = np.full((8, 3), np.inf), 0
     found = np.full(len(placed), -1)
     for number, corners in enumerate(placed):
         gap = np.linalg.norm(corners - newest, axis=1).max()
-        if num < 255 and gap >= STEP:
+        if num < 255 and gap >= step:
             newest, num = corners, num + 1
-        if gap >= STEP or gap <= SAME:
+        if gap >= step or gap <= SAME * step:
             found[number] = num - 1
     return found

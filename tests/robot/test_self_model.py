@@ -171,6 +171,26 @@ def test_an_arm_as_its_urdf_draws_it_gets_no_parts_of_what_it_moves_along(
     assert learn(ROBOT, LINKS, *recorded(moves, truth, noise)).pieces() == []
 
 
+SLIGHT = [(float(turn), 0.0) for turn in np.linspace(-0.08, 0.08, 11)]  # 64 mm at the tip: four configurations
+BESIDE = Shape(link="world", kind="box", size=(0.1, 0.05, 0.5), T_link_shape=pose_at((0.36, 0.13, 0.25)))
+
+
+def test_a_tool_at_the_tip_of_a_link_that_moves_slightly_is_found() -> None:
+    tool = Shape(link="arm", kind="box", size=(0.05, 0.04, 0.06), T_link_shape=pose_at((0.34, 0.0, 0.07)))
+    truth = RobotSurface.from_parts([*shapes(has_bracket=False), tool, BESIDE])
+    ((link, triangles),) = learn(ROBOT, LINKS, *recorded(SLIGHT, truth)).pieces()
+    assert link == "arm"
+    assert RobotSurface.from_parts([tool]).distance(np.eye(4)[None], triangles.reshape(-1, 3)).max() < 2 * VOXEL
+
+
+@pytest.mark.parametrize("beside", [[PLATE], [ROD], [BESIDE], [BRACKET]], ids=["plate", "rod", "box", "bracket"])
+def test_what_a_slight_motion_cannot_tell_from_the_scene_is_no_part(beside: list[Shape]) -> None:
+    """The bracket moves with the arm, but by less than 40 mm."""
+    truth = RobotSurface.from_parts([*shapes(has_bracket=False), *beside])
+    refused = r"arm.* moves? too little"
+    expect_refusal(refused, learn, ROBOT, LINKS, *recorded(SLIGHT, truth))
+
+
 def test_a_rib_goes_on_beside_the_joint_where_it_hardly_moves() -> None:
     rib = Shape(link="arm", kind="box", size=(0.34, 0.02, 0.02), T_link_shape=pose_at((0.17, 0.0, 0.06)))
     truth = RobotSurface.from_parts([*shapes(has_bracket=False), rib])

@@ -28,8 +28,6 @@ from splatctrl_cli.jobs.replay.criteria import (
 from splatctrl_cli.jobs.replay.inputs import bare_moving_links, recorded_postures
 from splatctrl_cli.robot.self_margins import least_gap
 
-SAME_GAP = 0.01  # [m]: change of a part's distance from its own link that is the sensor's
-
 
 def clearance(judged: Judged) -> Iterator[Reason]:
     """The exact distance of every moving sphere to the splats keeps the margin."""
@@ -95,11 +93,21 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
         )
         yield _locate(worst, starved)
         return
-    if (doubt := _part_or_object(judged, source, worst.worst_name)) is not None:
-        yield _locate(worst, doubt)
-        return
     states = sum(event.num_states for event in events)
     apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
+    link = unlearned_link(judged)
+    if link and worst.worst_name.startswith(f"{link}["):
+        part = lacking(
+            sentence=f"{worst.worst_name} {apart}, from the first state on, margin {mm(replay.margin)}; that may be "
+            f"a part of {link}, which {judged.inputs.model.self_model.unknown[link]},",
+            value=least,
+            threshold=replay.margin,
+            unit="m",
+            remedy=f"record {link} moving by 100 mm in view of the cameras, or give --self-model",
+            count=replay.num_states,
+        )
+        yield _locate(worst, part)
+        return
     yield _locate(
         worst,
         failed(
@@ -114,22 +122,17 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     )
 
 
-def _part_or_object(judged: Judged, source: str, who: str) -> Reason | None:
-    """A reason if the object may be a part of its link: beside it in every state, and the link was not learned."""
-    trace, learned, link = judged.replay.trace, judged.inputs.model.self_model, who.rpartition("[")[0]
-    distance = trace[f"clearance_{source}"]
-    is_beside = distance.max() < judged.threshold and np.ptp(distance) <= SAME_GAP
-    if learned is None or link not in learned.unknown or not is_beside:
-        return None
-    return lacking(
-        sentence=f"{who} is {mm(distance.min())} from an object in every state, margin {mm(judged.replay.margin)}; "
-        f"it may be a part of {link}, which {learned.unknown[link]},",
-        value=float(distance.min()),
-        threshold=judged.replay.margin,
-        unit="m",
-        remedy=f"record {link} moving by 100 mm in view of the cameras, or give --self-model",
-        count=judged.replay.num_states,
-    )
+def unlearned_link(judged: Judged) -> str:
+    """Link without a learned surface beside which an object stands, which may be its part; else empty.
+
+    The object breaks the margin in every logged state, or as a driven motion begins.
+    """
+    trace, learned = judged.replay.trace, judged.inputs.model.self_model
+    if learned is None or "exact" not in judged.replay.fields:
+        return ""
+    link = trace["nearest_exact"][0].rpartition("[")[0]
+    distance = trace["clearance_exact"][: 1 if judged.replay.closed_loop else None]
+    return link if link in learned.unknown and distance.max() < judged.threshold else ""
 
 
 def _locate(event: Event, reason: Reason) -> Reason:

@@ -10,7 +10,7 @@ from splatctrl_cli.evaluate.verdict import Outcome, Verdict, gate_reasons, verdi
 from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words, find_displaced
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
-from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION
+from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION, unlearned_link
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.robot.declared_contact import carried_words
 
@@ -32,7 +32,7 @@ def replay_verdict(judged: Judged) -> Verdict:
     """Judge by every criterion, then by the request's gates."""
     replay, metrics = judged.replay, judged.metrics
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
-    if find_displaced(judged) is not None:
+    if find_displaced(judged) is not None or (replay.closed_loop and unlearned_link(judged)):
         by_map = (*BY_MAP, *(() if replay.outside else BY_OUR_CONTROLLER))
         reasons = [  # what failed may be the robot itself, as an obstacle of the map
             replace(reason, outcome=Outcome.NOT_EVALUABLE, label="")
