@@ -238,7 +238,7 @@ def test_a_board_seen_by_one_camera_only_is_refused(tmp_path: Path) -> None:
 
 def test_a_board_that_no_robot_holds_does_not_tie_the_cameras_to_it(tmp_path: Path, plain_arm: Path) -> None:
     """Somebody moves it beside the robot: no link moves as it does."""
-    setup = Turning(options=replace(MOVING, duration_s=6.0, fps=4.0))
+    setup = Turning(options=replace(MOVING, duration_s=6.0, fps=3.0))
     with pytest.raises(NotEvaluableError, match=r"tied to no robot: .*does not move with the robot") as refusal:
         calibrated(setup, tmp_path, board=BOARD, **robot_in(plain_arm))
     assert "let the gripper hold the board" in (refusal.value.remedy or "")
