@@ -8,11 +8,13 @@ import pytest
 from splatctrl_cli.checks import limits
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import fixed
+from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.recordings import open_recording
 from splatctrl_cli.jobs.replay import inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import Desk, FakeSource, logged
+from tests.field.scenes import cloud, splat_set
 from tests.quick import painted, parsed_once, unpainted
 from tests.recording.log.make_log import messages_of, write_raw
 
@@ -57,6 +59,15 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size = ["--duration", "1.0", "--width", "96", "--height", "72", "--dtu"]
     assert main(["simulate", "-o", str(folder), *size, "-q"]) == 0
     return folder
+
+
+@pytest.fixture(scope="session")
+def splats(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cloud of 600 splats, as a file."""
+    path = tmp_path_factory.mktemp("splats") / "splats.ply"
+    centers, radii = cloud()
+    write_ply(path, splat_set(centers, radii + 0.001), {})  # a PLY holds log radii
+    return path
 
 
 @pytest.fixture(scope="session")

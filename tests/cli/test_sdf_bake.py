@@ -21,19 +21,11 @@ from splatctrl_cli.jobs.bake.accuracy import SUMMARY_METRICS
 from splatctrl_cli.simulate.arm import UNMODELLED
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli.here import splatctrl
-from tests.field.scenes import cloud, splat_set
+from tests.field.scenes import splat_set
 from tests.jobs.stage import interrupt
 from tests.plain import known, plain_grid
 
 COARSE = ("--set", "field.max_loss=1")  # cells that are baked in no time
-
-
-@pytest.fixture(scope="module")
-def splats(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("splats") / "splats.ply"
-    centers, radii = cloud()
-    write_ply(path, splat_set(centers, radii + 0.001), {})  # a PLY holds log radii
-    return path
 
 
 def test_bakes_both_formats_a_header_and_a_run(tmp_path: Path, splats: Path) -> None:

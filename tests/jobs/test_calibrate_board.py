@@ -22,7 +22,7 @@ from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
 from tests.calibration.scan import calibrated, printed, robot_in, with_board
 
-OPTIONS = RecordingOptions(duration_s=2.0, fps=4.0, width=320, height=240, color_rays=0)
+OPTIONS = RecordingOptions(duration_s=2.0, fps=3.0, width=320, height=240, color_rays=0)
 MOVING = replace(OPTIONS, duration_s=3.0, fps=2.0)
 BOARD = Board(columns=7, rows=4, square=0.03)
 EYES = [np.array([0.38 + 0.85 * np.cos(a), 0.85 * np.sin(a), 0.75]) for a in (-0.7, 0.0, 0.7)]
@@ -197,7 +197,7 @@ def showing(board: Board) -> Shown:
     ("setup", "board", "says", "remedy"),
     [
         (
-            lambda: ShownApart(options=replace(OPTIONS, duration_s=2.5)),
+            lambda: ShownApart(options=replace(OPTIONS, duration_s=2.5, fps=4.0)),
             "7x4:0.03",
             "does not tie together: cam0 | cam1, cam2",
             "at the same moment",
@@ -238,7 +238,7 @@ def test_a_board_seen_by_one_camera_only_is_refused(tmp_path: Path) -> None:
 
 def test_a_board_that_no_robot_holds_does_not_tie_the_cameras_to_it(tmp_path: Path, plain_arm: Path) -> None:
     """Somebody moves it beside the robot: no link moves as it does."""
-    setup = Turning(options=replace(MOVING, duration_s=6.0, fps=4.0))
+    setup = Turning(options=replace(MOVING, duration_s=6.0, fps=3.0))
     with pytest.raises(NotEvaluableError, match=r"tied to no robot: .*does not move with the robot") as refusal:
         calibrated(setup, tmp_path, board=BOARD, **robot_in(plain_arm))
     assert "let the gripper hold the board" in (refusal.value.remedy or "")

@@ -2,7 +2,7 @@
 
 import torch
 
-from tests.reference.raster import DILATION, MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
+from tests.reference.raster import composed, projected
 
 
 def rotations(quats_wxyz: torch.Tensor) -> torch.Tensor:
@@ -20,15 +20,8 @@ def covariances(
     camera: torch.Tensor, points_camera: torch.Tensor, scales: torch.Tensor, quats: torch.Tensor
 ) -> torch.Tensor:
     """Sigma' = J W R S S R^T W^T J^T plus the dilation; (N, 2, 2)."""
-    fx, fy, cx, cy, width, height = camera[:6]
-    x, y, z = points_camera.unbind(1)
-    tx = torch.clamp(x / z, -MARGIN * (cx + 0.5) / fx, MARGIN * (width - 0.5 - cx) / fx)
-    ty = torch.clamp(y / z, -MARGIN * (cy + 0.5) / fy, MARGIN * (height - 0.5 - cy) / fy)
-    zero = torch.zeros_like(z)
-    J = torch.stack([torch.stack([fx / z, zero, -fx * tx / z], 1), torch.stack([zero, fy / z, -fy * ty / z], 1)], 1)
     M = rotations(quats) * scales[:, None, :]
-    W = camera[6:15].reshape(3, 3)
-    return J @ W @ (M @ M.mT) @ W.T @ J.mT + DILATION * torch.eye(2, dtype=torch.float64)
+    return projected(camera, points_camera, M @ M.mT)
 
 
 def basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
@@ -66,24 +59,7 @@ def colors(camera: torch.Tensor, centers: torch.Tensor, harmonics: torch.Tensor,
 def render(camera: torch.Tensor, parameters: torch.Tensor, degree: int = 3) -> torch.Tensor:
     """Planes (5, H, W) of parameters (N, 59): sum_i (c_i, d_i, 1) alpha_i G_i prod_{j<i} (1 - alpha_j G_j)."""
     centers, opacities = parameters[:, :3], torch.sigmoid(parameters[:, 10])
-    width, height = int(camera[4]), int(camera[5])
     points = centers @ camera[6:15].reshape(3, 3).T + camera[15:18]
-    conics = torch.linalg.inv(covariances(camera, points, torch.exp(parameters[:, 3:6]), parameters[:, 6:10]))
+    on_image = covariances(camera, points, torch.exp(parameters[:, 3:6]), parameters[:, 6:10])
     shades = colors(camera, centers, parameters[:, 11:].reshape(-1, 3, 16), degree)
-    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    T = torch.ones(height, width, dtype=torch.float64)
-    is_live = torch.ones(height, width, dtype=torch.bool)
-    planes = torch.zeros(5, height, width, dtype=torch.float64)
-    for i in [i for i in torch.argsort(points[:, 2]).tolist() if points[i, 2] > NEAR]:
-        x, y, z = points[i]
-        du, dv = u - (camera[0] * x / z + camera[2]), v - (camera[1] * y / z + camera[3])
-        a, b, c = conics[i, 0, 0], conics[i, 0, 1], conics[i, 1, 1]
-        G = torch.exp(-0.5 * (a * du * du + 2 * b * du * dv + c * dv * dv))
-        alpha = torch.clamp(opacities[i] * G, max=MAX_ALPHA)
-        is_seen = is_live & (alpha >= MIN_ALPHA)
-        is_last = is_seen & (T * (1 - alpha) < MIN_TRANSMITTANCE)
-        is_live = is_live & ~is_last
-        weight = torch.where(is_seen & ~is_last, alpha * T, torch.zeros_like(T))
-        planes = planes + torch.stack([*shades[i], z, torch.ones_like(z)])[:, None, None] * weight
-        T = T - weight
-    return planes
+    return composed(camera, points, on_image, opacities, shades)

@@ -355,10 +355,12 @@ def test_a_camera_on_the_hand_rides_with_it_and_sees_nothing_nearer_than_it_can(
 
 
 def test_the_same_seed_records_the_same_bytes(model: RobotModel, tmp_path: Path) -> None:
+    """Also where two imagers give depth."""
     contents = []
+    assert draw(211, 1, model).world.body.depth is not None
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        record(draw(3, 1, model), model, tmp_path / name)
+        record(draw(211, 1, model), model, tmp_path / name)
         contents.append([(tmp_path / name / file).read_bytes() for file in ("log.mcap", "robot.urdf", "robot.yaml")])
     assert contents[0] == contents[1]
 

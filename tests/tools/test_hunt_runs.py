@@ -107,12 +107,11 @@ def test_what_was_once_a_false_green_and_what_is_near_the_border_is_none(
     assert not found.is_false_green, found
 
 
-def test_a_run_with_stereo_depth_is_the_same_twice_and_its_truth_is_that_of_what_is_seen(tmp_path: Path) -> None:
+def test_the_truth_of_a_run_with_stereo_depth_is_that_of_what_is_seen(tmp_path: Path) -> None:
     model = true_robot(tmp_path)
     chosen = (index for index in range(60) if draw_body(STEREO_SEED, index, family_of(STEREO_SEED, index)).parts)
     trial = next(t for t in (draw(STEREO_SEED, index, model) for index in chosen) if t.mode == "audit")
     found = run(STEREO_SEED, trial.index)
-    assert found == run(STEREO_SEED, trial.index)
     world = trial.world
     assert found.robot == f"slim {world.body.parts[0]}"
     assert found.spread > 0

@@ -255,12 +255,6 @@ def read_from_stream(path: Path) -> tuple[Float64, float, Bool]:
     return np.array(rest[3:]), resolution, cells
 
 
-def touched(grid: DistanceGrid, radius: float) -> Bool:
-    """Cells whose cube, seen as the ball around it, a ball around (0.1, 0, 0) reaches."""
-    distance = np.linalg.norm(centers(grid) - (0.1, 0.0, 0.0), axis=-1) - radius
-    return distance <= np.sqrt(0.75) * grid.voxel + 1e-6
-
-
 @pytest.mark.parametrize("channels", [("sdf", "bound"), ("sdf", "hard"), ("sdf", "hard", "bound")])
 def test_the_cells_that_a_splat_may_reach_into_are_occupied(
     tmp_path: Path, channels: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
@@ -289,18 +283,6 @@ def test_no_rounding_loses_a_cell_and_those_without_a_distance_are_occupied(
     assert origin.tolist() == grid.origin.tolist()
     sdf = grid.channels["sdf"]
     np.testing.assert_array_equal(cells, (grid.channels["bound"] <= 0) | (sdf <= 0) | np.isnan(sdf))
-
-
-@pytest.mark.parametrize(
-    ("voxel", "shape"), [(0.02, (9, 10, 11)), (0.1, (3, 29, 57)), (0.7, (7, 8, 9)), (1 / 3, (3, 1, 2))]
-)
-def test_no_rounding_loses_a_cell(tmp_path: Path, voxel: float, shape: tuple[int, int, int]) -> None:
-    grid = random_grid(shape=shape)
-    grid = DistanceGrid(origin=np.array([1e-5, -2.3, 0.0]), voxel=voxel, channels=grid.channels, header=dict(HEADER))
-    write_moveit(tmp_path / "field.moveit", grid)
-    origin, _, cells = read_from_stream(tmp_path / "field.moveit")
-    assert origin.tolist() == grid.origin.tolist()
-    np.testing.assert_array_equal(cells, (grid.channels["bound"] <= 0) | (grid.channels["sdf"] <= 0))
 
 
 MIDDLE = np.array([0.1, 0.0, 0.0])

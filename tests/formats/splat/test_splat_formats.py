@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.formats.splat import usd
-from splatctrl_cli.formats.splat.gaussian_ply import REFERENCE_PLY, SplatFormat, differences, write_gaussian_ply
+from splatctrl_cli.formats.splat.gaussian_ply import SplatFormat, differences, write_gaussian_ply
 from splatctrl_cli.formats.splat.splats import (
     FORMATS,
     as_gaussians,
@@ -78,12 +78,6 @@ def test_what_is_no_gaussian_or_no_whole_file_is_refused_in_one_line(tmp_path: P
     for length, read in ((len(content) // 2 - 3, read_splats), (20, read_splats), (20, describe)):
         path.write_bytes(content[:length])
         expect_refusal(f"a{kind.suffix}: ", read, path)
-
-
-def test_the_reference_layout_has_62_properties_whatever_the_labels(tmp_path: Path) -> None:
-    REFERENCE_PLY.write(tmp_path / "a.ply", labelled(10, 1), {})
-    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
-    assert header.count("property float") == header.count("property") == 62
 
 
 def test_what_lies_outside_a_formats_range_is_held_at_its_edge(tmp_path: Path) -> None:

@@ -39,14 +39,6 @@ def small_slabs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def splats(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("splats") / "splats.ply"
-    centers, radii = cloud()
-    write_ply(path, splat_set(centers, radii + 0.001), {})
-    return path
-
-
-@pytest.fixture(scope="module")
 def whole(splats: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What a bake in one slab gives."""
     out = tmp_path_factory.mktemp("whole") / "field"

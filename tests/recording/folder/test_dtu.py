@@ -175,20 +175,6 @@ def test_cameras_and_depth_of_the_full_size_fit_images_made_smaller(scan: Path) 
     np.testing.assert_array_equal(small.depth, found.depth)
 
 
-def test_pixels_that_are_hidden_or_not_finite_have_no_depth(scan: Path) -> None:
-    shown = np.full((48, 64), 255, np.uint8)
-    shown[20:30, 20:30] = 0
-    cv2.imwrite(str(scan / DEPTHS / "depth_visual_0001.png"), shown)
-    depth = np.full((48, 64), 700, np.float32)
-    depth[0, 0], depth[0, 1], depth[0, 2] = np.nan, np.inf, -5
-    write_pfm(scan / DEPTHS / "depth_map_0000.pfm", depth)
-    (scan / DEPTHS / "depth_visual_0000.png").unlink()
-    views = read_dtu(scan).views
-    np.testing.assert_allclose(views[0].depth[0, :4], [0, 0, 0, 0.7])
-    assert (views[1].depth[20:30, 20:30] == 0).all()
-    assert (views[1].depth[31:] > 0).all()
-
-
 @pytest.mark.parametrize(
     ("depth", "cameras", "message"),
     [
