@@ -104,7 +104,7 @@ def learn(
             configurations = _configurations(placed[:, number], FINE * STEP)
         used = [(view, int(k)) for view, k in zip(views, configurations, strict=True) if k >= 0]
         is_enough = configurations.max(initial=-1) + 1 >= NUM_CONFIGURATIONS
-        found = _grow_link(surface, number, boxes[number], used, reach, is_fine) if is_enough else []
+        found = _grow_link(surface, number, boxes[number], used, reach) if is_enough else []
         if parts := [part for part in found if len(part.triangles) or not is_fine]:
             learned += parts
         elif is_fine:
@@ -172,17 +172,17 @@ def _views(
 
 
 def _grow_link(
-    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float, is_fine: bool
+    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
 ) -> list[LearnedLink]:
     """`_learn_link`, with the reach doubled while parts extend that far."""
-    found = _learn_link(surface, number, box, used, reach, is_fine)
+    found = _learn_link(surface, number, box, used, reach)
     if 2 * reach <= MOST_REACH and any(part.outside_most > reach - VOXEL for part in found):
-        return _grow_link(surface, number, box, used, 2 * reach, is_fine)
+        return _grow_link(surface, number, box, used, 2 * reach)
     return found
 
 
 def _learn_link(
-    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float, is_fine: bool
+    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
 ) -> list[LearnedLink]:
     points = [transform_points(invert_transform(v.T_world_link[number]), v.points_world) for v, _ in used]
     points = [part[_is_in(box, part, reach)] for part in points]
@@ -210,7 +210,7 @@ def _learn_link(
         stays[is_solid], moves[is_solid] = _stays_in_world(*its, shown, poses[run, number])
         is_other[is_solid] = _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
         grid = _without_scene(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, stays, 0) > 0)
-        is_elsewhere = spread_cells(mask, is_other | (~moves if is_fine else False) | (stays & moves), 0) > 0
+        is_elsewhere = spread_cells(mask, is_other | (stays & moves), 0) > 0
         grid = _without_scene(np.where(is_elsewhere, np.float32(TRUNCATION), grid), np.zeros_like(mask))
         is_part = (grid < 0)[mask]
         if not is_part.any() and (index or len(np.unique(at[num_own >= LEAST_CELLS])) < NUM_CONFIGURATIONS):
