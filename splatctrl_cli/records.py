@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.ranges import MAX_PLACE
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -257,10 +257,11 @@ class Box:
             values = np.array([float(part) for part in text.split(",")])
         except ValueError:
             values = np.empty(0)
-        if values.shape != (6,) or not (np.abs(values) <= MAX_PLACE).all() or not np.all(values[:3] < values[3:]):
-            raise UsageError(
-                f"--box {text}: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1, y0 < y1, z0 < z1, within 1e6"
-            )
+        refuse_if(
+            values.shape != (6,) or not (np.abs(values) <= MAX_PLACE).all() or not np.all(values[:3] < values[3:]),
+            f"--box {text}: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1, y0 < y1, z0 < z1, within 1e6",
+            error=UsageError,
+        )
         return cls(lower=values[:3], upper=values[3:])
 
     def contains(self, points_world: NDArray[np.floating]) -> Bool:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import IN_FRONT
-from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.evaluate.metrics import (
     BAD_SHARE,
     DECIBELS,
@@ -143,8 +143,7 @@ def metric_scales() -> dict[str, Scale]:
 
 def total_score(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Each figure's mean over views that have it, or nan. Raises NotEvaluableError without a view."""
-    if not rows:
-        raise NotEvaluableError("no view was scored: expected at least one, got 0")
+    refuse_if(not rows, "no view was scored: expected at least one, got 0", error=NotEvaluableError)
     totals: dict[str, float] = {"num_views": len(rows)}
     for name in rows[0]:
         values = [row[name] for row in rows if not math.isnan(row[name])]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import OTHER_VIEW_CLEARLY, SAME_PLACE_DEGREES, SAME_PLACE_METRES
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.evaluate.held_out_depth import CLOUD_SCALES
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS
 from splatctrl_cli.evaluate.score import metric_scales
@@ -56,11 +56,11 @@ def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
     earlier = read_baseline(path)
     now, then = ({**one["protocol"], "scans": one.get("scans")} for one in (report, earlier))
     for name in ("name", "split", "mask_rule", "resolution", "averaging", "scans"):
-        if now.get(name) != then.get(name):
-            raise InputError(
-                f"{path}: not comparable: {name}: expected {now.get(name)}, got {then.get(name)}",
-                remedy="score the baseline anew, in the same way",
-            )
+        refuse_if(
+            now.get(name) != then.get(name),
+            f"{path}: not comparable: {name}: expected {now.get(name)}, got {then.get(name)}",
+            remedy="score the baseline anew, in the same way",
+        )
     old: Mapping[str, Any] = earlier["metrics"]
     return {
         PREFIX + name: value - old[name] if value is not None and isinstance(old.get(name), int | float) else None

@@ -10,7 +10,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Any, Generic, TypeVar
 
-from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError, did_you_mean
+from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError, did_you_mean, refuse_if
 
 E = TypeVar("E")  # what a criterion looks at
 
@@ -234,13 +234,18 @@ def check_gate_names(
     for requirement in requirements:
         name, _, _ = parse_gate(requirement)
         for options, others in (elsewhere or {}).items():
-            if name not in names and name in others:
-                raise UsageError(f"--require {requirement}: a figure of {options}", remedy="give it, or gate another")
-        if name not in names:
-            raise UsageError(
-                f"--require {requirement}: unknown metric",
-                remedy=did_you_mean(name, names, f"known here: {', '.join(names)}"),
+            refuse_if(
+                name not in names and name in others,
+                f"--require {requirement}: a figure of {options}",
+                remedy="give it, or gate another",
+                error=UsageError,
             )
+        refuse_if(
+            name not in names,
+            f"--require {requirement}: unknown metric",
+            remedy=did_you_mean(name, names, f"known here: {', '.join(names)}"),
+            error=UsageError,
+        )
 
 
 def gate_reasons(

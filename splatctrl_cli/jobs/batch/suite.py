@@ -114,10 +114,12 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     )
     _check_name(where, name)
     command = _worded(where, "command", table.get("command", base.command))
-    if command not in commands:
-        raise UsageError(
-            f"{where}: no job is called {command!r}", remedy=_suggest(command, commands, "give command = one of")
-        )
+    refuse_if(
+        command not in commands,
+        f"{where}: no job is called {command!r}",
+        remedy=_suggest(command, commands, "give command = one of"),
+        error=UsageError,
+    )
     own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
     refuse_if(own is not None, f"{where}: a batch gives {own} itself", remedy="leave it out", error=UsageError)
     matrix = table.get("matrix", {})
@@ -127,10 +129,12 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
         error=UsageError,
     )
     expect = _worded(where, "expect", table.get("expect", base.expect))
-    if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
-        raise UsageError(
-            f"{where} expect: no verdict is called {expect!r}", remedy=_suggest(expect, (*EXPECTED, "exit N"))
-        )
+    refuse_if(
+        expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect),
+        f"{where} expect: no verdict is called {expect!r}",
+        remedy=_suggest(expect, (*EXPECTED, "exit N")),
+        error=UsageError,
+    )
     return Job(
         name=name,
         command=command,
@@ -217,11 +221,19 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> N
             error=UsageError,
         )
         for job in recording.only:
-            if job not in jobs:
-                raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_suggest(job, jobs))
+            refuse_if(
+                job not in jobs,
+                f"[[recordings]] only: no job is called {job!r}",
+                remedy=_suggest(job, jobs),
+                error=UsageError,
+            )
         for job in recording.overrides:
-            if job not in (recording.only or jobs):
-                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_suggest(job, jobs))
+            refuse_if(
+                job not in (recording.only or jobs),
+                f"[recordings.jobs.{job}]: no job has this name",
+                remedy=_suggest(job, jobs),
+                error=UsageError,
+            )
 
 
 def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:

@@ -115,11 +115,12 @@ class Scorer:
             error=NotEvaluableError,
         )
         has_training = self.scene.names_its_views
-        if has_training and self.reference.has_depth and not any(view["seen_share"] for view in self.figures):
-            raise NotEvaluableError(
-                f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
-                remedy="is it the same world and the same scene? give the recording that reconstruct was given",
-            )
+        refuse_if(
+            has_training and self.reference.has_depth and not any(view["seen_share"] for view in self.figures),
+            f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
+            remedy="is it the same world and the same scene? give the recording that reconstruct was given",
+            error=NotEvaluableError,
+        )
 
     def _score_one(self, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None) -> None:
         frame = view.frame
