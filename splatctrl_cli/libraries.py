@@ -7,7 +7,7 @@ from pkgutil import iter_modules
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_faults
 
 
 class _LoadedLate(ModuleType):
@@ -40,12 +40,9 @@ def is_installed(module: str) -> bool:
 
 def of_extra(module: str, extra: str, what: str) -> Any:
     """A library that reads `what`. Raises UsageError if its extra is not installed."""
-    try:
+    remedy = f"pip install 'splatctrl-cli[{extra}]'"
+    with refuse_faults(f"{what} need the library {module}", ImportError, remedy=remedy, error=UsageError):
         return import_module(module)
-    except ImportError as error:
-        raise UsageError(
-            f"{what} need the library {module}: {error}", remedy=f"pip install 'splatctrl-cli[{extra}]'"
-        ) from None
 
 
 __all__ = ["distributed", "is_installed", "mpl", "of_extra", "scipy_io", "trimesh"]

@@ -155,21 +155,10 @@ class LossReport:
 class RecordSource(Protocol):
     """A recorded dataset as records in time order."""
 
-    @property
-    def name(self) -> str:
-        """The file's or folder's name."""
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Joints in the order of the states."""
-
-    @property
-    def has_clock(self) -> bool:
-        """False for invented stamps (static views)."""
+    name: str  # of the file or folder
+    cameras: tuple[str, ...]
+    joint_names: tuple[str, ...]  # in the order of the states
+    has_clock: bool  # False for invented stamps (static views)
 
     @property
     def loss(self) -> LossReport:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if, require
 from splatctrl_cli.libraries import scipy_io
 from splatctrl_cli.records import MILLIMETRES, Bool, Float64
 
@@ -213,10 +213,8 @@ class ObservedSpace:
 
 def scan_number(scan: str) -> int:
     """24 for ``scan24``. Raises InputError without a number."""
-    match = re.search(r"(\d+)$", scan)
-    if match is None:
-        raise InputError(f"scan '{scan}': expected a name with DTU's number, such as scan24")
-    return int(match[1])
+    number = re.search(r"\d+$", scan)
+    return int(require(number, f"scan '{scan}': expected a name with DTU's number, such as scan24")[0])
 
 
 def cloud_of_scan(folder: Path, scan: str) -> Path:

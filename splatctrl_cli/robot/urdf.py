@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64
 
@@ -278,9 +278,8 @@ def _check_limits(where: str, kind: str, limit: Any) -> None:
 
 def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape | tuple[str, str]]:
     geometry = collision.find("geometry")
-    element = None if geometry is None else next(iter(geometry), None)
-    if element is None:
-        raise InputError(f"{path}: link '{link}': collision without geometry")
+    first = next(iter(() if geometry is None else geometry), None)
+    element = require(first, f"{path}: link '{link}': collision without geometry")
     where = f"{path}: link '{link}': {element.tag}"
     T_link_shape = _origin(where, collision.find("origin"))
     if element.tag == "mesh":

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import DAMAGED, UsageError, refuse_if
+from splatctrl_cli.errors import DAMAGED, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, verdict_of
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, select_shard
@@ -229,12 +229,12 @@ def scheduling(
         with local_executor(workers) as executor:
             yield scheduler(executor=executor, slots=workers)
         return
-    try:
+    lacks, silent = "--dask: dask is not installed", f"--dask {dask}: no scheduler answers"
+    with (
+        refuse_faults(lambda _: lacks, ImportError, remedy="pip install 'splatctrl[dask]'", error=UsageError),
+        refuse_faults(silent, OSError, ValueError, remedy="check the address", error=UsageError),
+    ):
         client = distributed.Client(dask, timeout=CONNECT_S)
-    except ImportError:
-        raise UsageError("--dask: dask is not installed", remedy="pip install 'splatctrl[dask]'") from None
-    except (OSError, ValueError) as error:
-        raise UsageError(f"--dask {dask}: no scheduler answers: {error}", remedy="check the address") from None
     with client:
         yield scheduler(
             executor=client.get_executor(pure=False, retries=2),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config.ranges import format_value
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if
+from splatctrl_cli.errors import UsageError, did_you_mean, refuse_faults, refuse_if
 
 Table = Mapping[str, Any]
 
@@ -68,14 +68,13 @@ class Suite:
 
 def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     """Read a suite; commands: allowed ones. Raises InputError, or UsageError for its content."""
-    try:
+    example = "see splatctrl help batch for an example"
+    refuse_if(path.is_dir(), f"{path}: is a folder", remedy="give the suite's file, or --list with it")
+    with (
+        refuse_faults(lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy="check the path"),
+        refuse_faults(f"{path}: is not TOML", ValueError, remedy=example, error=UsageError),
+    ):
         document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: is not TOML: {error}", remedy="see splatctrl help batch for an example") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a folder", remedy="give the suite's file, or --list with it") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the path") from None
     _check_keys(path.name, document, ("name", "out", "recordings", "jobs"))
     folder = path.absolute().parent
     name = _worded(path.name, "name", document.get("name", path.stem))

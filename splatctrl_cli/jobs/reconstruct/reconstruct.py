@@ -272,7 +272,9 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
     frames = [
         depth_frame(item)
         for item in source.stored()
-        if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen and arm.is_posed(item.stamp_ns)
+        if isinstance(item, StoredFrame)
+        and (item.camera, item.stamp_ns) in chosen
+        and arm.posture(item.stamp_ns) is not None
     ]
     progress.log(f"the robot is measured in {counted(len(frames), 'frame')} of {counted(len(order), 'moment')}")
     return frames
