@@ -11,7 +11,7 @@ from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import KERNEL_OF, KERNELS, SphereField, device_field
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
-from splatctrl_cli.field.probability import make_probability
+from splatctrl_cli.field.probability import PROBABILITIES
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.memory import Memory
@@ -65,7 +65,9 @@ class Baker:
         kinds = {name: kind for name, kind in KERNELS.items() if name in names}
         self.kernels = {name: kind(self.spheres, config, threads=threads) for name, kind in kinds.items()}
         has_probability = "probability" in channels
-        self.probability = make_probability(self.spheres, config, threads=threads) if has_probability else None
+        self.probability = (
+            PROBABILITIES[config.probability](self.spheres, config, threads) if has_probability else None
+        )
         self.counts = {f"{name}_{what}": 0 for name in self.kernels for what in ("without_value", "over_estimates")}
         self._occupancy, self._thresholds = occupancy, thresholds or OccupancyConfig()
         self.on_device = None if device is None else device_field(self.spheres, self.kernels, config, device)

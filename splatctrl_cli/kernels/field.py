@@ -233,31 +233,6 @@ def bake_kernel(
     )
 
 
-def touched_blocks(
-    spheres: Clusters,
-    offsets: Offsets,
-    changed: UInt8,
-    length: float | None,
-    span: GridSpan,
-    is_touched: UInt8,
-    *,
-    threads: int = 0,
-) -> None:
-    """Set is_touched (blocks) to 1 where spheres in `changed` (16 C,) can matter.
-
-    For `bake_hard` if `length` is None (offsets: radii), else for a Gaussian `bake_kernel` (``2 l^2 log |w_i|``).
-    """
-    native.field_touched(
-        *spheres,
-        *offsets,
-        changed,
-        0.0 if length is None else length,
-        *span.arrays[:3],
-        num_threads(threads),
-        is_touched,
-    )
-
-
 def interpolate(values: Float32, origin: Float64, voxel: float, points: Float64) -> tuple[Float64, Float64]:
     """Trilinear value (Q,) and that interpolant's gradient (Q, 3), for points (Q, 3).
 

@@ -231,10 +231,6 @@ class OccupancyMap:
         cells = np.stack(np.unravel_index(voxels, self.log_odds.shape), axis=1)
         return (self.origin + self.config.voxel * cells).astype(np.float32)
 
-    def occupied_centers(self) -> Float32:
-        """Centres (K, 3) [m] of `occupied_voxels`."""
-        return self.centers_of(self.occupied_voxels())
-
     def grid(self) -> OccupancyGrid:
         return OccupancyGrid(
             origin=self.origin.copy(),

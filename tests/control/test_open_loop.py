@@ -8,8 +8,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.columns import NamedColumns
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
-from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
-from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
+from splatctrl_cli.control.replay import OpenLoopTask, Outcome, ReplayTask, ReplayTrace, closed_loop, open_loop
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Bool, DistanceField, Float64
 from tests.control.fakes import PlanarArm, Plane, far_away

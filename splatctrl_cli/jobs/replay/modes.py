@@ -9,10 +9,17 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.columns import step_columns
 from splatctrl_cli.control.goals import LoggedMotion, PlanDetour, TwistTrack
-from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.outside import OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
-from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
+from splatctrl_cli.control.replay import (
+    OpenLoopTask,
+    ReplayTask,
+    ReplayTrace,
+    closed_loop,
+    divergence,
+    open_loop,
+    scene_change,
+)
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.spilled_rows import ObjectFile
