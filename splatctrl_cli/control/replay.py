@@ -214,7 +214,7 @@ class _Course:
         return task.anchors.at(stamp_ns)
 
     def outcome(self, stamp_ns: int, index: int, step: ControlStep, q: Float64) -> Outcome | None:
-        """Outcome if the course ends with this step from q (J,), None if it goes on."""
+        """Outcome if the course ends with this step from q (J,), else None."""
         if self.has_ended(stamp_ns, index, step):
             return Outcome.GOAL_REACHED
         return Outcome.STALLED if self.has_stalled(stamp_ns, index, q) else None
