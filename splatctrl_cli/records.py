@@ -85,7 +85,7 @@ class RgbdFrame:
     valid: Bool | None = None
 
     @property
-    def in_view(self) -> Bool:
+    def is_in_view(self) -> Bool:
         """`valid` (H, W), True everywhere if None."""
         return np.ones(self.depth.shape, bool) if self.valid is None else self.valid
 
@@ -116,7 +116,7 @@ def spread(items: Sequence[Item], most: int) -> list[Item]:
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))]
 
 
-def by_stamp(*streams: Iterable[Item]) -> Iterator[Item]:
+def merge_by_stamp(*streams: Iterable[Item]) -> Iterator[Item]:
     """Merge sorted streams by stamp; at equal stamps, earlier streams come first."""
     return heapq.merge(*streams, key=attrgetter("stamp_ns"))
 

@@ -12,7 +12,7 @@ from splatctrl_cli.records import RgbdFrame
 
 
 class Severity(StrEnum):
-    """error: a later command fails or errs; warning: a loss or doubt; note: no fault."""
+    """Error: a later command fails or errs; warning: a loss or doubt; note: no fault."""
 
     ERROR = "error"
     WARNING = "warning"

@@ -134,7 +134,7 @@ def closed_loop(
         check_goal(model, waypoint.T_world_goal)
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
     check_free(model, field, q, distance_to)
-    controller = controller.with_field(field, balls_at(task.stamp_ns))
+    controller = controller.replace_field(field, balls_at(task.stamp_ns))
     by_surface: tuple[str, ...] = ()
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
@@ -150,7 +150,7 @@ def closed_loop(
         if field_at(stamp) is not field:
             changes.append(scene_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
-            controller = controller.with_field(field, balls_at(stamp))
+            controller = controller.replace_field(field, balls_at(stamp))
         rate = rate_of(config, model, scene_step_at, stamp, q)
         goal, guide = course.goal(stamp, q)
         moment = Moment(
@@ -351,7 +351,7 @@ def open_loop(
             continue
         if field_at(int(stamp)) is not field:
             field = field_at(int(stamp))
-            controller = controller.with_field(field)
+            controller = controller.replace_field(field)
         goal, guide = (task.T_world_goal, None)
         if task.twists is not None:
             goal, guide = task.twists.goal_at(model, config, task.frame, q, int(stamp))

@@ -223,7 +223,7 @@ def compare_with_truth(
     median_radius: float,
     probabilities: Mapping[str, Callable[[Float64, Float64], Float64]],
 ) -> tuple[dict[str, Any], dict[str, Reliability]]:
-    """Accuracy of `FIELDS` where `frames` saw the surface, as in ``field.json``, and reliability by probability form.
+    """Accuracy of `FIELDS` where `frames` saw the surface (``field.json``), and reliability by probability form.
 
     Of sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]. name: of the
     truth. workspace: where the scene keeps splats. probabilities: functions of points (Q, 3) and sdf (Q,) [m].

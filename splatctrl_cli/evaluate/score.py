@@ -101,7 +101,7 @@ def score_view(
             "ssim": float(similarity[region].mean()) if region.any() else math.nan,
             **errors,
             "depth_coverage": errors["depth_pixels"] / num_reference if num_reference else math.nan,
-            "in_front": in_front(depth, frame.depth, region),
+            "in_front": share_in_front(depth, frame.depth, region),
         }
         figures |= {f"{figure}_{name}": value for figure, value in found.items()}
     return figures
@@ -121,7 +121,7 @@ def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float
     return float(mass[is_inside & is_free[i, j, k]].sum() / mass.sum()) if mass.sum() > 0 else math.nan
 
 
-def in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
+def share_in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
     """Share of masked pixels with both depths whose `depth` is nearer by more than IN_FRONT.
 
     nan without such pixels.

@@ -65,7 +65,7 @@ note = partial(Reason, outcome=Outcome.PASSED, is_note=True)
 """Decides nothing and is worth a line."""
 
 
-def held(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
+def passed_reason(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
     """A passed criterion, not worth a line."""
     return Reason(outcome=Outcome.PASSED, sentence=sentence, value=value, threshold=threshold, unit=unit, count=count)
 
@@ -131,7 +131,7 @@ class Verdict:
         return tuple(reason for reason in self.reasons if reason.outcome is not Outcome.PASSED)
 
     @property
-    def said(self) -> tuple[Reason, ...]:
+    def shown(self) -> tuple[Reason, ...]:
         return tuple(reason for reason in self.reasons if reason.is_note and reason.outcome is Outcome.PASSED)
 
     @property
@@ -208,7 +208,7 @@ def brief(result: Any) -> str:
     return f"{type(result).__name__}({', '.join(shown)})"
 
 
-def counted(number: float, noun: str) -> str:
+def plural(number: float, noun: str) -> str:
     """``1 view``, ``2 views``."""
     return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
 

@@ -120,13 +120,13 @@ class Baker:
         where = None if mask is None else _cells(mask, span)
         if where is not None and not where.any():
             return
-        made = self._made(span, where)
+        made = self._make_channels(span, where)
         for name in self.channels:
             out[name][... if where is None else where] = made[name]
 
-    def _made(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
+    def _make_channels(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
         cells = None if where is None else np.flatnonzero(where)
-        made, entry = self._by_processor(span, cells) if self.on_device is None else self._by_device(span)
+        made, entry = self._bake_on_processor(span, cells) if self.on_device is None else self._bake_on_device(span)
         if self.probability is not None:
             whole = np.zeros(span.shape_of_channel, np.float32)
             whole[... if where is None else where] = made["sdf"]
@@ -138,7 +138,7 @@ class Baker:
             made["observed"] = _pick(observed, cells)
         return made
 
-    def _by_processor(self, span: GridSpan, cells: Index | None) -> _Made:
+    def _bake_on_processor(self, span: GridSpan, cells: Index | None) -> _Made:
         hard, gradient, entry = self._hard(span, cells)
         kernels = {name: self._kernel(name, span, cells) for name in self.kernels}
         for name, (distance, _) in kernels.items():
@@ -154,7 +154,7 @@ class Baker:
             made[name] = np.where(np.isnan(distance), hard, distance)
         return made, entry
 
-    def _by_device(self, span: GridSpan) -> _Made:
+    def _bake_on_device(self, span: GridSpan) -> _Made:
         assert self.on_device is not None
         wanted = {*self.channels, "entry"} if "label" in self.channels else set(self.channels)
         found = self.on_device.bake(span, wanted, margin=self.bound_margin)

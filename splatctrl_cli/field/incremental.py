@@ -14,7 +14,7 @@ from splatctrl_cli.records import Float64, SplatSet, UInt8
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """mask (blocks of the grid): 1 where a bake is needed; None: everywhere, for `reason`."""
+    """Mask (blocks of the grid): 1 where a bake is needed; None: everywhere, for `reason`."""
 
     mask: UInt8 | None
     num_blocks: int

@@ -28,7 +28,7 @@ class Clusters(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """values (16 C,): o of ``|x - p| - o`` [m], or b of ``|x - p|^2 - b`` [m^2]; spare -1e30.
+    """Values (16 C,): o of ``|x - p| - o`` [m], or b of ``|x - p|^2 - b`` [m^2]; spare -1e30.
 
     maxima (C + G,): the largest of clusters, then groups.
     """

@@ -159,7 +159,7 @@ def test_angular_twists_turn_with_the_link_too() -> None:
     """The link's x axis is the world's y, its y the world's z."""
     arm = PlanarArm()
     arm.frame_pose = lambda q, frame: pose_at([0, 0, 0], [[0, 0, 1], [1, 0, 0], [0, 1, 0]])  # type: ignore[method-assign]
-    found = track([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], axes="tip").in_world(arm, BENT, 0, 0.5)
+    found = track([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], axes="tip").find_world_twist(arm, BENT, 0, 0.5)
     np.testing.assert_allclose(found, [0.3, 0.1, 0.2, 0.6, 0.4, 0.5])
 
 

@@ -197,7 +197,7 @@ def test_a_killed_writer_leaves_no_lock_and_can_be_gone_on_from(tmp_path: Path, 
 def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
 
-    held = output.held
+    held = output.lock_output
 
     @contextmanager
     def held_late(partial: Path, *, is_folder: bool) -> Iterator[None]:

@@ -60,7 +60,7 @@ def test_the_voxels_are_those_of_the_plain_reference(voxel: float) -> None:
 
 def balls(*cells: tuple[int, int, int]) -> Balls:
     centers = 0.02 * np.array(cells, np.float32).reshape(-1, 3)
-    return Balls.of_voxels(centers, 0.02, np.full(len(cells), Label.OBJECT, np.uint8))
+    return Balls.from_voxels(centers, 0.02, np.full(len(cells), Label.OBJECT, np.uint8))
 
 
 Cells = list[tuple[int, int, int]]

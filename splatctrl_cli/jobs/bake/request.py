@@ -152,7 +152,7 @@ def read_previous(path: Path, scene: Path) -> Previous:
         lambda _: f"--update {path}: has no readable run.json", InputError, remedy="bake it once without --update"
     ):
         run = read_object(path / "run.json")
-    grid = read_npz(Parts.of_run(path, run).checked(file))
+    grid = read_npz(Parts.from_run(path, run).checked(file))
     is_ours = run.get("command") == "sdf-bake" and run.get("splatctrl") == __version__
     refuse_if(
         not is_ours or "unrepresented_voxels" not in grid.header,

@@ -281,7 +281,7 @@ def _open_source(request: QueryRequest, progress: Progress) -> Answering:
         error=UsageError,
     )
     check_room(str(file), file.stat().st_size, "bake a smaller --box or a larger --voxel")
-    grid = read_npz(Parts.beside(file).checked(file))
+    grid = read_npz(Parts.from_folder(file).checked(file))
     box, of_grid = grid_answers(grid, str(file))
     if request.scene is None:
         refuse_if(

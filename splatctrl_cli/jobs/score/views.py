@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.calibration.displacement import placed
+from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, space_out, thin
@@ -78,7 +78,7 @@ class Scorer:
             training=scene.cameras,
             has_clock=has_clock,
             numbered_by_stamp=self.reference.numbered_by_stamp,
-            corrected=lambda frame: corrected(placed(frame, off), scene.corrections),
+            corrected=lambda frame: corrected(correct_pose(frame, off), scene.corrections),
         )
         may_train = self.allow_training or self.reference.scores_training
         wait = Wait(progress, f"scores {', '.join(self.cameras)}", "views").announce()
@@ -218,7 +218,7 @@ class CloudSettings:
     masks: Path | None = None
     space: ObservedSpace | None = None
 
-    def of_scan(self, scan: str | None) -> "CloudSettings":
+    def select_scan(self, scan: str | None) -> "CloudSettings":
         """Settings with one scan's files. Raises InputError naming missing files."""
         path = cloud_of_scan(self.path, scan or "") if self.path.is_dir() else self.path
         return replace(self, path=path, space=None if self.masks is None else read_observed(self.masks, scan or ""))
