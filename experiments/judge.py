@@ -118,7 +118,7 @@ def deepest_contact(problem: Problem, position: Float64) -> Contact:
     return Contact(q=q, sphere=sphere, point=surface[0], when=when)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class MotionSource:
     """A motion as a log without frames."""
 

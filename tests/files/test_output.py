@@ -205,7 +205,7 @@ def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monke
         with held(partial, is_folder=is_folder):
             yield
 
-    monkeypatch.setattr(output, "held", held_late)
+    monkeypatch.setattr(output, "lock_output", held_late)
     with pytest.raises(UsageError, match="already exists"), output_path(out, force=False, is_folder=True):
         pytest.fail("must not get here")
     assert names(tmp_path) == ["out"]
