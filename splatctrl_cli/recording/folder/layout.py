@@ -61,8 +61,8 @@ def ask_description(name: str, *examples: str) -> Callable[[Path, SourceOptions]
     def refuse(folder: Path, _: SourceOptions) -> Description:
         raise InputError(
             f"{folder}: laid out as {name}, whose lens and poses a description names",
-            remedy=f"write {' or '.join(examples)} as `splatctrl help input` shows it ({name}), and give it with"
-            f" --root {folder}",
+            remedy=f"write {' or '.join(f'{one}.toml (`splatctrl help {one}` prints it)' for one in examples)}, enter"
+            f" your numbers, and give it with --root {folder}",
         )
 
     return refuse
