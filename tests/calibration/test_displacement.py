@@ -140,7 +140,7 @@ def test_where_one_camera_cannot_be_corrected_none_is(arm: Arm, frames: list[Rgb
 def test_a_joint_whose_zero_is_off_does_not_move_a_camera(
     arm: Arm, frames: list[RgbdFrame], joint: int, degrees: float
 ) -> None:
-    posture = arm._posture
+    posture = arm.posture
 
     def bent(stamp_ns: int) -> Float64 | None:
         q = posture(stamp_ns)
