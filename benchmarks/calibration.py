@@ -27,7 +27,7 @@ from splatctrl_cli.geometry import invert_transform, look_at
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 from splatctrl_cli.recording.container.mcap_writer import mcap_log
 from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame, by_stamp
+from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame, merge_by_stamp
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import HAND, Motion
@@ -120,7 +120,7 @@ class SetUp(Recording):
 
     def records(self) -> Iterator[Record]:
         """By stamp."""
-        return by_stamp(self.joint_states(), self.frames())
+        return merge_by_stamp(self.joint_states(), self.frames())
 
     def static_transforms(self) -> list[Transform]:
         """The cameras where they are taken to be."""

@@ -27,7 +27,7 @@ from splatctrl_cli.config.fixed import FEWEST_STRETCHES
 from splatctrl_cli.evaluate.conformal import autocorrelation_time, conformal_rank, stretch_scores, stretches
 from splatctrl_cli.jobs.replay.evidence import misses_of
 from splatctrl_cli.jobs.replay.inputs import open_log, read_states
-from splatctrl_cli.jobs.replay.lockstep import from_log
+from splatctrl_cli.jobs.replay.lockstep import reconstruct_scene
 from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
 from splatctrl_cli.jobs.running.progress import SILENT
@@ -131,7 +131,7 @@ def trial_of(seed: int) -> Trial | None:
             log=folder / "log.mcap", urdf=urdf, spheres=spheres, out=folder, config=config, options=options, threads=1
         )
         states = read_states(open_log(request)[1], model)
-        scene = from_log(request, model, folder, SILENT)
+        scene = reconstruct_scene(request, model, folder, SILENT)
         inputs = ReplayInputs(
             source=states.source, states=states.states, model=model, scene=scene, truth=None, digests={}
         )

@@ -18,7 +18,7 @@ from experiments.paths import joint_length
 from experiments.problems import Problem
 from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
-from splatctrl_cli.planner.planned import resampled
+from splatctrl_cli.planner.planned import resample
 from splatctrl_cli.records import Float64
 
 STEP, FINE = 0.05, 0.01  # [rad] of OMPL's edge check, and of the recheck
@@ -46,7 +46,7 @@ def notes_beside_ompl(clearance: Clearance, problems: Sequence[Problem]) -> list
 
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(1)
-    rooms = [(problem, clearance.in_scene(solids_of(problem.things))) for problem in problems]
+    rooms = [(problem, clearance.replace_scene(solids_of(problem.things))) for problem in problems]
     valid = [(p, room) for p, room in rooms if min(room.at(np.array([p.start, p.goal]))) > 0]
     notes = []
     for way, by_edges in (("states", False), ("edges", True)):
@@ -103,7 +103,7 @@ def solved(problem: Problem, room: Clearance, *, by_edges: bool) -> Answer | Non
     setup.simplifySolution()
     total = process_time() - began
     path = np.array([_posture(state, J) for state in setup.getSolutionPath().getStates()])
-    num_hit = sum(bool(np.min(room.at(resampled(path[i : i + 2], FINE))) < 0) for i in range(len(path) - 1))
+    num_hit = sum(bool(np.min(room.at(resample(path[i : i + 2], FINE))) < 0) for i in range(len(path) - 1))
     return Answer(path=path, search=search, total=total, num_calls=calls[0], num_hit=num_hit)
 
 

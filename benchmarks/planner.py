@@ -21,7 +21,7 @@ from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.planner.birrt import Plan, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
-from splatctrl_cli.planner.planned import resampled, time_path
+from splatctrl_cli.planner.planned import resample, time_path
 from splatctrl_cli.records import Bool, Float64
 
 FRAME = "panda_grasptarget"
@@ -54,7 +54,7 @@ def run(options: Options) -> Result:
     solved: list[Solved] = []
     failed, invalid = [], []
     for problem in problems:
-        room = clearance.in_scene(solids_of(problem.things))
+        room = clearance.replace_scene(solids_of(problem.things))
         start = process_time()
         try:
             answer = plan(room, problem.start, problem.goal, PlannerConfig())
@@ -65,7 +65,7 @@ def run(options: Options) -> Result:
             failed.append(f"{_name(problem)}: {answer.outcome} after {answer.num_iterations} iterations")
             continue
         solved.append(_solved(problem, answer, process_time() - start, room))
-    runs = [_followed(s, clearance.in_scene(solids_of(s.problem.things))) for s in solved[::EVERY_TRACKED]]
+    runs = [_followed(s, clearance.replace_scene(solids_of(s.problem.things))) for s in solved[::EVERY_TRACKED]]
     edges = _edge_checks(clearance, problems[::10])
     notes = notes_beside_ompl(clearance, problems if options.is_quick else problems[::10])
     return _result(solved, failed, invalid, edges, runs, notes)
@@ -77,14 +77,14 @@ def _name(problem: Problem) -> str:
 
 def _solved(problem: Problem, answer: Plan, cpu: float, room: Clearance) -> Solved:
     path = answer.waypoints
-    num_hit = sum(bool(np.min(room.at(resampled(path[i : i + 2], FINE))) < 0) for i in range(len(path) - 1))
+    num_hit = sum(bool(np.min(room.at(resample(path[i : i + 2], FINE))) < 0) for i in range(len(path) - 1))
     return Solved(
         problem=problem,
         plan=answer,
         cpu=cpu,
         num_hit=num_hit,
         clearance=least_clearance(room, path).lower,
-        effector=effector_length(room.model, resampled(path, COARSE), FRAME),
+        effector=effector_length(room.model, resample(path, COARSE), FRAME),
     )
 
 
@@ -130,13 +130,13 @@ def _edge_checks(clearance: Clearance, problems: Sequence[Problem]) -> dict[str,
     random = np.random.default_rng(0)
     counts = dict.fromkeys(("edges", "free", "checks", "false", "fixed_checks", "fixed_false", "refused"), 0)
     for problem in problems:
-        room, model = clearance.in_scene(solids_of(problem.things)), clearance.model
+        room, model = clearance.replace_scene(solids_of(problem.things)), clearance.model
         start = _free_postures(room, random)
         way = random.normal(size=start.shape)
         way *= random.uniform(0.3, 1.5, (len(way), 1)) / np.linalg.norm(way, axis=1, keepdims=True)
         end = np.clip(start + way, model.lower, model.upper)
         check = check_edges(room, start, end, contact=PlannerConfig().contact)
-        truth = np.array([np.min(room.at(resampled(np.array(e), 1e-3))) >= 0 for e in zip(start, end, strict=True)])
+        truth = np.array([np.min(room.at(resample(np.array(e), 1e-3))) >= 0 for e in zip(start, end, strict=True)])
         fixed, num_fixed = _fixed_steps(room, start, end)
         counts["edges"] += len(start)
         counts["free"] += int(truth.sum())
@@ -159,7 +159,7 @@ def _fixed_steps(room: Clearance, start: Float64, end: Float64) -> tuple[Bool, i
     """Which edges samples `COARSE` apart take for free, and how many samples that took."""
     is_free, num_checks = np.ones(len(start), dtype=bool), 0
     for e, edge in enumerate(zip(start, end, strict=True)):
-        is_hit = room.at(resampled(np.array(edge), COARSE)[1:]) < 0
+        is_hit = room.at(resample(np.array(edge), COARSE)[1:]) < 0
         is_free[e] = not np.any(is_hit)
         num_checks += int(np.argmax(is_hit)) + 1 if np.any(is_hit) else len(is_hit)
     return is_free, num_checks

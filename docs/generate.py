@@ -78,7 +78,7 @@ Registry = tuple[tuple[str, ...], Iterable[Entry]]
 LISTS: dict[str, Registry] = {  # with the words before what follows an entry's first sentence
     "criteria": (("**else**",), CRITERIA),
     "limits": (("since",), (LIMITS[0], ALONE, *LIMITS[1:], PROOF)),
-    "metrics": (("by",), [*documented()]),
+    "metrics": (("",), [*documented()]),
     "splat_formats": (("rounding", "without"), SPLAT_FORMATS.values()),
     "grid_formats": (("for",), GRID_FORMATS.values()),
     "datasets": (("poses", "depth", "intrinsics"), LAYOUTS),
@@ -109,7 +109,7 @@ def _filled(found: re.Match[str]) -> str:
 def _line(titles: tuple[str, ...], name: str, meaning: str, *cells: str) -> str:
     """An entry of a list."""
     return "; ".join(
-        [f"- {name}: {meaning}", *(f"{title} {cell}" for title, cell in zip(titles, cells, strict=False))]
+        [f"- {name}: {meaning}", *(f"{title} {cell}".strip() for title, cell in zip(titles, cells, strict=False))]
     )
 
 

@@ -77,7 +77,7 @@ def against_truth(problem: Problem, position: Float64, views: Views) -> Executio
         contact = deepest_contact(problem, position)
         surface = HIT_SEEN if views.has_seen(contact.point[None])[0] else HIT_UNSEEN
         cause = HIT_SELF if contact.is_own else surface
-    alone = Clearance.of(problem.model.with_self_pairs(NO_PAIRS), problem.solids)
+    alone = Clearance.of(problem.model.replace_self_pairs(NO_PAIRS), problem.solids)
     clearance = least_clearance(alone, position, tolerance=5e-4)
     return Execution(
         cause=cause,
@@ -118,7 +118,7 @@ def deepest_contact(problem: Problem, position: Float64) -> Contact:
     return Contact(q=q, sphere=sphere, point=surface[0], when=when)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class MotionSource:
     """A motion as a log without frames."""
 

@@ -171,7 +171,7 @@ def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
     centers = grid.origin + grid.voxel * np.argwhere(is_thing)
     if not len(centers):
         raise NotEvaluableError("occupancy grid: no voxel is occupied")
-    balls = Balls.of_voxels(centers.astype(np.float32), grid.voxel, np.zeros(len(centers), np.uint8))
+    balls = Balls.from_voxels(centers.astype(np.float32), grid.voxel, np.zeros(len(centers), np.uint8))
     radii = np.full(len(balls), balls.radius, np.float32)
     field = SphereField(Spheres.of(balls.centers, radii), threads=threads)
     scene = Certified(distance=_less_rounding(field))

@@ -230,7 +230,7 @@ class Trial:
         )
         if not len(down):
             return NO_GRASP
-        alone = scene.model.with_self_pairs(judge.NO_PAIRS)
+        alone = scene.model.replace_self_pairs(judge.NO_PAIRS)
         around = Clearance.of(alone, solids_of([*scene.drawn.things, *room()]))
         is_free = check_edges(around, hover[None], down, contact=judge.TOUCH).is_free.all()
         return "" if is_free else HIT_GRASPING
@@ -259,7 +259,7 @@ def _held_cube(scene: Scene, q: Float64) -> Primitive:
 
 def _clearance(model: RobotModel, known: Map, position: Float64) -> float:
     """The least distance [m] of a motion (T, J) to the map, on the whole way."""
-    in_map = Clearance.of(model.with_self_pairs(judge.NO_PAIRS), known.scene)
+    in_map = Clearance.of(model.replace_self_pairs(judge.NO_PAIRS), known.scene)
     return least_clearance(in_map, position, tolerance=5e-4).upper
 
 

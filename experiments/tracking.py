@@ -68,7 +68,7 @@ def follow_with_controller(
         now = stamp_ns + round(len(steps) * period * 1e9)
         if field_at(now) is not field:
             field = field_at(now)
-            controller = controller.with_field(field)
+            controller = controller.replace_field(field)
         wanted, velocity = (row[0] for row in path.at(clock))
         goal, guide = guided_goal(model, frame, wanted, velocity)
         if clock >= path.duration and is_at_goal(pose_error(model.frame_pose(q, frame), goal), control):

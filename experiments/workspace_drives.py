@@ -169,7 +169,7 @@ def driven(
         if index % every == 0:
             field = see(index // every, q)
             controller = (
-                controller.with_field(field) if controller else QpIkController(model, control, field, frame=FRAME)
+                controller.replace_field(field) if controller else QpIkController(model, control, field, frame=FRAME)
             )
         assert controller is not None
         stamp = START_NS + round(index * control.period * 1e9)

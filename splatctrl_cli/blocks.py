@@ -62,7 +62,8 @@ from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.kernels import native, num_threads
 from splatctrl_cli.kernels import raster as gaussian_kernels
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
-from splatctrl_cli.libraries import is_installed, mpl, of_extra
+from splatctrl_cli.libraries import import_extra as of_extra
+from splatctrl_cli.libraries import is_installed, mpl
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import (
     Ball,
@@ -82,8 +83,8 @@ from splatctrl_cli.planner.planned import (
     goal_postures,
     planned_detours,
     planned_path,
-    resampled,
 )
+from splatctrl_cli.planner.planned import resample as resampled
 from splatctrl_cli.recording.calibrated import Perturbation
 from splatctrl_cli.recording.folder.dtu import scan_folders
 from splatctrl_cli.recording.folder.idr import idr_scans

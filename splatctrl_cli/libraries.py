@@ -7,7 +7,7 @@ from pkgutil import iter_modules
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_faults
 
 
 class _LoadedLate(ModuleType):
@@ -38,17 +38,14 @@ def is_installed(module: str) -> bool:
         return False
 
 
-def of_extra(module: str, extra: str, what: str) -> Any:
+def import_extra(module: str, extra: str, what: str) -> Any:
     """A library that reads `what`. Raises UsageError if its extra is not installed."""
-    try:
+    remedy = f"pip install 'splatctrl-cli[{extra}]'"
+    with refuse_faults(f"{what} need the library {module}", ImportError, remedy=remedy, error=UsageError):
         return import_module(module)
-    except ImportError as error:
-        raise UsageError(
-            f"{what} need the library {module}: {error}", remedy=f"pip install 'splatctrl-cli[{extra}]'"
-        ) from None
 
 
-__all__ = ["distributed", "is_installed", "mpl", "of_extra", "scipy_io", "trimesh"]
+__all__ = ["distributed", "import_extra", "is_installed", "mpl", "scipy_io", "trimesh"]
 
 
 Entry = TypeVar("Entry")  # of a registry; lists and trials start with the lowest `order`

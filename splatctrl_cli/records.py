@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.ranges import MAX_PLACE
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -85,7 +85,7 @@ class RgbdFrame:
     valid: Bool | None = None
 
     @property
-    def in_view(self) -> Bool:
+    def is_in_view(self) -> Bool:
         """`valid` (H, W), True everywhere if None."""
         return np.ones(self.depth.shape, bool) if self.valid is None else self.valid
 
@@ -116,7 +116,7 @@ def spread(items: Sequence[Item], most: int) -> list[Item]:
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))]
 
 
-def by_stamp(*streams: Iterable[Item]) -> Iterator[Item]:
+def merge_by_stamp(*streams: Iterable[Item]) -> Iterator[Item]:
     """Merge sorted streams by stamp; at equal stamps, earlier streams come first."""
     return heapq.merge(*streams, key=attrgetter("stamp_ns"))
 
@@ -155,21 +155,10 @@ class LossReport:
 class RecordSource(Protocol):
     """A recorded dataset as records in time order."""
 
-    @property
-    def name(self) -> str:
-        """The file's or folder's name."""
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Joints in the order of the states."""
-
-    @property
-    def has_clock(self) -> bool:
-        """False for invented stamps (static views)."""
+    name: str  # of the file or folder
+    cameras: tuple[str, ...]
+    joint_names: tuple[str, ...]  # in the order of the states
+    has_clock: bool  # False for invented stamps (static views)
 
     @property
     def loss(self) -> LossReport:
@@ -257,10 +246,11 @@ class Box:
             values = np.array([float(part) for part in text.split(",")])
         except ValueError:
             values = np.empty(0)
-        if values.shape != (6,) or not (np.abs(values) <= MAX_PLACE).all() or not np.all(values[:3] < values[3:]):
-            raise UsageError(
-                f"--box {text}: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1, y0 < y1, z0 < z1, within 1e6"
-            )
+        refuse_if(
+            values.shape != (6,) or not (np.abs(values) <= MAX_PLACE).all() or not np.all(values[:3] < values[3:]),
+            f"--box {text}: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1, y0 < y1, z0 < z1, within 1e6",
+            error=UsageError,
+        )
         return cls(lower=values[:3], upper=values[3:])
 
     def contains(self, points_world: NDArray[np.floating]) -> Bool:

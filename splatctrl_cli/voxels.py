@@ -121,7 +121,7 @@ class Balls(Columns):
     labels: UInt8
 
     @classmethod
-    def of_voxels(cls, centers: Float32, voxel: float, labels: UInt8) -> "Balls":
+    def from_voxels(cls, centers: Float32, voxel: float, labels: UInt8) -> "Balls":
         """Balls around voxels of edge `voxel` [m] at centers (K, 3)."""
         return cls(centers=centers, radius=0.5 * 3**0.5 * voxel, labels=labels)
 

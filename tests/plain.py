@@ -75,5 +75,5 @@ def known(grid: OccupancyGrid, stamp_ns: int = 0, unrepresented: ArrayLike = (),
         grid=grid,
         last_seen=(grid.num_updates > 0).astype(np.uint16),
         step_stamps_ns=np.array([stamp_ns], np.int64),
-        unrepresented=Balls.of_voxels(centers, grid.voxel, np.full(len(centers), label, np.uint8)),
+        unrepresented=Balls.from_voxels(centers, grid.voxel, np.full(len(centers), label, np.uint8)),
     )

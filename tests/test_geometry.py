@@ -18,7 +18,7 @@ from splatctrl_cli.geometry import (
     transform_from,
     transform_points,
 )
-from splatctrl_cli.records import Box, Intrinsics, PointCloud, by_stamp
+from splatctrl_cli.records import Box, Intrinsics, PointCloud, merge_by_stamp
 from tests.refused import expect_refusal
 
 RNG = np.random.default_rng(0)
@@ -82,7 +82,9 @@ def test_a_box_that_is_not_six_finite_numbers_in_order_is_refused(text: str) -> 
 
 def test_of_one_stamp_the_items_of_an_earlier_stream_come_first_each_in_its_own_order() -> None:
     streams = [[(1, "a"), (3, "b"), (3, "c")], [(3, "d"), (4, "e")], [(0, "f"), (3, "g")]]
-    merged = by_stamp(*([SimpleNamespace(stamp_ns=stamp, name=name) for stamp, name in items] for items in streams))
+    merged = merge_by_stamp(
+        *([SimpleNamespace(stamp_ns=stamp, name=name) for stamp, name in items] for items in streams)
+    )
     assert "".join(item.name for item in merged) == "fabcdge"
 
 

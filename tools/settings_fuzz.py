@@ -114,11 +114,11 @@ class Desk:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         log, quiet = folder / "log", ("--threads", "1", "-q")
-        self._made("simulate", "-o", log, "--duration", "0.6", "--width", "64", "--height", "48", "-q")
+        self._make_channels("simulate", "-o", log, "--duration", "0.6", "--width", "64", "--height", "48", "-q")
         robot = ("--urdf", log / "robot.urdf", "--spheres", log / "robot_spheres.yaml")
         fast = [word for setting in FAST for word in ("--set", setting)]
         made = ("reconstruct", log / "log.mcap", *robot, *quiet, *fast)
-        self._made(*made, "-o", folder / "scene")
+        self._make_channels(*made, "-o", folder / "scene")
         drive = ("replay", log / "log.mcap", "--scene", folder / "scene", *robot, *quiet, "--mode", "closed-loop")
         short = (*drive, "--set", "control.max_time=0.2", "--set", "planner.max_iterations=20")
         stalling = [f"--set=control.{name}" for name in ("max_detours=1", "stall_time=0.02", "stall_speed=10")]
@@ -139,7 +139,7 @@ class Desk:
             left = sorted(path.name for path in Path(name).iterdir())
         return Outcome(case=case, code=code, seconds=seconds, said=said, fault=fault_of(case, code, said, left))
 
-    def _made(self, *words: object) -> None:
+    def _make_channels(self, *words: object) -> None:
         code, said, _ = run(words, 10 * TIME_LIMIT)
         if code != 0:
             raise SystemExit(f"{words[0]}: exit {code}: {said}")

@@ -12,7 +12,7 @@ from experiments.drawn_task import Task, solids_of, task_of
 from experiments.environments import ENVIRONMENTS, Environment, drawn, ring_of_cameras
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.planned import resampled
+from splatctrl_cli.planner.planned import resample
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.primitives import signed_distance
@@ -90,7 +90,7 @@ def test_the_task_is_a_clear_way_between_places_that_are_apart(
 ) -> None:
     task = tasks(kind)
     room = Clearance.of(arm, solids_of(task.environment.primitives))
-    assert room.at(resampled(task.waypoints, 0.01)).min() > drawn_task.TASK_CLEARANCE - 1e-3
+    assert room.at(resample(task.waypoints, 0.01)).min() > drawn_task.TASK_CLEARANCE - 1e-3
     tip = arm.frame_names[-1]
     start, end = (arm.frame_pose(q, tip) for q in task.waypoints[[0, -1]])
     np.testing.assert_allclose(end[:3, 3], task.T_world_goal[:3, 3], atol=1e-3)

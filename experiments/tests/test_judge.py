@@ -16,7 +16,7 @@ from experiments.problems import Problem, Views, read_problem, views_of
 from experiments.tests.conftest import HOME, blind
 from experiments.trial import OURS, Attempt, Rig, Trial, trial_of
 from splatctrl_cli.config import Config
-from splatctrl_cli.evaluate.verdict import Outcome, Verdict, held, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Verdict, passed_reason, verdict_of
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.replay import evidence_criteria
 from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
@@ -75,7 +75,7 @@ def test_the_back_of_a_thing_that_the_arm_at_rest_hid_from_all_cameras_is_not_sa
 
 
 def passed(*_: object) -> Verdict:
-    return verdict_of("replay", [held("kept", 0.1, 0.02, "m", 2)], passed="safe")
+    return verdict_of("replay", [passed_reason("kept", 0.1, 0.02, "m", 2)], passed="safe")
 
 
 def through_the_post(problem: Problem) -> Float64:

@@ -35,7 +35,7 @@ def test_postures_over_cube_and_bowl_are_clear_of_everything_with_the_cube_in_th
         before, after = scene.to_cube(), scene.to_bowl(scene.hover)
         assert Clearance.of(before.model, before.solids).at(before.goal[None])[0] >= min(ROOM, 0.04)
         ends = np.array([after.start, after.goal])
-        alone = Clearance.of(after.model.with_self_pairs(judge.NO_PAIRS), after.solids)
+        alone = Clearance.of(after.model.replace_self_pairs(judge.NO_PAIRS), after.solids)
         assert alone.at(ends).min() >= ROOM
         assert len(after.model.sphere_set.radii) > len(before.model.sphere_set.radii)
 

@@ -9,7 +9,7 @@ from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.planned import resampled, time_path
+from splatctrl_cli.planner.planned import resample, time_path
 from tests.control.fakes import Balls, PlanarArm
 from tests.planner.walls import clearance, one_wall, thin_post
 
@@ -41,7 +41,7 @@ def test_a_path_is_followed_to_its_end_by_the_controller() -> None:
 
 
 def test_lengths_are_those_of_an_arc() -> None:
-    turn = resampled(np.array([[-0.5, 0.0], [0.5, 0.0]]), 0.01)
+    turn = resample(np.array([[-0.5, 0.0], [0.5, 0.0]]), 0.01)
     assert joint_length(turn) == pytest.approx(1.0)
     moved, turned = effector_length(ARM, turn, "tip")
     assert moved == pytest.approx(0.9, rel=1e-4)
@@ -52,6 +52,6 @@ def test_lengths_are_those_of_an_arc() -> None:
 def test_the_least_clearance_lies_between_its_bounds(room: object) -> None:
     free = clearance(room)  # type: ignore[arg-type]
     proved = least_clearance(free, PATH, tolerance=1e-4)
-    dense = float(np.min(free.at(resampled(PATH, 1e-4))))
+    dense = float(np.min(free.at(resample(PATH, 1e-4))))
     assert proved.lower <= dense <= proved.upper + 1e-6 and proved.upper - proved.lower <= 1e-4
     assert proved.num_checks < 2000

@@ -11,7 +11,7 @@ from experiments.ways import Surroundings, beside_the_start, plain_ways
 from splatctrl_cli.config import Config
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.planner.planned import resampled
+from splatctrl_cli.planner.planned import resample
 from splatctrl_cli.records import Bool, Float64, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
@@ -111,6 +111,6 @@ def test_unseen_space_that_a_motion_comes_to_is_counted_but_where_the_arm_begins
         balls = problem.model.sphere_centers_batch(postures)[:, moving].reshape(-1, 3)
         return SphereField(Spheres.of(balls, np.tile(radii[moving], len(postures)))).query(cells)[0] < 0
 
-    expected = 0.02**3 * np.sum(held(resampled(position, 0.02)) & ~held(position))
+    expected = 0.02**3 * np.sum(held(resample(position, 0.02)) & ~held(position))
     assert expected > 0.005 and around.unseen_on(position) == pytest.approx(expected, rel=0.15)
     assert surroundings(problem, far, 0.01).unseen_on(position) == 0.0

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.yardstick import Motion, Yardstick, proved_clearance
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.planner.planned import resampled
+from splatctrl_cli.planner.planned import resample
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm
 
@@ -94,7 +94,7 @@ def test_a_proved_clearance_is_not_above_any_posture_between_the_states(seed: in
     field = Balls(np.c_[random.uniform(-1, 1, (3, 2)), np.zeros(3)].tolist(), [0.03] * 3)
     motion = Motion(stamp_ns=TICK * np.arange(4), position=position)
     proved = proved_clearance(ARM, motion, lambda stamp: lambda points: field.query(points)[0])
-    assert proved <= least(resampled(position, 2e-3), field)
+    assert proved <= least(resample(position, 2e-3), field)
     assert proved > -4  # it says something
 
 

@@ -183,13 +183,13 @@ class Adjustment:
     def rows(self, estimate: Estimate, reach: float, *, with_robot: bool = True) -> Iterator[Rows]:
         """All residuals of at most `reach` [m]."""
         views = self.evidence.views
-        placed = [self._placed(view, estimate) for view in views]
+        placed = [self._find_pose(view, estimate) for view in views]
         for i, j in self.evidence.pairs:
             yield self._overlap(views[i], views[j], *placed[i], *placed[j], estimate, reach)
         for frame in self.evidence.frames if with_robot else ():
             yield from filter(None, [self._robot(frame, estimate, reach)])
 
-    def _placed(self, item: DepthView | RgbdFrame, estimate: Estimate) -> tuple[Float64, Float64]:
+    def _find_pose(self, item: DepthView | RgbdFrame, estimate: Estimate) -> tuple[Float64, Float64]:
         """T_world_camera, and its motion with the clock, camera frame."""
         T, twist = self.evidence.recorded(item, estimate.clock)
         correction = estimate.corrections[item.camera]
@@ -250,7 +250,7 @@ class Adjustment:
         assert self.evidence.arm is not None
         scale, bias = estimate.depth_of(frame.camera)
         depth = np.where(frame.depth > 0, scale * frame.depth + bias, 0.0).astype(np.float32)
-        T, twist = self._placed(frame, estimate)
+        T, twist = self._find_pose(frame, estimate)
         found = self.evidence.arm.rows(
             depth, frame.intrinsics, T, twist, frame.stamp_ns - round(estimate.clock * 1e9), reach
         )

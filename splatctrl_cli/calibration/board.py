@@ -211,7 +211,9 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
                 placed[camera], T_world_board = X, stays
             elif camera not in rig.moving and not stands and rig.arm is not None and not rig.held:
                 T_world_camera = _place_by_link(rig.arm, by_camera[camera])
-                placed[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ T_world_camera
+                placed[camera] = (
+                    invert_transform(rig.recorded[camera][by_camera[camera][0].stamp_ns]) @ T_world_camera
+                )
         except NotEvaluableError as error:
             reasons.append(error.message.removeprefix("calibrate: "))
     refuse_if(
@@ -232,7 +234,7 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
                 f" moment (expected {fixed.CALIBRATION_BOARD_FEWEST} times)",
                 remedy=SHOW,
             )
-        placed[best] = invert_transform(_recorded(rig, by_camera[best][0])) @ middle_pose(votes[best])
+        placed[best] = invert_transform(rig.recorded[best][by_camera[best][0].stamp_ns]) @ middle_pose(votes[best])
     return placed
 
 
@@ -369,13 +371,9 @@ def _votes(
             continue
         for other in (s for name in placed for s in by_camera[name]):
             if stands or abs(other.stamp_ns - own.stamp_ns) <= fixed.CALIBRATION_BOARD_TOGETHER_NS:
-                T_world_other = _recorded(rig, other) @ placed[other.camera]
+                T_world_other = rig.recorded[other.camera][other.stamp_ns] @ placed[other.camera]
                 votes.append(T_world_other @ other.T_camera_board @ invert_transform(own.T_camera_board))
     return votes
-
-
-def _recorded(rig: Rig, sighting: Sighting) -> Float64:
-    return rig.recorded[sighting.camera][sighting.stamp_ns]
 
 
 def middle_pose(poses: Sequence[Float64]) -> Float64:

@@ -22,7 +22,7 @@ class Certainty:
     covariance: Float64
     reach: Float64
 
-    def of_camera(self, camera: str) -> Float64:
+    def slice_covariance(self, camera: str) -> Float64:
         """Covariance (6, 6) of a camera's rotation and translation, own frame; 0 if fixed."""
         columns = self.unknowns.columns(camera)[:POSE]
         return np.zeros((POSE, POSE)) if columns[0] < 0 else self.covariance[np.ix_(columns, columns)]
@@ -33,7 +33,7 @@ class Certainty:
         if columns[0] < 0:
             return np.zeros((POSE, POSE))
         block = self.reach[np.ix_(columns, columns)]
-        return np.asarray(block @ self.of_camera(camera) @ block.T)
+        return np.asarray(block @ self.slice_covariance(camera) @ block.T)
 
     def sigma_depth(self, camera: str) -> tuple[float, float]:
         """Sigma of scale and bias [m]; 0 if fixed."""

@@ -53,7 +53,7 @@ def is_corrected(row: Mapping[str, Any]) -> bool:
     return "T_recorded_camera" in row
 
 
-def placed(frame: RgbdFrame, cameras: Mapping[str, Mapping[str, Any]]) -> RgbdFrame:
+def correct_pose(frame: RgbdFrame, cameras: Mapping[str, Mapping[str, Any]]) -> RgbdFrame:
     """The frame at its camera's corrected pose, if `cameras` has one."""
     row = cameras.get(frame.camera, {})
     return _move(frame, np.reshape(row["T_recorded_camera"], (4, 4))) if is_corrected(row) else frame

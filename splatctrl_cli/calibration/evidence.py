@@ -128,21 +128,18 @@ class Arm:
     def __init__(self, model: RobotModel, posture: Posture) -> None:
         self.model = model
         self.surface = model.surface
-        self._posture = posture
+        self.posture = posture
         self._vague = np.array(sorted(self.surface.vague), dtype=np.int64)
         self.surface_poses = lru_cache(maxsize=REMEMBERED)(self._surface_poses)
 
-    def is_posed(self, stamp_ns: int) -> bool:
-        return self._posture(stamp_ns) is not None
-
     def link_pose(self, link: str, stamp_ns: int) -> Float64 | None:
         """T_world_link (4, 4) at a time [ns]; None if no joint state is near."""
-        q = self._posture(stamp_ns)
+        q = self.posture(stamp_ns)
         return None if q is None else self.model.frame_pose(q, link)
 
     def _surface_poses(self, stamp_ns: int) -> Float64 | None:
         """T_world_link (L, 4, 4) of the surface's links, or None."""
-        q = self._posture(stamp_ns)
+        q = self.posture(stamp_ns)
         if q is None:
             return None
         return self.surface.poses({link: self.model.frame_pose(q, link) for link in self.surface.links})
@@ -325,7 +322,9 @@ def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
         views=views,
         pairs=_pairs(views, moving),
         frames=[
-            strided(f, fixed.CALIBRATION_ARM_ROWS) for f in frames if arm is not None and arm.is_posed(f.stamp_ns)
+            strided(f, fixed.CALIBRATION_ARM_ROWS)
+            for f in frames
+            if arm is not None and arm.posture(f.stamp_ns) is not None
         ],
         arm=arm,
         mounts={camera: mount for camera, mount in mounts.items() if mount is not None},

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.calibration.views import DepthView, by_twists, depth_sigma, landed
+from splatctrl_cli.calibration.views import DepthView, depth_sigma, derive_by_twists, landed
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, project, strided_lens, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
@@ -105,7 +105,7 @@ class Rows:
 def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
     """Rows of every second point of view a on view b, T (4, 4) apart."""
     number = np.arange(0, len(a.depth.points), 2)
-    there, lands, surface, normals, distance = on_surface(a, b, T, slice(None, None, 2))
+    there, lands, surface, normals, distance = hit_surface(a, b, T, slice(None, None, 2))
     sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
     lands &= np.abs(distance) < width * sigma
     number, there, normals, surface = number[lands], there[lands], normals[lands], surface[lands]
@@ -116,7 +116,7 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
     u, v = np.round(exact).astype(np.int64).T
     depth = Rows(
         residuals=distance * weight,
-        by_twists=by_twists(own, there, normals, T) * weight[:, None],
+        by_twists=derive_by_twists(own, there, normals, T) * weight[:, None],
         own=number,
         by_own=np.einsum("ki,ki->k", normals @ T[:3, :3], own) * weight,  # a farther point moves along its ray
         other=v * b.gray.shape[1] + u,
@@ -134,7 +134,7 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
     weight = np.where(counts, 1 - np.square(deviation / fixed.REFINE_CUT), 0.0) / fixed.REFINE_COLOR
     return Rows(
         residuals=np.concatenate([depth.residuals, difference * weight]),
-        by_twists=np.vstack([depth.by_twists, by_twists(own, there, gradient, T) * weight[:, None]]),
+        by_twists=np.vstack([depth.by_twists, derive_by_twists(own, there, gradient, T) * weight[:, None]]),
         own=np.tile(depth.own, 2),
         by_own=np.concatenate([depth.by_own, np.einsum("ki,ki->k", gradient @ T[:3, :3], own) * weight]),
         other=np.tile(depth.other, 2),
@@ -142,7 +142,7 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
     )
 
 
-def on_surface(
+def hit_surface(
     a: GrayView, b: GrayView, T: Float64, which: slice = EVERY
 ) -> tuple[Float64, Bool, Float64, Float64, Float64]:
     """View a's points in view b, at T (4, 4): points, hits, surface, normals, distances.
@@ -223,7 +223,7 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
     colors = [_small(frame, view.gray.shape[0]) for frame, view in zip(frames, views, strict=True)]
     found: list[tuple[int, int, int, float, float]] = []
     for i, j in overlapping(views, poses, np.ones(len(frames), np.bool_), is_free):
-        there, lands, _, _, distance = on_surface(views[i], views[j], invert_transform(poses[j]) @ poses[i])
+        there, lands, _, _, distance = hit_surface(views[i], views[j], invert_transform(poses[j]) @ poses[i])
         lands &= np.abs(distance) < fixed.EXPOSURE_NEAR * depth_sigma(there[:, 2])
         u, v = np.round(project(views[j].depth.lens, there[lands])).astype(np.int64).T
         own_u, own_v = np.round(project(views[i].depth.lens, views[i].depth.points[lands])).astype(np.int64).T

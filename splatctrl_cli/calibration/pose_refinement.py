@@ -17,7 +17,7 @@ from scipy.linalg import null_space
 from scipy.sparse import csr_array
 
 from splatctrl_cli.calibration.evidence import HELD, POSE, transform_of, twist_between
-from splatctrl_cli.calibration.gray_views import GrayView, Rows, gray_view, on_surface, overlapping, rows_of, scaled
+from splatctrl_cli.calibration.gray_views import GrayView, Rows, gray_view, hit_surface, overlapping, rows_of, scaled
 from splatctrl_cli.calibration.views import surface_normals
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, project
@@ -114,13 +114,13 @@ class BentViews:
 
     def add(self, i: int, j: int, rows: Rows, columns: Index, J: Float64) -> None:
         """Add view i on view j to the round's equations; derivatives J (R, F) in `columns`."""
-        by_offsets = self.by_offsets(i, j, rows)
+        by_offsets = self.derive_by_offsets(i, j, rows)
         self._cross[columns] += (by_offsets.T @ J).T
         square = (by_offsets.T @ by_offsets).tocoo()
         self._own[square.row, square.col] += square.data
         self._slope[:] += by_offsets.T @ rows.residuals
 
-    def by_offsets(self, i: int, j: int, rows: Rows) -> csr_array:
+    def derive_by_offsets(self, i: int, j: int, rows: Rows) -> csr_array:
         """(R, C G) derivatives of view i's residuals on view j by offsets."""
         size, parts = len(self._basis), []
         for k, pixels, by_stretch in ((i, self._pixels[i][rows.own], rows.by_own), (j, rows.other, rows.by_other)):
@@ -332,7 +332,7 @@ def _distances(
     """Median distance of points from other surfaces; `odd`: those not in `rows_of`."""
     found = [np.zeros(0)]
     for i, j in pairs:
-        _, lands, _, _, distance = on_surface(
+        _, lands, _, _, distance = hit_surface(
             views[i], views[j], invert_transform(poses[j]) @ poses[i], slice(int(odd), None, 2)
         )
         found.append(np.minimum(np.abs(distance[lands]), fixed.REFINE_FARTHEST[0]))

@@ -45,7 +45,7 @@ class Solution:
         )
 
     @property
-    def held(self) -> tuple[str, ...]:
+    def fixed(self) -> tuple[str, ...]:
         unknowns = self.adjustment.unknowns
         return tuple(camera for camera in unknowns.cameras if camera not in unknowns.poses)
 

@@ -123,7 +123,7 @@ def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
     return lands & (surface[:, 2] > 0), surface, view.normals[v, u]
 
 
-def by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Float64:
+def derive_by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Float64:
     """Derivatives (K, 12) of a value at `there` (K, 3) by two cameras' motions.
 
     The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. gradient (K, 3): by the point.
@@ -137,12 +137,12 @@ def by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Fl
 def overlap_rows(
     points: Float64, T: Float64, which: Bool, surface: Float64, normals: Float64
 ) -> tuple[Float64, Float64]:
-    """Distances (M,) [m] of points from a view's surface planes, and derivatives (M, 12), `by_twists`.
+    """Distances (M,) [m] of points from a view's surface planes, and derivatives (M, 12), `derive_by_twists`.
 
     points (K, 3): of the other view, at T (4, 4); which (K,): those that land (`landed`).
     """
     there, normal = transform_points(T, points[which]), normals[which]
-    return np.einsum("ki,ki->k", there - surface[which], normal), by_twists(points[which], there, normal, T)
+    return np.einsum("ki,ki->k", there - surface[which], normal), derive_by_twists(points[which], there, normal, T)
 
 
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:

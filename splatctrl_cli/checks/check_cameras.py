@@ -12,7 +12,7 @@ from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO
 from splatctrl_cli.recording.log.registration import DISTORTION_MODELS, is_distorted, lens_model
 from splatctrl_cli.recording.log.rig import Camera, ImageLens, image_lens, intrinsics_of, nearest_gap_ns
-from splatctrl_cli.recording.log.survey import Calibration, Survey, paired
+from splatctrl_cli.recording.log.survey import Calibration, Survey, pair_images
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics
 
@@ -72,7 +72,7 @@ def calibration_findings(
 ) -> Iterator[Finding]:
     """Findings on CameraInfo; `changed`: stamps of first changes."""
     unset = NOTE if cameras and all(camera.info for camera in cameras) else WARNING
-    for entry in found.of_type(CAMERA_INFO):
+    for entry in found.select_types(CAMERA_INFO):
         name, is_unset = entry.topic.name, entry.calibration is None
         text = "K is zero: the camera was never calibrated"
         yield from judge(unset if is_unset else None, "uncalibrated", name, text)
@@ -119,7 +119,7 @@ def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens
 
 def _rivals(found: Survey, camera: CameraTopics) -> Iterator[Finding]:
     chosen = found.topics[camera.info].calibration if camera.info else None
-    for entry in found.of_type(CAMERA_INFO):
+    for entry in found.select_types(CAMERA_INFO):
         name, other = entry.topic.name, entry.calibration
         if chosen is None or other is None or name in (camera.info, camera.depth_info):
             continue
@@ -199,7 +199,7 @@ def camera_findings(
 def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> list[Finding]:
     where, tolerance = f"camera {camera.name}", options.pairing_tolerance_s
     color, depth = (found.topics[t].stamps_ns[: limits.PAIRED_STAMPS] for t in (camera.color, camera.depth))
-    pairs = paired(color, depth, round(tolerance * 1e9)).tolist()
+    pairs = pair_images(color, depth, round(tolerance * 1e9)).tolist()
     rarer, other = sorted((len(color), len(depth)))
     if not pairs or not rarer:
         gap = nearest_gap_ns(color, depth) * 1e-9

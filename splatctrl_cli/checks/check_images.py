@@ -19,7 +19,7 @@ SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kept:
+class Thumbnail:
     """Depth (h, w) [m] at every `stride`-th pixel, or colour (h, w, 3) averaged.
 
     width, height [px]: of the whole image.
@@ -50,7 +50,7 @@ class ImageWatch:
         self.sizes: Counter[tuple[int, int]] = Counter()
         self.medians: Thinned[float] = Thinned(1000)
         self.shares: Thinned[float] = Thinned(1000)
-        self.kept: Thinned[Kept] = Thinned(limits.KEPT_IMAGES)
+        self.kept: Thinned[Thumbnail] = Thinned(limits.KEPT_IMAGES)
         self.thumbnails: list[tuple[int, NDArray[Any]]] = []
         self._wanted: Thinned[None] = Thinned(limits.DECODED_IMAGES)
 
@@ -105,7 +105,9 @@ class ImageWatch:
 
     def _keep(self, stamp_ns: int, image: NDArray[Any], small: NDArray[Any]) -> None:
         height, width = image.shape[:2]
-        self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride_of(height), width=width, height=height, pixels=small))
+        self.kept.add(
+            Thumbnail(stamp_ns=stamp_ns, stride=stride_of(height), width=width, height=height, pixels=small)
+        )
 
     def rescale(self, scale: float) -> None:
         """Set the scale [m per count] of a log that names it."""
@@ -301,7 +303,7 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
                         unit="px",
                     )
                 )
-        elif (other := _other(camera, edges, _at_zero(surface))) is not None:
+        elif (other := _other(camera, edges, _extrapolate_to_zero(surface))) is not None:
             others[camera] = other
     for camera, (name, own, peak) in others.items():
         found += judge(
@@ -321,7 +323,7 @@ def _other(
 ) -> tuple[str, float, float] | None:
     pairs = {name: list(zip(edges[camera], its, strict=False)) for name, its in edges.items() if name != camera}
     scores = {
-        name: _at_zero(_correlate([(a[0], b[1]) for a, b in its]))
+        name: _extrapolate_to_zero(_correlate([(a[0], b[1]) for a, b in its]))
         for name, its in pairs.items()
         if all(a[0].shape == b[1].shape for a, b in its)
     }
@@ -372,6 +374,6 @@ def _peak(surface: Float64) -> tuple[int, int, float, float]:
     return int(v) - rows, int(u) - columns, peak, float(near.max())
 
 
-def _at_zero(surface: Float64) -> float:
+def _extrapolate_to_zero(surface: Float64) -> float:
     v, u, wide = surface.shape[0] // 2, surface.shape[1] // 2, limits.EDGE_AROUND
     return float(surface[v - wide : v + wide + 1, u - wide : u + wide + 1].max())

@@ -15,7 +15,7 @@ from splatctrl_cli.checks.check_cameras import calibration_findings, camera_find
 from splatctrl_cli.checks.check_folder import judge_frames
 from splatctrl_cli.checks.check_images import (
     ImageWatch,
-    Kept,
+    Thumbnail,
     depth_findings,
     image_findings,
     sample_findings,
@@ -209,7 +209,7 @@ def reduced_frames(
     return frames
 
 
-def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
+def _frame(camera: Camera, kept: Thumbnail, color: Thumbnail | None, stamp_ns: int, T: Float64) -> RgbdFrame:
     depth, stride = kept.pixels, kept.stride
     if camera.depth_lens is not None and camera.T_color_depth is not None:
         stride = max(1, round(camera.intrinsics.height / kept.pixels.shape[0]))
@@ -234,7 +234,7 @@ def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Flo
     )
 
 
-def _enlarge(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
+def _enlarge(image: NDArray[Any], kept: Thumbnail) -> NDArray[Any]:
     return np.repeat(np.repeat(image, kept.stride, axis=0)[: kept.height], kept.stride, axis=1)[:, : kept.width]
 
 

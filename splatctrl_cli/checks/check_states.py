@@ -239,7 +239,7 @@ class RobotStates:
 
 def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) -> RobotStates:
     findings: list[Finding] = []
-    for topic in found.of_type(*STATE_TYPES):
+    for topic in found.select_types(*STATE_TYPES):
         if options.joint_topic in (None, topic.topic.name):
             for stream in topic.joints.streams.values():
                 findings += stream_findings(topic.topic.name, stream)
@@ -271,7 +271,7 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
         return RobotStates(model=None, states=states)
     model = model.moved_by(names)
     try:
-        states = states.of_log(*model.joint_columns(names))
+        states = states.convert_joints(*model.joint_columns(names))
     except InputError as wrong:
         return RobotStates(
             model=model, lack=str(wrong), findings=[error("joints", "joint states", wrong.message, wrong.remedy)]

@@ -222,7 +222,7 @@ def _pixel_scores(
     changes = np.array(camera.changes)
     scores = np.zeros(len(offsets))
     for i, inside in enumerate(is_inside):
-        keep = _kept(inside)
+        keep = _trim(inside)
         if keep.any():
             of = np.searchsorted(wanted, number[i])
             a, b = depth[of[:-1][keep]], depth[of[1:][keep]]
@@ -235,14 +235,14 @@ def _sum_scores(seconds: Float64, position: Float64, camera: CameraMotion, start
     change = np.array([image.mean() for image in camera.changes])
     scores = np.zeros(len(offsets))
     for i, offset in enumerate(offsets):
-        keep = _kept((at - offset >= 0) & (at - offset <= seconds[-1]))
+        keep = _trim((at - offset >= 0) & (at - offset <= seconds[-1]))
         if keep.any():
             moved = np.abs(np.diff(_at(seconds, position, at - offset), axis=0)).mean(axis=1)
             scores[i] = correlation(moved[keep], change[keep])
     return scores
 
 
-def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
+def _trim(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
     keep = is_inside[1:] & is_inside[:-1]
     return keep if keep.sum() >= max(limits.MOTION_INTERVALS // 2, len(keep) // 2) else np.zeros_like(keep)
 

@@ -12,7 +12,7 @@ from splatctrl_cli.records import RgbdFrame
 
 
 class Severity(StrEnum):
-    """error: a later command fails or errs; warning: a loss or doubt; note: no fault."""
+    """Error: a later command fails or errs; warning: a loss or doubt; note: no fault."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -37,15 +37,15 @@ class Check:
     @property
     def docs(self) -> str:
         """Its line in docs/check.md: code and severity, a bar, meaning."""
-        return f"`{self.code}` ({', '.join(self.severities)}) | {self.meaning}"
+        return f"`{self.code}` ({'/'.join(self.severities)}) | {self.meaning}"
 
 
 _TABLE = """
 # code | severities | commands that an error blocks | meaning | what to do, where a finding does not say
-damaged | warning |  | a part of the file cannot be read; the rest is judged | copy the file again; if it stays,
+damaged | warning |  | part of the file cannot be read | copy the file again; if it stays,
     look at what wrote these messages
 remark | note |  | how something was read, or messages that are not
-loss | note |  | topics and frames that are left out
+loss | note |  | topics and frames left out
 missing | error | all | depth, CameraInfo or tf that `ingest` needs
 refused | error | all | the capture or folder cannot be read as described
 gap | warning |  | a topic pauses for over 0.1 s and three median intervals | record fewer topics or to a faster disk;
@@ -53,11 +53,11 @@ gap | warning |  | a topic pauses for over 0.1 s and three median intervals | re
 part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log |
     start and stop all drivers with the recorder, or cut the log there
 files-apart | warning |  | over 60 s between two files | are they one recording? if not, give each alone
-stamp-repeats | warning |  | header stamps that repeat | look for a driver that publishes twice, or a topic recorded
+stamp-repeats | warning |  | repeated header stamps | look for a driver that publishes twice, or a topic recorded
     twice
-stamp-back | warning |  | header stamps that go back | two publishers on one topic, a clock that was set, or a loop
+stamp-back | warning |  | header stamps go back | two publishers on one topic, a clock that was set, or a loop
     of a played log: record again
-stamp-zero | warning, error | all | header stamps of 0; an error where all are | give --stamps log to take the times
+stamp-zero | warning, error | all | header stamps of 0; an error if all | give --stamps log to take the times
     of logging, and let the driver stamp the next recording
 clock | note |  | all stamps are shifted alike against the log's clock
 clock-offset | warning |  | stamps over 20 ms after or 1 s before their log time, or 0.2 s off most topics, or 60 ms
@@ -67,12 +67,12 @@ clock-drift | warning |  | stamps drift by over 20 ms against the log's clock | 
 robot-clock | note, warning |  | the offset of cameras and robot: a warning beyond 40 ms with `--urdf`, else beyond 30
     ms and twice its uncertainty
 sampled | note |  | not every image was decoded
-undecodable | note, warning, error | all | images that do not decode; an error where none does | they are left out;
+undecodable | note, warning, error | all | undecodable images; an error if all | they are left out;
     record a form that is read, or copy the file again where it is named as damaged too
 encoding | note, warning |  | not read, or changing
 image-size | note, warning |  | images of several sizes on one topic | record one size; frames of another than the
     camera's are left out
-pairing | warning, error | all | under 95 % of the images find a partner; an error where none does
+pairing | warning, error | all | under 95 % of images find a partner; an error if none
 rates-differ | note |  | colour and depth differ in number by a factor of 1.5 | record both at one rate; more frames
     show more, and what moves is seen sooner
 pair-offset | note |  | depth over 10 ms from its colour image | let the driver synchronise colour and depth: what
@@ -80,12 +80,12 @@ pair-offset | note |  | depth over 10 ms from its colour image | let the driver 
 depth-scale | note, error | all | median depth outside 0.05 to 20 m; a note outside 0.15 to 8 m
 depth-share | note, warning |  | under half of the pixels have depth; a warning below a tenth | the rest stays unseen:
     dark or shiny things, too near, or warped depth with holes
-depth-empty | warning, error | later | images without depth; an error where all are | is the projector on, and the
+depth-empty | warning, error | later | images without depth; an error if all | is the projector on, and the
     scene within its range?
-depth-invalid | note |  | pixels that are NaN, infinite, negative or a code for no return
-depth-constant | warning |  | the largest depth is one value in many pixels, far behind the others: an undeclared code
-    for no return | let the driver write 0 or NaN for no return; as it stands, it is a surface
-depth-repeats | warning |  | depth images equal to the one before | look for a driver that publishes its last image
+depth-invalid | note |  | NaN, infinite, negative or no-return pixels
+depth-constant | warning |  | many pixels have one largest depth, far behind the others: an undeclared
+    no-return code | let the driver write 0 or NaN for no return; as it stands, it is a surface
+depth-repeats | warning |  | repeated depth images | look for a driver that publishes its last image
     again; repeated depth is no new evidence, and only depth that was made without noise may repeat
 principal-point | warning, error | later | over 15 % of the size off the middle; an error where it fits another image
     size
@@ -94,31 +94,31 @@ field-of-view | warning |  | outside 20 to 140 degrees, horizontally
 uncalibrated | note, warning |  | K is zero | calibrate it, or record the driver's factory values
 camera-info-size | error | all | another size than the images | record the CameraInfo of this stream, or name it with
     --camera
-camera-info-changes | warning |  | a CameraInfo that changes | split the log there, or record with one setting
+camera-info-changes | warning |  | CameraInfo changes | split the log there, or record with one setting
 camera-info-two | warning |  | a second K for the same frame and size
 distortion | note, warning, error | all | distorted images (note); a wrong number of coefficients (warning); an
     unknown model (error)
 tf-gap | warning |  | a moving transform pauses
 tf-ends | warning |  | a moving transform ends over 1 s before the last image | record /tf to the end; if it stands
     still, publish it on /tf_static or give --camera-pose
-tf-roots | note, error | all | separate trees; an error where cameras are in several
+tf-roots | note, error | all | separate trees; an error if cameras are in several
 tf-parents | warning |  | a frame with two parents
-pose-missing | warning, error | all | images without a pose; an error where all are | tf starts late, ends early, or
+pose-missing | warning, error | all | images without a pose; an error if all | tf starts late, ends early, or
     has a gap of more than 1 s; if it stands still give --camera-pose
 pose-jump | error | later | a camera moves over 0.2 m and ten times its median step in one frame | two publishers of
     one frame, or a localisation that was corrected; reconstruct refuses it
 alignment | error | later | edges of depth and colour are over 1.5 % of the width apart, or match across cameras
-views-scale | warning, error | later | the factor on depths that makes views fit; a warning where they hardly overlap
+views-scale | warning, error | later | the factor that makes depths fit; a warning at little overlap
 views-pose | warning |  | how far a camera must move for its views to fit (from 12 mm or 0.8 deg)
 agreement | note, error | later | how far apart views place one surface [mm]; an error beyond 30 mm (3 % of depth
     above 1 m)
 views-agreement | error | later | the same for views of one camera
-exposure | note |  | one surface differs by over 5 % in brightness or colour between images
+exposure | note |  | a surface's brightness or colour differs by over 5 % between images
 exposure-rows | note |  | rows of one image are over 20 % brighter than others
-joints | note, error | replay | the topics and velocities in use; an error where the robot's joints are missing
+joints | note, error | replay | topics and velocities in use; an error if joints of the robot are missing
 joints-nan | warning |  | positions that are not finite | they are left out; look at the driver
 joints-degrees | error | replay | positions that no joint can reach in radians
-joints-velocity | note, warning |  | velocities that are missing (note) or zero
+joints-velocity | note, warning |  | missing (note) or zero velocities
 joints-still | note |  | no joint moves
 joints-limits | warning |  | states beyond the URDF's limits | is it the right URDF, are the joints in its units, or
     were its limits lowered?

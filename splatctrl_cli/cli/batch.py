@@ -21,7 +21,7 @@ from splatctrl_cli.jobs.batch.batch import (
     BatchResult,
     batch,
     dry_run,
-    planned,
+    plan_batch,
     suites_of,
 )
 from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, text_of
@@ -187,7 +187,7 @@ def _cell(run: Run | None) -> str:
 def _list_runs(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
     folder, order = request.suite, dict[str, int]()
     if not folder.is_dir():
-        *_, nodes, folder = planned(request, command_line)
+        *_, nodes, folder = plan_batch(request, command_line)
         order = {node.name: number for number, node in enumerate(nodes)}
     refuse_if(not (folder / NAME).is_file(), f"{folder}: has no {NAME}", remedy="run the batch first")
     conditions = [*args.where, *(["state!=done"] if args.failed else [])]

@@ -11,7 +11,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, TypeVar
 
-from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several, whole
+from splatctrl_cli.cli.parser import Adds, group, join_run_options, option, real, several, whole
 from splatctrl_cli.cli.reports import report_command, wrap_result
 from splatctrl_cli.config import PRESETS, Config, fixed, load_config
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
@@ -205,7 +205,7 @@ def seed(what: str) -> Adds:
 
 COMMON = (  # which every command has
     option("--json", "print one JSON object instead of a table"),
-    of_run(
+    join_run_options(
         option("-v/--verbose", "say more; show tracebacks", action="count", default=0),
         option("-q/--quiet", "no progress, no log lines"),
     ),
@@ -213,12 +213,12 @@ COMMON = (  # which every command has
 JUNIT = (  # which every command that judges has
     option("--junit FILE", "write the verdict for CI as JUnit XML, a case for each criterion", Path),
 )
-THREADS = of_run(
+THREADS = join_run_options(
     option("--threads THREADS", "threads, at most 16 or one per core (default: one per core)", whole(0, 1024))
 )
 CONFIG_FILE = option("--config FILE.toml", "settings, see splatctrl config --template", Path)
-CONFIG = (CONFIG_FILE, *settings(), of_run(seed("everything random")), THREADS)
-DEVICE = of_run(
+CONFIG = (CONFIG_FILE, *settings(), join_run_options(seed("everything random")), THREADS)
+DEVICE = join_run_options(
     option(
         "--device NAME",
         "where to compute: auto, cpu, cuda or cuda:N; auto takes a card that is worth its start (splatctrl help gpu)",
@@ -374,7 +374,7 @@ class Console:
             print(verdict.sentence)
             for reason in () if has_findings else verdict.decisive[1:10]:  # --json and summary.json have all
                 print(f"  {reason.outcome}: {reason}")
-            for reason in () if has_findings else verdict.said:
+            for reason in () if has_findings else verdict.shown:
                 print(f"  note: {reason}")
             print()
             self.result({}, lines)

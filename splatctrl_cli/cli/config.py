@@ -36,14 +36,15 @@ def run_completion(args: argparse.Namespace, console: Console) -> int:
 
 
 def run_help(args: argparse.Namespace, console: Console) -> int:
-    """Print a page, every setting, or every option of a command without a page."""
+    """Print a page, an example, every setting, or a command's options."""
     roots = Path(__file__).parents[1:3]  # of a wheel, of the repository
     folder = next(place / "docs" for place in roots if (place / "docs" / "README.md").is_file())
     commands, topic = build_parser().actions, args.topic or "README"
     assert commands is not None
     texts: dict[str, Callable[[], str]] = {name: one.format_full_help for name, one in commands.choices.items()}
     texts["settings"] = lambda: "\n".join(template_of(resolved_settings(None, ())))
-    texts |= {page.stem: partial(page.read_text, encoding="utf-8") for page in folder.glob("*.md")}
+    pages = [*folder.glob("examples/*.toml"), *folder.glob("*.md")]
+    texts |= {page.stem: partial(page.read_text, encoding="utf-8") for page in pages}
     refuse_if(
         topic not in texts,
         f"help: no page {format_value(topic)}",

@@ -18,7 +18,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     request = request_of(DemoRequest, args)
 
     def perform(words: Sequence[str], folder: Path) -> str:
-        """Run a command line, print its output with the final folder's name, and return its label."""
+        """Run a command line, print its output with the final folder, and return its label."""
         step, text = build_parser(words[0]).parse_args(words), io.StringIO()
         vars(step).pop("junit", None)  # CI is told of the demo alone
         step.quiet = args.quiet

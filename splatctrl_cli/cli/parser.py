@@ -187,7 +187,7 @@ def either(*options: Adds, required: bool = False) -> Adds:
     return lambda container: add_all(container.add_mutually_exclusive_group(required=required), options)
 
 
-def of_run(*options: Adds) -> Adds:
+def join_run_options(*options: Adds) -> Adds:
     """Options of the last group, in every command."""
     return lambda parser: add_all(parser.run_group, options)
 

@@ -25,7 +25,7 @@ def wrap_result(result: Mapping[str, Any], code: int) -> dict[str, Any]:
 
 
 def report_command(args: argparse.Namespace, verdict: Mapping[str, Any] | None, code: int, line: str = "") -> None:
-    """Report a verdict, or a command without one by its error line, to --junit and GitHub.
+    """Report a verdict, else the command's error line, to --junit and GitHub.
 
     Raises UsageError or WriteError if the file is unwritable.
     """

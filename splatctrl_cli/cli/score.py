@@ -8,7 +8,7 @@ from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.score_report import PREFIX
-from splatctrl_cli.evaluate.verdict import counted
+from splatctrl_cli.evaluate.verdict import plural
 from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.jobs.score.views import CloudSettings
 from splatctrl_cli.records import MILLIMETRE
@@ -80,7 +80,7 @@ def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
     yield from ("", *_protocol_lines(report["protocol"]))
     if views:
         yield (
-            f"{counted(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot;"
+            f"{plural(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot;"
             f" depth: median of the absolute error; seen: by {', '.join(report['training_cameras'])} within 2 cm"
         )
     if "chamfer" in metrics:

@@ -20,7 +20,7 @@ from splatctrl_cli.config.sections import (
     SceneConfig,
     VerdictConfig,
 )
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if
+from splatctrl_cli.errors import UsageError, did_you_mean, refuse_faults, refuse_if
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,12 +151,11 @@ def _check_known(name: str, known: Collection[str], where: str, prefix: str) -> 
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    try:
+    with (
+        refuse_faults(lambda _: f"{path}: no such file", FileNotFoundError, remedy="give an existing TOML file"),
+        refuse_faults(f"{path}: not valid TOML", ValueError, error=UsageError),  # UTF-8 and too long integers, too
+    ):
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file", remedy="give an existing TOML file") from None
-    except ValueError as error:  # no TOML, no UTF-8, or an integer of thousands of digits
-        raise UsageError(f"{path}: not valid TOML: {error}") from None
 
 
 def _parse_value(text: str) -> Any:

@@ -42,7 +42,7 @@ CHUNK = 256  # states per query
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance(Columns):
-    """distance (T,) [m] of the nearest moving part, NaN if unknown; sphere (T,): its index.
+    """Distance (T,) [m] of the nearest moving part, NaN if unknown; sphere (T,): its index.
 
     For self-collision: of the nearest pair, and its index, -1 without pairs.
     """

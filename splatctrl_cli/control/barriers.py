@@ -40,7 +40,7 @@ class SceneRows(BarrierTerm):
         self.names = tuple(names[s] for s in self._moving)
         self._links = np.array(model.sphere_set.links)[self._moving]
 
-    def with_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
+    def replace_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
         """Rows in another field, of `balls` (None: links' surfaces do not count)."""
         other = copy(self)
         other._field, other._balls = field, balls
@@ -233,7 +233,7 @@ SceneStepAt = Callable[[int], SceneStep | None]
 
 
 def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
-    """dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
+    """Rate dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
 
     Clipped to [-limit, 0]; missing distances give 0. The past rate holds until the next scene.
     """

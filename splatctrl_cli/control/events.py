@@ -68,13 +68,9 @@ class Obstacle:
 
     def __str__(self) -> str:
         where = ", ".join(f"{v:.3f}" for v in self.position)
-        if self.name:
-            what = self.name
-        elif self.splat is not None:
-            what = f"{self.label} splat {self.splat}"
-        else:
-            what = UNREPRESENTED if self.label == UNREPRESENTED else f"cell {self.cell}"
-        return f"{what} at ({where})"
+        unit = UNREPRESENTED if self.label == UNREPRESENTED else f"cell {self.cell}"
+        what = unit if self.splat is None else f"{self.label} splat {self.splat}"
+        return f"{self.name or what} at ({where})"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -172,7 +172,7 @@ class TwistTrack:
         age = (stamp_ns - self.stamp_ns[np.maximum(index, 0)]) * 1e-9
         return np.asarray((index >= 0) & (age <= timeout))
 
-    def in_world(self, model: RobotModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
+    def find_world_twist(self, model: RobotModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
         """Twist (6,) at a stamp [ns] in world axes, with the arm at q (J,); not capped."""
         twist = self.at(stamp_ns, timeout)
         if self.axes is None:
@@ -183,7 +183,7 @@ class TwistTrack:
     def reference(self, model: RobotModel, config: ControlConfig, q: Float64, stamp_ns: int) -> Float64:
         """`in_world`, each part capped in norm."""
         return reference_velocity(
-            self.in_world(model, q, stamp_ns, config.twist_timeout),
+            self.find_world_twist(model, q, stamp_ns, config.twist_timeout),
             gain=1.0,
             max_linear=config.max_linear_speed,
             max_angular=config.max_angular_speed,

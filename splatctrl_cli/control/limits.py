@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, fixed
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.records import Float64, Index, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
@@ -39,11 +39,12 @@ def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
     found = [re.search(r"(?:^|_)joint([1-7])$", name) for name in joint_names]
     numbers = [0 if match is None else int(match.group(1)) for match in found]
     odd = [name for name, n in zip(joint_names, numbers, strict=True) if n == 0 or numbers.count(n) > 1]
-    if odd:
-        raise UsageError(
-            f"control.velocity_limits = fr3: expected names that end in joint1 to joint7, got {', '.join(odd)}",
-            remedy="lock the others (--lock), or set control.velocity_limits = urdf",
-        )
+    refuse_if(
+        odd,
+        f"control.velocity_limits = fr3: expected names that end in joint1 to joint7, got {', '.join(odd)}",
+        remedy="lock the others (--lock), or set control.velocity_limits = urdf",
+        error=UsageError,
+    )
     most, offset, slope, lower, upper = np.array([FR3_JOINTS[number - 1] for number in numbers]).T
 
     def limit(q: Float64) -> tuple[Float64, Float64]:
@@ -168,11 +169,12 @@ def box_rows(lowest: Float64, highest: Float64) -> Rows:
 
 def _acceleration(value: float | tuple[float, ...], joints: Sequence[str]) -> Float64 | None:
     each = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    if len(each) not in (1, len(joints)):
-        raise UsageError(
-            f"control.max_acceleration: expected one number or {len(joints)}, one for each joint, got {len(each)}",
-            remedy=f"in the order {', '.join(joints)}",
-        )
+    refuse_if(
+        len(each) not in (1, len(joints)),
+        f"control.max_acceleration: expected one number or {len(joints)}, one for each joint, got {len(each)}",
+        remedy=f"in the order {', '.join(joints)}",
+        error=UsageError,
+    )
     if np.all(each == 0):
         return None
     return np.broadcast_to(each, (len(joints),)).copy()

@@ -18,7 +18,7 @@ from splatctrl_cli.control.line_process import Fault, LineProcess, Misbehaved, s
 from splatctrl_cli.control.step import Commander, ControlStep, Moment, QpIkController, View
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.control.user_controller import PROTOCOL
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 
@@ -48,13 +48,13 @@ class Program(LineProcess):
         """Start it with the line `start`. Raises InputError if it cannot or is no controller."""
         self._step_limit, self._seconds, self._num = step_limit, 0.0, 0
         self.spent = 0.0  # [s] on the last step
-        try:
+        with refuse_faults(
+            lambda error: f"{name}: cannot be started: {getattr(error, 'strerror', None) or error}",
+            OSError,
+            ValueError,
+            remedy="check its path, and that it may be executed",
+        ):
             super().__init__(command)
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(
-                f"{name}: cannot be started: {reason}", remedy="check its path, and that it may be executed"
-            ) from None
         try:
             version = _document(self.exchange(_line(start), max(START_LIMIT, step_limit))).get("protocol")
             if version != PROTOCOL:

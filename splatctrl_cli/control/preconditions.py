@@ -7,7 +7,7 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, part_clearances
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_if
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers, UInt8
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
@@ -31,8 +31,9 @@ def check_model(model: RobotModel) -> None:
             f"got {model.velocity_limit[joint]:g}",
             remedy="set it in the URDF's <limit velocity=...>",
         )
-    if not np.any(model.moving_spheres):
-        raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
+    refuse_if(
+        not np.any(model.moving_spheres), "robot: no collision sphere moves with a joint", remedy="check --spheres"
+    )
 
 
 def check_coverage(model: RobotModel, config: ControlConfig) -> None:
@@ -62,13 +63,13 @@ def check_within_limits(model: RobotModel, q: Float64, tolerance: float, what: s
     """Raise InputError for q (J,) outside the position limits by more than `tolerance` [rad]."""
     outside = np.maximum(q - model.upper, model.lower - q)
     worst = int(np.argmax(outside))
-    if outside[worst] > tolerance:
-        raise InputError(
-            f"{what}: joint {model.joint_names[worst]}: expected within [{model.lower[worst]:.4f}, "
-            f"{model.upper[worst]:.4f}] rad, got {q[worst]:.4f}",
-            remedy=f"choose another {'--start-time' if what == 'start' else what}, or check that the URDF is of this "
-            "robot",
-        )
+    refuse_if(
+        outside[worst] > tolerance,
+        f"{what}: joint {model.joint_names[worst]}: expected within [{model.lower[worst]:.4f}, "
+        f"{model.upper[worst]:.4f}] rad, got {q[worst]:.4f}",
+        remedy=f"choose another {'--start-time' if what == 'start' else what}, or check that the URDF is of this "
+        "robot",
+    )
 
 
 def check_free(
@@ -92,8 +93,10 @@ def check_free(
 
 def check_goal(model: RobotModel, T_world_goal: Float64) -> None:
     """Raise InputError for a goal that is no pose, or beyond the robot's reach."""
-    if np.shape(T_world_goal) != (4, 4) or not np.all(np.isfinite(T_world_goal)):
-        raise InputError("goal: expected a finite pose x,y,z,qx,qy,qz,qw")
+    refuse_if(
+        np.shape(T_world_goal) != (4, 4) or not np.all(np.isfinite(T_world_goal)),
+        "goal: expected a finite pose x,y,z,qx,qy,qz,qw",
+    )
     distance = float(np.linalg.norm(T_world_goal[:3, 3] - model.base_position))
     if distance > model.reach():
         where = ", ".join(f"{v:.3f}" for v in T_world_goal[:3, 3])

@@ -89,10 +89,10 @@ class RowBuilder:
     def _terms(self) -> tuple[BarrierTerm, ...]:
         return (self.scene, *self._others)
 
-    def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
-        """Rows in another field; see `SceneRows.in_field`."""
+    def replace_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
+        """Rows in another field; see `SceneRows.replace_field`."""
         other = copy(self)
-        other.scene = self.scene.with_field(field, balls)
+        other.scene = self.scene.replace_field(field, balls)
         return other
 
     def at(self, state: State) -> Rows:

@@ -1,4 +1,4 @@
-"""Closed loop from a logged start to a goal, in the scene known then."""
+"""Open loop along a log, and closed loop from a logged start to a goal, in the scene known then."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction
 from splatctrl_cli.control.barriers import FieldAt, SceneStepAt, rate_of, scene_margin
+from splatctrl_cli.control.columns import NamedColumns, step_columns
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, guided_goal, pose_error
 from splatctrl_cli.control.preconditions import (
     StaticViolation,
@@ -19,9 +20,9 @@ from splatctrl_cli.control.preconditions import (
     sphere_clearance,
     static_violations,
 )
-from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController
+from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController, VelocityMargin
 from splatctrl_cli.files.spilled_rows import ObjectFile
-from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
+from splatctrl_cli.records import Bool, DistanceField, Float64, FloatRows, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
 
@@ -133,7 +134,7 @@ def closed_loop(
         check_goal(model, waypoint.T_world_goal)
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
     check_free(model, field, q, distance_to)
-    controller = controller.with_field(field, balls_at(task.stamp_ns))
+    controller = controller.replace_field(field, balls_at(task.stamp_ns))
     by_surface: tuple[str, ...] = ()
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
@@ -149,7 +150,7 @@ def closed_loop(
         if field_at(stamp) is not field:
             changes.append(scene_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
-            controller = controller.with_field(field, balls_at(stamp))
+            controller = controller.replace_field(field, balls_at(stamp))
         rate = rate_of(config, model, scene_step_at, stamp, q)
         goal, guide = course.goal(stamp, q)
         moment = Moment(
@@ -166,14 +167,9 @@ def closed_loop(
         stamps.append(stamp)
         positions.append(q)
         steps.append(step)
-        if commander.is_over:
-            outcome = Outcome.CONTROLLER_FAILED
-            break
-        if course.has_ended(stamp, index, step):
-            outcome = Outcome.GOAL_REACHED
-            break
-        if course.has_stalled(stamp, index, q):
-            outcome = Outcome.STALLED
+        ended = Outcome.CONTROLLER_FAILED if commander.is_over else course.outcome(stamp, index, step, q)
+        if ended is not None:
+            outcome = ended
             break
         q, last_velocity = q + config.period * step.velocity, step.velocity
     return ReplayTrace(
@@ -216,6 +212,12 @@ class _Course:
             return None
         self._since = index
         return task.anchors.at(stamp_ns)
+
+    def outcome(self, stamp_ns: int, index: int, step: ControlStep, q: Float64) -> Outcome | None:
+        """Outcome if the course ends with this step from q (J,), else None."""
+        if self.has_ended(stamp_ns, index, step):
+            return Outcome.GOAL_REACHED
+        return Outcome.STALLED if self.has_stalled(stamp_ns, index, q) else None
 
     def has_stalled(self, stamp_ns: int, index: int, q: Float64) -> bool:
         """True at a standstill before the goal without a planned detour; starts one if possible.
@@ -308,3 +310,69 @@ def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
     if len(positions) <= num_back:
         return False
     return bool(np.max(np.abs(positions[-1] - positions[-1 - num_back])) < config.stall_speed * config.stall_time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenLoopTask:
+    """Goal at each state: logged motion, a frame's pose (4, 4), or logged twists.
+
+    home (J,) [rad]: the posture to lean to with a goal pose (None: the model's `middle`).
+    """
+
+    frame: str
+    T_world_goal: Float64 | None = None
+    home: Float64 | None = None
+    twists: TwistTrack | None = None
+
+
+def open_loop(
+    model: RobotModel,
+    config: ControlConfig,
+    motion: LoggedMotion,
+    task: OpenLoopTask,
+    field_at: FieldAt,
+    *,
+    has_distance: Bool,
+    scene_step_at: SceneStepAt | None = None,
+    commander: Commander = OURS,
+) -> NamedColumns:
+    """Ask the commander at every logged state, in the field known then; nothing is integrated.
+
+    has_distance (T,): False skips a state. scene_step_at: as in `closed_loop`. Returns `step_columns`, and by state:
+    logged, dv (commanded less logged) (T, J) [rad/s]; velocity_difference: its norm, largest_difference: of a joint;
+    the room that the logged velocity left, as in `VelocityMargin`.
+    """
+    field = field_at(int(motion.stamp_ns[0]))
+    controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
+    steps: list[ControlStep | None] = [None] * len(motion.stamp_ns)
+    margins: list[VelocityMargin | None] = [None] * len(motion.stamp_ns)
+    for index, (stamp, q, v) in enumerate(zip(motion.stamp_ns, motion.position, motion.velocity, strict=True)):
+        if not has_distance[index]:
+            continue
+        if field_at(int(stamp)) is not field:
+            field = field_at(int(stamp))
+            controller = controller.replace_field(field)
+        goal, guide = (task.T_world_goal, None)
+        if task.twists is not None:
+            goal, guide = task.twists.goal_at(model, config, task.frame, q, int(stamp))
+        elif goal is None:
+            goal, guide = guided_goal(model, task.frame, q, v)
+        rate = rate_of(config, model, scene_step_at, int(stamp), q)
+        margins[index] = controller.margin_of(q, v, distance_rate=rate)
+        if commander.is_over:
+            continue
+        moment = Moment(stamp_ns=int(stamp), q=q, T_world_goal=goal, guide=guide, last_velocity=v, distance_rate=rate)
+        steps[index] = commander.step(controller, moment)
+    columns = step_columns(steps, motion.velocity.shape[1])
+    difference = columns["v"] - motion.velocity
+    return {
+        **columns,
+        "logged": np.asarray(motion.velocity),
+        "dv": difference,
+        "velocity_difference": np.linalg.norm(difference, axis=1),
+        "largest_difference": np.max(np.abs(difference), axis=1),
+        "barrier_margin_logged": np.array([np.nan if room is None else room.barrier for room in margins]),
+        "barrier_row_logged": ["" if room is None else room.barrier_row for room in margins],
+        "velocity_margin_logged": np.array([np.nan if room is None else room.limit for room in margins]),
+        "velocity_row_logged": ["" if room is None else room.limit_row for room in margins],
+    }

@@ -153,10 +153,10 @@ class QpIkController:
         self._costs: tuple[CostTerm, ...] = (*standard_costs(config, home), *costs)
         self._reach_weight = eliminated_weight(*configured_weights(config))
 
-    def with_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
-        """Controller on a newer field; see `SceneRows.in_field`."""
+    def replace_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
+        """Controller on a newer field; see `SceneRows.replace_field`."""
         other = copy(self)
-        other._builder = self._builder.with_field(field, balls)
+        other._builder = self._builder.replace_field(field, balls)
         return other
 
     def step(

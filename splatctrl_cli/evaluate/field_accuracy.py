@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import BANDS, MAP_ALLOWANCE, PROBABILITY_NEAR
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_if
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS, LENGTH, Scale
 from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.formats.mesh import load_mesh
@@ -118,11 +118,12 @@ def field_accuracy(
     nearest true surface point; None if unknown. The over-estimate is of `hard` at seen points up to 20 cm, against 1
     cm + `median_radius` [m]. Raises InputError for unequal lengths, or without `hard`.
     """
-    if "hard" not in distances:
-        raise InputError(f"distances: expected one named hard, got {', '.join(distances) or 'none'}")
+    refuse_if("hard" not in distances, f"distances: expected one named hard, got {', '.join(distances) or 'none'}")
     for name, values in {**distances, **({} if seen is None else {"seen": seen})}.items():
-        if values.shape != truth.shape:
-            raise InputError(f"{name}: expected {truth.shape} values, as the truth has, got {values.shape}")
+        refuse_if(
+            values.shape != truth.shape,
+            f"{name}: expected {truth.shape} values, as the truth has, got {values.shape}",
+        )
     errors = {name: values.astype(np.float64) - truth for name, values in distances.items()}
     is_near = (truth >= BANDS[0][0]) & (truth < BANDS[-1][1])
     everyone = np.ones(truth.shape, dtype=np.bool_)
@@ -222,7 +223,7 @@ def compare_with_truth(
     median_radius: float,
     probabilities: Mapping[str, Callable[[Float64, Float64], Float64]],
 ) -> tuple[dict[str, Any], dict[str, Reliability]]:
-    """Accuracy of `FIELDS` where `frames` saw the surface, as in ``field.json``, and reliability by probability form.
+    """Accuracy of `FIELDS` where `frames` saw the surface (``field.json``), and reliability by probability form.
 
     Of sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]. name: of the
     truth. workspace: where the scene keeps splats. probabilities: functions of points (Q, 3) and sdf (Q,) [m].
@@ -235,8 +236,11 @@ def compare_with_truth(
     is_blank = ~np.isfinite(sdf)
     is_around = (np.abs(distance) < BANDS[-1][1]) & ~is_blank
     is_near = (distance >= BANDS[0][0]) & is_around
-    if not is_near.any():
-        raise NotEvaluableError(f"{name}: no cell of the grid lies within {BANDS[-1][1]} m outside an object")
+    refuse_if(
+        not is_near.any(),
+        f"{name}: no cell of the grid lies within {BANDS[-1][1]} m outside an object",
+        error=NotEvaluableError,
+    )
     seen, in_workspace = np.zeros_like(is_near), np.ones_like(is_near)
     seen[is_around] = seen_by(surface[is_around], frames)
     if workspace is not None:
@@ -294,11 +298,12 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     known, points = known[in_reach], points[in_reach]
     distance, _, is_inside = field.closest(points)
     is_near = ~is_inside & (distance < REACH)
-    if not is_near.any():
-        raise NotEvaluableError(
-            f"{mesh_path}: no cell of the grid lies within {REACH:g} m outside the mesh",
-            remedy="give the mesh in the frame of the grid (world), in metres",
-        )
+    refuse_if(
+        not is_near.any(),
+        f"{mesh_path}: no cell of the grid lies within {REACH:g} m outside the mesh",
+        remedy="give the mesh in the frame of the grid (world), in metres",
+        error=NotEvaluableError,
+    )
     accuracy = field_accuracy(
         {name: distance_at(values, known[is_near]) for name, values in distances.items()},
         distance[is_near],

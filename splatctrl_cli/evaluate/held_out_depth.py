@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.evaluate.field_accuracy import (
     GridDistance,
     band_accuracy,
@@ -49,21 +49,22 @@ def cloud_score(
     training camera. nan without points. unit: metres per unit of the reference's file. Raises NotEvaluableError
     without near points, or if another unit fits.
     """
-    if not max_distance > 0:
-        raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
+    refuse_if(
+        not max_distance > 0, f"--cloud-max: expected a distance above 0 m, got {max_distance:g}", error=UsageError
+    )
     counted = points if counts is None else points[counts]
     for name, some in (("scene's surface", counted), ("reference cloud", reference)):
-        if not len(some):
-            raise NotEvaluableError(f"the {name}: expected points to compare, got none")
+        refuse_if(not len(some), f"the {name}: expected points to compare, got none", error=NotEvaluableError)
     _check_unit(points, reference, max_distance, unit)
     to_reference = _nearest(counted, reference, max_distance, threads)
     to_surface = _nearest(reference, points, max_distance, threads)
-    if to_reference.min() >= max_distance:
-        raise NotEvaluableError(
-            f"the reference cloud: expected points within {1e3 * max_distance:g} mm of the scene's surface, got none;"
-            f" it spans {_box(reference)} m, the surface {_box(points)} m",
-            remedy="is it the same scene, in the same frame? give the cloud's unit as --cloud-unit",
-        )
+    refuse_if(
+        to_reference.min() >= max_distance,
+        f"the reference cloud: expected points within {1e3 * max_distance:g} mm of the scene's surface, got none;"
+        f" it spans {_box(reference)} m, the surface {_box(points)} m",
+        remedy="is it the same scene, in the same frame? give the cloud's unit as --cloud-unit",
+        error=NotEvaluableError,
+    )
     of = {"accuracy": to_reference, "completeness": to_surface, "completeness_seen": to_surface[seen]}
     found = {name: _mean_below(distances, max_distance) for name, distances in of.items()}
     return {
@@ -80,12 +81,13 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
     factors = (1.0, 1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
     fits = {factor: _overlap(some, factor * others, margin) for factor in factors}
     best = max(fits, key=lambda factor: fits[factor])
-    if fits[1.0] < fixed.CLOUD_NO_OVERLAP and fits[best] > fixed.CLOUD_GOOD_OVERLAP:
-        raise NotEvaluableError(
-            f"the reference cloud: expected the size of the scene's surface, which spans {_box(points)} m, got"
-            f" {_box(reference)} m; {best:g} times as large it overlaps by {100 * fits[best]:.0f}%",
-            remedy=f"give the cloud's unit as --cloud-unit {unit * best:g}",
-        )
+    refuse_if(
+        fits[1.0] < fixed.CLOUD_NO_OVERLAP and fits[best] > fixed.CLOUD_GOOD_OVERLAP,
+        f"the reference cloud: expected the size of the scene's surface, which spans {_box(points)} m, got"
+        f" {_box(reference)} m; {best:g} times as large it overlaps by {100 * fits[best]:.0f}%",
+        remedy=f"give the cloud's unit as --cloud-unit {unit * best:g}",
+        error=NotEvaluableError,
+    )
 
 
 def _overlap(points: Float64, others: Float64, margin: float) -> float:
@@ -149,8 +151,7 @@ def thin(points: Float64, spacing: float) -> Float64:
 
 
 def _check_spacing(spacing: float) -> None:
-    if not spacing > 0:
-        raise UsageError(f"--cloud-spacing: expected a distance above 0 m, got {spacing:g}")
+    refuse_if(not spacing > 0, f"--cloud-spacing: expected a distance above 0 m, got {spacing:g}", error=UsageError)
 
 
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
@@ -212,11 +213,12 @@ def compare_with_held_out_depth(
     distances = grid_distances(grid)
     box = Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1))
     measured, eyes, num_edges = _measure(frames, counted, Box(lower=box.lower - REACH, upper=box.upper + REACH))
-    if not box.contains(measured).any():
-        raise NotEvaluableError(
-            f"held-out depth: no pixel of {len(frames)} frames shows a point in the grid",
-            remedy="give frames that look at the box of the grid, with poses in its frame",
-        )
+    refuse_if(
+        not box.contains(measured).any(),
+        f"held-out depth: no pixel of {len(frames)} frames shows a point in the grid",
+        remedy="give frames that look at the box of the grid, with poses in its frame",
+        error=NotEvaluableError,
+    )
     rng = np.random.default_rng(seed)
     drawn = np.sort(rng.choice(len(measured), min(len(measured), max_points), replace=False))
     ray = measured[drawn] - eyes[drawn]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if, require
 from splatctrl_cli.libraries import scipy_io
 from splatctrl_cli.records import MILLIMETRES, Bool, Float64
 
@@ -82,12 +82,12 @@ class ScoreProtocol:
                 )
             scored = self.scored
         training = self.training or tuple(n for n in numbers if n not in scored)
-        if not scored or not training:
-            raise InputError(
-                f"{where}: protocol {self.name}: expected views to train and views to score, got {len(training)} and "
-                f"{len(scored)} of {len(numbers)} views",
-                remedy="give another holdout rule",
-            )
+        refuse_if(
+            not scored or not training,
+            f"{where}: protocol {self.name}: expected views to train and views to score, got {len(training)} and "
+            f"{len(scored)} of {len(numbers)} views",
+            remedy="give another holdout rule",
+        )
         used = {*training, *scored}
         return Split(training=training, scored=scored, left_out=tuple(n for n in numbers if n not in used))
 
@@ -156,11 +156,12 @@ def _holdout(name: str) -> ScoreProtocol:
     every = re.fullmatch(r"every(\d+)(?:\+(\d+))?", rule)
     if every:
         step, first = int(every[1]), int(every[2] or 0)
-        if step < 2 or first >= step:
-            raise UsageError(
-                f"--protocol {name}: expected every N of at least 2 and FIRST below N, got {step} and {first}",
-                remedy="holdout:every8 scores views 0, 8, 16, ..., and holdout:every8+4 views 4, 12, ...",
-            )
+        refuse_if(
+            step < 2 or first >= step,
+            f"--protocol {name}: expected every N of at least 2 and FIRST below N, got {step} and {first}",
+            remedy="holdout:every8 scores views 0, 8, 16, ..., and holdout:every8+4 views 4, 12, ...",
+            error=UsageError,
+        )
         return ScoreProtocol(name=name, every=step, first=first, source=source)
     if re.fullmatch(r"\d+(,\d+)*", rule):
         return ScoreProtocol(name=name, scored=tuple(sorted({int(word) for word in rule.split(",")})), source=source)
@@ -212,10 +213,8 @@ class ObservedSpace:
 
 def scan_number(scan: str) -> int:
     """24 for ``scan24``. Raises InputError without a number."""
-    match = re.search(r"(\d+)$", scan)
-    if match is None:
-        raise InputError(f"scan '{scan}': expected a name with DTU's number, such as scan24")
-    return int(match[1])
+    number = re.search(r"\d+$", scan)
+    return int(require(number, f"scan '{scan}': expected a name with DTU's number, such as scan24")[0])
 
 
 def cloud_of_scan(folder: Path, scan: str) -> Path:
@@ -233,11 +232,11 @@ def read_observed(folder: Path, scan: str) -> ObservedSpace:
     path, plane_path = folder / f"ObsMask{number}_10.mat", folder / f"Plane{number}.mat"
     box, resolution = _array(path, "BB", 6).reshape(2, 3), float(_array(path, "Res", 1)[0])
     mask = np.asarray(_variable(path, "ObsMask")) != 0
-    if mask.ndim != 3 or not resolution > 0 or not (box[1] > box[0]).all():
-        raise InputError(
-            f"{path}: expected ObsMask (X, Y, Z), a box BB and a width Res above 0, got {mask.shape}, {box.tolist()}"
-            f" and {resolution:g}"
-        )
+    refuse_if(
+        mask.ndim != 3 or not resolution > 0 or not (box[1] > box[0]).all(),
+        f"{path}: expected ObsMask (X, Y, Z), a box BB and a width Res above 0, got {mask.shape}, {box.tolist()}"
+        f" and {resolution:g}",
+    )
     return ObservedSpace(
         is_observed=mask,
         low=box[0] / MILLIMETRES,
@@ -249,14 +248,15 @@ def read_observed(folder: Path, scan: str) -> ObservedSpace:
 
 def _array(path: Path, name: str, size: int) -> Float64:
     values = np.asarray(_variable(path, name), np.float64).ravel()
-    if values.size != size or not np.isfinite(values).all():
-        raise InputError(f"{path}: {name}: expected {size} numbers, got {values.size}")
+    refuse_if(
+        values.size != size or not np.isfinite(values).all(),
+        f"{path}: {name}: expected {size} numbers, got {values.size}",
+    )
     return values
 
 
 def _variable(path: Path, name: str) -> Any:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file", remedy="give the folder ObsMask of DTU's SampleSet")
+    refuse_if(not path.is_file(), f"{path}: no such file", remedy="give the folder ObsMask of DTU's SampleSet")
     try:
         return scipy_io.loadmat(path, variable_names=[name])[name]
     except KeyError:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import IN_FRONT
-from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.evaluate.metrics import (
     BAD_SHARE,
     DECIBELS,
@@ -101,7 +101,7 @@ def score_view(
             "ssim": float(similarity[region].mean()) if region.any() else math.nan,
             **errors,
             "depth_coverage": errors["depth_pixels"] / num_reference if num_reference else math.nan,
-            "in_front": in_front(depth, frame.depth, region),
+            "in_front": share_in_front(depth, frame.depth, region),
         }
         figures |= {f"{figure}_{name}": value for figure, value in found.items()}
     return figures
@@ -121,7 +121,7 @@ def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float
     return float(mass[is_inside & is_free[i, j, k]].sum() / mass.sum()) if mass.sum() > 0 else math.nan
 
 
-def in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
+def share_in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
     """Share of masked pixels with both depths whose `depth` is nearer by more than IN_FRONT.
 
     nan without such pixels.
@@ -143,8 +143,7 @@ def metric_scales() -> dict[str, Scale]:
 
 def total_score(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Each figure's mean over views that have it, or nan. Raises NotEvaluableError without a view."""
-    if not rows:
-        raise NotEvaluableError("no view was scored: expected at least one, got 0")
+    refuse_if(not rows, "no view was scored: expected at least one, got 0", error=NotEvaluableError)
     totals: dict[str, float] = {"num_views": len(rows)}
     for name in rows[0]:
         values = [row[name] for row in rows if not math.isnan(row[name])]

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import OTHER_VIEW_CLEARLY, SAME_PLACE_DEGREES, SAME_PLACE_METRES
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, refuse_if
 from splatctrl_cli.evaluate.held_out_depth import CLOUD_SCALES
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS
 from splatctrl_cli.evaluate.score import metric_scales
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, gate_reasons, note, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, plural, verdict_of
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.records import Bool, Float64
@@ -56,11 +56,11 @@ def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
     earlier = read_baseline(path)
     now, then = ({**one["protocol"], "scans": one.get("scans")} for one in (report, earlier))
     for name in ("name", "split", "mask_rule", "resolution", "averaging", "scans"):
-        if now.get(name) != then.get(name):
-            raise InputError(
-                f"{path}: not comparable: {name}: expected {now.get(name)}, got {then.get(name)}",
-                remedy="score the baseline anew, in the same way",
-            )
+        refuse_if(
+            now.get(name) != then.get(name),
+            f"{path}: not comparable: {name}: expected {now.get(name)}, got {then.get(name)}",
+            remedy="score the baseline anew, in the same way",
+        )
     old: Mapping[str, Any] = earlier["metrics"]
     return {
         PREFIX + name: value - old[name] if value is not None and isinstance(old.get(name), int | float) else None
@@ -128,7 +128,7 @@ def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damag
     compared = Reason(
         criterion="views",
         outcome=Outcome.PASSED if num_views else Outcome.NOT_EVALUABLE,
-        sentence=f"{counted(num_views, 'view')} compared",
+        sentence=f"{plural(num_views, 'view')} compared",
         value=float(num_views),
         threshold=1.0,
         count=int(num_views),
@@ -137,7 +137,7 @@ def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damag
     return verdict_of(
         "score",
         [compared, *notes, *gate_reasons(require, dict.fromkeys(NAMES_WITH_CHANGES, None) | metrics, counts)],
-        scope=counted(num_views, "view") + ("" if num_scans is None else f" of {counted(num_scans, 'scan')}"),
+        scope=plural(num_views, "view") + ("" if num_scans is None else f" of {plural(num_scans, 'scan')}"),
         is_damaged=is_damaged,
         counts=counts,
     )

@@ -10,7 +10,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Any, Generic, TypeVar
 
-from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError, did_you_mean
+from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError, did_you_mean, refuse_if
 
 E = TypeVar("E")  # what a criterion looks at
 
@@ -65,7 +65,7 @@ note = partial(Reason, outcome=Outcome.PASSED, is_note=True)
 """Decides nothing and is worth a line."""
 
 
-def held(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
+def passed_reason(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
     """A passed criterion, not worth a line."""
     return Reason(outcome=Outcome.PASSED, sentence=sentence, value=value, threshold=threshold, unit=unit, count=count)
 
@@ -131,7 +131,7 @@ class Verdict:
         return tuple(reason for reason in self.reasons if reason.outcome is not Outcome.PASSED)
 
     @property
-    def said(self) -> tuple[Reason, ...]:
+    def shown(self) -> tuple[Reason, ...]:
         return tuple(reason for reason in self.reasons if reason.is_note and reason.outcome is Outcome.PASSED)
 
     @property
@@ -208,7 +208,7 @@ def brief(result: Any) -> str:
     return f"{type(result).__name__}({', '.join(shown)})"
 
 
-def counted(number: float, noun: str) -> str:
+def plural(number: float, noun: str) -> str:
     """``1 view``, ``2 views``."""
     return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
 
@@ -234,13 +234,18 @@ def check_gate_names(
     for requirement in requirements:
         name, _, _ = parse_gate(requirement)
         for options, others in (elsewhere or {}).items():
-            if name not in names and name in others:
-                raise UsageError(f"--require {requirement}: a figure of {options}", remedy="give it, or gate another")
-        if name not in names:
-            raise UsageError(
-                f"--require {requirement}: unknown metric",
-                remedy=did_you_mean(name, names, f"known here: {', '.join(names)}"),
+            refuse_if(
+                name not in names and name in others,
+                f"--require {requirement}: a figure of {options}",
+                remedy="give it, or gate another",
+                error=UsageError,
             )
+        refuse_if(
+            name not in names,
+            f"--require {requirement}: unknown metric",
+            remedy=did_you_mean(name, names, f"known here: {', '.join(names)}"),
+            error=UsageError,
+        )
 
 
 def gate_reasons(

@@ -11,7 +11,7 @@ from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import KERNEL_OF, KERNELS, SphereField, device_field
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
-from splatctrl_cli.field.probability import make_probability
+from splatctrl_cli.field.probability import PROBABILITIES
 from splatctrl_cli.formats.grid.grid_format import CHANNELS
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.memory import Memory
@@ -65,7 +65,9 @@ class Baker:
         kinds = {name: kind for name, kind in KERNELS.items() if name in names}
         self.kernels = {name: kind(self.spheres, config, threads=threads) for name, kind in kinds.items()}
         has_probability = "probability" in channels
-        self.probability = make_probability(self.spheres, config, threads=threads) if has_probability else None
+        self.probability = (
+            PROBABILITIES[config.probability](self.spheres, config, threads) if has_probability else None
+        )
         self.counts = {f"{name}_{what}": 0 for name in self.kernels for what in ("without_value", "over_estimates")}
         self._occupancy, self._thresholds = occupancy, thresholds or OccupancyConfig()
         self.on_device = None if device is None else device_field(self.spheres, self.kernels, config, device)
@@ -118,13 +120,13 @@ class Baker:
         where = None if mask is None else _cells(mask, span)
         if where is not None and not where.any():
             return
-        made = self._made(span, where)
+        made = self._make_channels(span, where)
         for name in self.channels:
             out[name][... if where is None else where] = made[name]
 
-    def _made(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
+    def _make_channels(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
         cells = None if where is None else np.flatnonzero(where)
-        made, entry = self._by_processor(span, cells) if self.on_device is None else self._by_device(span)
+        made, entry = self._bake_on_processor(span, cells) if self.on_device is None else self._bake_on_device(span)
         if self.probability is not None:
             whole = np.zeros(span.shape_of_channel, np.float32)
             whole[... if where is None else where] = made["sdf"]
@@ -136,7 +138,7 @@ class Baker:
             made["observed"] = _pick(observed, cells)
         return made
 
-    def _by_processor(self, span: GridSpan, cells: Index | None) -> _Made:
+    def _bake_on_processor(self, span: GridSpan, cells: Index | None) -> _Made:
         hard, gradient, entry = self._hard(span, cells)
         kernels = {name: self._kernel(name, span, cells) for name in self.kernels}
         for name, (distance, _) in kernels.items():
@@ -152,7 +154,7 @@ class Baker:
             made[name] = np.where(np.isnan(distance), hard, distance)
         return made, entry
 
-    def _by_device(self, span: GridSpan) -> _Made:
+    def _bake_on_device(self, span: GridSpan) -> _Made:
         assert self.on_device is not None
         wanted = {*self.channels, "entry"} if "label" in self.channels else set(self.channels)
         found = self.on_device.bake(span, wanted, margin=self.bound_margin)

@@ -37,7 +37,7 @@ class SphereField:
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def nearest(self, points: Float64) -> Index:
-        """points (Q, 3) [m] -> index (Q,) of the sphere that gives the distance."""
+        """Index (Q,) of the sphere that gives the distance at points (Q, 3) [m]."""
         local = self.spheres.relative(checked_points(points))
         return self.spheres.source[native.nearest(self.spheres.clusters, self.radii, local, threads=self._threads)[2]]
 
@@ -61,7 +61,7 @@ class LogSumExpField(ABC):
 
     @abstractmethod
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined."""
+        """Distance (Q,) [m] and gradient (Q, 3) at points (Q, 3) [m]; NaN if undefined."""
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
         """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
@@ -96,7 +96,7 @@ class GpdfField(LogSumExpField):
         self._offsets = spheres.offsets(self.offsets - self._common)
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined.
+        """Distance (Q,) [m] and gradient (Q, 3) at points (Q, 3) [m]; NaN if undefined.
 
         ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this,
         normalised (`normalise`).
@@ -143,7 +143,7 @@ class SeField(LogSumExpField):
         self.radii = spheres.offsets(spheres.radii, spare=0.0)
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN where L >= 0."""
+        """Distance (Q,) [m] and gradient (Q, 3), not normalised, at points (Q, 3) [m]; NaN where L >= 0."""
         score, gradient = native.gaussian(
             self.spheres.clusters,
             self._offsets,
@@ -270,11 +270,11 @@ class OnDevice:
         return found.distance.astype(np.float64), found.gradient.astype(np.float64)
 
     def distance(self, points: Float64) -> Float64:
-        """points (Q, 3) [m] -> distance (Q,) [m]."""
+        """Distance (Q,) [m] at points (Q, 3) [m]."""
         return self._answer(points).distance.astype(np.float64) if len(points) else np.zeros(0)
 
     def nearest(self, points: Float64) -> Index:
-        """points (Q, 3) [m] -> index (Q,) of the sphere that gives the exact distance."""
+        """Index (Q,) of the sphere that gives the exact distance at points (Q, 3) [m]."""
         if not len(points):
             return np.zeros(0, np.int64)
         found = self._answer(points, "entry")

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_cdt, distance_transform_edt
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.errors import InputError, UsageError, refuse_if
+from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
 from splatctrl_cli.field.clusters import checked_points
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import (
@@ -192,10 +192,9 @@ class GridField:
         ``max over the corners of (hard(corner) - |x - corner|)``, less rounding. It holds for obstacle cells, too.
         NaN where `query` is. Raises InputError without the channel bound.
         """
-        if self._bound is None:
-            raise InputError("distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
+        bound = require(self._bound, "distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
         # The channel bounds a whole cell: at its centre the exact distance is half a diagonal more.
-        lowest = native.lipschitz_bound(self._bound, self._origin, self._voxel, checked_points(points))
+        lowest = native.lipschitz_bound(bound, self._origin, self._voxel, checked_points(points))
         certified = np.asarray(lowest + HALF_DIAGONAL * self._voxel)
         if self._has_blank:
             certified[np.isnan(self.query(points)[0])] = np.nan

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.field.baker import Baker, Planes
-from splatctrl_cli.kernels import field as native
+from splatctrl_cli.kernels import native, num_threads
 from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Float64, SplatSet, UInt8
 
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """mask (blocks of the grid): 1 where a bake is needed; None: everywhere, for `reason`."""
+    """Mask (blocks of the grid): 1 where a bake is needed; None: everywhere, for `reason`."""
 
     mask: UInt8 | None
     num_blocks: int
@@ -41,12 +41,13 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
     for with_weights in (False, True) if "se" in new.kernels else (False,):
         both = _changed((before, after), (old, new), with_weights=with_weights)
         for changed, baker in zip(both, (old, new), strict=True):
-            se = baker.kernels["se"] if with_weights else None
-            offsets, length = (baker.exact.radii, None) if se is None else (se.terms().offsets, se.kernel.length)
+            se = baker.kernels["se"] if with_weights else None  # ``2 l^2 log |w_i|``; else the radii, and no length
+            offsets, length = (baker.exact.radii, 0.0) if se is None else (se.terms().offsets, se.kernel.length)
             if changed.any():
-                native.touched_blocks(
-                    baker.spheres.clusters, offsets, changed, length, span, mask, threads=baker.threads
-                )
+                native.field_touched(
+                    *baker.spheres.clusters, *offsets, changed, length, *span.arrays[:3],
+                    num_threads(baker.threads), mask,
+                )  # fmt: skip
     return Changes(mask=mask, num_blocks=num_blocks)
 
 

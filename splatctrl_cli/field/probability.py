@@ -115,15 +115,10 @@ def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
 
 CollisionProbability = CalibratedProbability | PaperProbability
 _Make = Callable[[Spheres, FieldConfig, int], CollisionProbability]
-PROBABILITIES: Mapping[str, _Make] = {
+PROBABILITIES: Mapping[str, _Make] = {  # by `config.probability`
     "calibrated": lambda spheres, config, threads: CalibratedProbability(sigma=config.error, mean=config.error_mean),
     "paper": lambda spheres, config, threads: PaperProbability(spheres, config, threads=threads),
 }
-
-
-def make_probability(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> CollisionProbability:
-    """Make the probability that ``config.probability`` names."""
-    return PROBABILITIES[config.probability](spheres, config, threads)
 
 
 def probabilities(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> dict[str, CollisionProbability]:

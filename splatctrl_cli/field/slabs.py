@@ -168,7 +168,7 @@ _BESIDE = 64  # bytes per cell in a bake besides its channels, in at most 64 MiB
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kept:
+class EarlierBake:
     """An earlier bake, valid where `mask` (blocks) is zero, with new observations."""
 
     grid: DistanceGrid
@@ -257,7 +257,7 @@ class UnknownSpace:
         }
 
 
-def bake_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
+def bake_planes(baker: Baker, first: int, last: int, kept: EarlierBake | None = None) -> Planes:
     """Channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
     planes = baker.allocate(last - first)
     if kept is None:

@@ -33,7 +33,7 @@ class Parts:
     remedy: str = REMEDY
 
     @classmethod
-    def of_run(cls, folder: Path, run: Mapping[str, object]) -> "Parts":
+    def from_run(cls, folder: Path, run: Mapping[str, object]) -> "Parts":
         """Read the digests in ``run.json``. Raises InputError for invalid ones."""
         digests = run.get("parts")
         if digests is not None and not (
@@ -43,7 +43,7 @@ class Parts:
         return cls(folder=folder, digests=digests)
 
     @classmethod
-    def beside(cls, path: Path) -> "Parts":
+    def from_folder(cls, path: Path) -> "Parts":
         """Read the digests in a file's folder; None without ``run.json`` or from an older version.
 
         Raises InputError for an unreadable ``run.json``.
@@ -53,7 +53,7 @@ class Parts:
             return cls(folder=path.parent)
         with refuse_faults(f"{file}: cannot be read", OSError, ValueError):
             run = json.loads(file.read_text(encoding="utf-8"))
-        return cls.of_run(path.parent, run if isinstance(run, dict) else {})
+        return cls.from_run(path.parent, run if isinstance(run, dict) else {})
 
     def has(self, path: Path) -> bool:
         """True if a file is listed; without digests, if it exists."""
@@ -80,7 +80,7 @@ _WITHOUT_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.
 
 
 @contextmanager
-def held(partial: Path, *, is_folder: bool) -> Iterator[None]:
+def lock_output(partial: Path, *, is_folder: bool) -> Iterator[None]:
     """Lock a partial output for the block; create it if missing.
 
     The lock follows a rename, ends with the process, and leaves nothing. Without flock(2) nothing is locked. Raises
@@ -203,7 +203,7 @@ def output_path(
             _check_not_there(path, force=force)
             partial = partial_path(path)
             partial.parent.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(held(partial, is_folder=is_folder))
+            stack.enter_context(lock_output(partial, is_folder=is_folder))
             is_resumed = resume and can_go_on()
             if is_folder and not is_resumed:
                 for entry in partial.iterdir():

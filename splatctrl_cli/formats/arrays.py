@@ -20,7 +20,7 @@ import numpy as np
 from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, ranges
 from splatctrl_cli.formats.unpacking import PIECE
-from splatctrl_cli.libraries import of_extra
+from splatctrl_cli.libraries import import_extra
 from splatctrl_cli.records import Array, Stamps, Values
 
 DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a place in it lies before its start
@@ -276,7 +276,7 @@ class Hdf5File(ArrayFile):
     def __init__(self, path: Path) -> None:
         """Raises InputError for another kind of file."""
         super().__init__(path)
-        self._h5py = of_extra("h5py", _EXTRA, "HDF5 files")
+        self._h5py = import_extra("h5py", _EXTRA, "HDF5 files")
         self.names = found = list[str]()
         with self._opened() as file:
             file.visititems(lambda name, item: found.append(name) if isinstance(item, self._h5py.Dataset) else None)
@@ -314,7 +314,7 @@ class ParquetFile(ArrayFile):
         """Raises InputError for another kind of file."""
         super().__init__(path)
         self._arrow, self._parquet = (
-            of_extra(name, _EXTRA, "Parquet files") for name in ("pyarrow", "pyarrow.parquet")
+            import_extra(name, _EXTRA, "Parquet files") for name in ("pyarrow", "pyarrow.parquet")
         )
         self._only = only
         with self._opened() as file:

@@ -16,7 +16,7 @@ STL_HEADER, STL_FACE = 84, 50  # bytes; the header ends with the number of faces
 
 @dataclass(frozen=True, kw_only=True)
 class TriangleMesh:
-    """vertices (V, 3) float64 [m]; faces (F, 3) int64, counter-clockwise from outside.
+    """Vertices (V, 3) float64 [m]; faces (F, 3) int64, counter-clockwise from outside.
 
     is_closed: every edge has two faces in opposite directions. note: ignored parts.
     """

@@ -85,13 +85,13 @@ def _unpacked_up_to(data: bytes, compression: str, most: int) -> bytes:
                 with decompressor.stream_reader(data, read_across_frames=True) as stream:
                     return stream.read(most)
             case "lz4":
-                return _of_lz4(data, most)
+                return _unpack_lz4(data, most)
             case "bz2":
                 return bz2.BZ2Decompressor().decompress(data, max_length=most)
     raise BadBlockError(f"compression {compression!r} is unknown; expected zstd, lz4 or bz2")
 
 
-def _of_lz4(data: bytes, most: int) -> bytes:
+def _unpack_lz4(data: bytes, most: int) -> bytes:
     parts, length = [], 0
     while data and length < most:
         decompressor = lz4.frame.LZ4FrameDecompressor()

@@ -118,7 +118,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
                 error=NotEvaluableError,
             )
         cameras, moving = sorted({frame.camera for frame in frames}), moving_cameras(frames)
-        held = _held(request, cameras, has_anchor=arm is not None or bool(moving))
+        held = _choose_fixed(request, cameras, has_anchor=arm is not None or bool(moving))
         begin = {camera: np.eye(4) for camera in cameras}
         if request.board is not None:
             by_stamp = {c: {f.stamp_ns: f.T_world_camera for f in frames if f.camera == c} for c in cameras}
@@ -162,7 +162,7 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
         f"{model.urdf.path}: expected collision geometry, got spheres alone, which enclose the surface",
         remedy="give the URDF with its meshes (--packages DIR where they are in packages)",
     )
-    states = source.states.of_log(*model.joint_columns(source.joint_names))
+    states = source.states.convert_joints(*model.joint_columns(source.joint_names))
     return Arm(model, states.postures(fixed.STATES_CLOSE_NS))
 
 
@@ -235,7 +235,7 @@ def depth_frame(stored: StoredFrame) -> RgbdFrame:
     )
 
 
-def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
+def _choose_fixed(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
     """Fixed cameras: of --hold; else none with a robot or moving camera; else the first."""
     refuse_if(
         request.hold is not None and request.hold not in cameras,
@@ -292,7 +292,7 @@ def _calibration(
         R = np.eye(3) if moves else T[:3, :3]
         to_axes = np.zeros((6, 6))
         to_axes[:3, 3:], to_axes[3:, :3] = R, R
-        covariance = to_axes @ certainty.of_camera(camera) @ to_axes.T
+        covariance = to_axes @ certainty.slice_covariance(camera) @ to_axes.T
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         scale, bias = estimate.depth_of(camera)
         unknowns = solution.adjustment.unknowns
@@ -315,7 +315,7 @@ def _calibration(
         world_frame=source.world_frame,
         digests=source.digests(),
         cameras=cameras,
-        held=(*((BASE,) if evidence.arm is not None else ()), *(f"camera {camera}" for camera in solution.held)),
+        held=(*((BASE,) if evidence.arm is not None else ()), *(f"camera {camera}" for camera in solution.fixed)),
         clock=float(estimate.clock) if solution.adjustment.unknowns.has_clock else None,
         sigma_clock=certainty.sigma_clock,
     )

@@ -28,7 +28,7 @@ class Clusters(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """values (16 C,): o of ``|x - p| - o`` [m], or b of ``|x - p|^2 - b`` [m^2]; spare -1e30.
+    """Values (16 C,): o of ``|x - p| - o`` [m], or b of ``|x - p|^2 - b`` [m^2]; spare -1e30.
 
     maxima (C + G,): the largest of clusters, then groups.
     """
@@ -230,31 +230,6 @@ def bake_kernel(
         num_threads(threads),
         distance,
         gradient,
-    )
-
-
-def touched_blocks(
-    spheres: Clusters,
-    offsets: Offsets,
-    changed: UInt8,
-    length: float | None,
-    span: GridSpan,
-    is_touched: UInt8,
-    *,
-    threads: int = 0,
-) -> None:
-    """Set is_touched (blocks) to 1 where spheres in `changed` (16 C,) can matter.
-
-    For `bake_hard` if `length` is None (offsets: radii), else for a Gaussian `bake_kernel` (``2 l^2 log |w_i|``).
-    """
-    native.field_touched(
-        *spheres,
-        *offsets,
-        changed,
-        0.0 if length is None else length,
-        *span.arrays[:3],
-        num_threads(threads),
-        is_touched,
     )
 
 

@@ -174,7 +174,7 @@ def optimiser_step(
 
 
 def unpack_parameters(parameters: Float32, num_threads: int) -> tuple[Float32, Float32, Float32, Float32]:
-    """centers (N, 3), radii (N,), colors (N, 3), opacities (N,) of parameters (N, 8)."""
+    """Centers (N, 3), radii (N,), colors (N, 3), opacities (N,) of parameters (N, 8)."""
     count = len(parameters)
     centers, colors = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     radii, opacities = np.empty(count, np.float32), np.empty(count, np.float32)

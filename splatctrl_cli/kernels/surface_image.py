@@ -34,7 +34,7 @@ class SurfaceScene:
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceImage:
-    """depth (H, W) [m] of the nearest surface, 0 = none; link (H, W) of it.
+    """Depth (H, W) [m] of the nearest surface, 0 = none; link (H, W) of it.
 
     inside (H, W): link of the solid around the measured point. -1 = none.
     """

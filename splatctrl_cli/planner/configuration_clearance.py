@@ -177,9 +177,9 @@ class Clearance:
             compiled=compiled,
             names=tuple(names[s] for s in moving) + tuple(f"{names[a]}~{names[b]}" for a, b in pairs),
         )
-        return room.in_scene(scene)
+        return room.replace_scene(scene)
 
-    def in_scene(self, scene: HasDistance) -> "Clearance":
+    def replace_scene(self, scene: HasDistance) -> "Clearance":
         """Same arm and margins in another scene."""
         if self.compiled is None or not isinstance(scene, Solids):
             return replace(self, scene=scene)

@@ -21,7 +21,7 @@ from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 
 
-def resampled(waypoints: Float64, spacing: float) -> Float64:
+def resample(waypoints: Float64, spacing: float) -> Float64:
     """Postures (K, J) at most `spacing` [rad] apart, with every waypoint."""
     rows = [waypoints[:1]]
     for a, b in pairwise(waypoints):
@@ -39,7 +39,7 @@ def effector_rates(
     """
     rates = np.full(len(waypoints) - 1, np.inf)
     for edge, ends in enumerate(pairwise(waypoints)):
-        for q in resampled(np.array(ends), fixed.FRAME_SPACING):
+        for q in resample(np.array(ends), fixed.FRAME_SPACING):
             twist = model.frame_jacobian(q, frame) @ (ends[1] - ends[0])
             for part, limit in ((twist[:3], max_linear), (twist[3:], max_angular)):
                 speed = float(np.linalg.norm(part))

@@ -96,7 +96,7 @@ class Correction:
         if (camera.scale, camera.bias) == (1.0, 0.0):
             return replace(stored, T_world_camera=T)
         if unit is None or camera.bias:
-            return _with_depth(stored, T, lambda: self.depth(stored.camera, stored.depth))
+            return _replace_depth(stored, T, lambda: self.depth(stored.camera, stored.depth))
         scaled, one = unit * camera.scale, np.float32(unit)
         return replace(
             stored,
@@ -116,7 +116,7 @@ class Correction:
         return [f"{text}, which was found of another recording ({self.calibration.recording})"]
 
 
-def _with_depth(stored: StoredFrame, T: Float64, read_depth: Callable[[], Float32]) -> StoredFrame:
+def _replace_depth(stored: StoredFrame, T: Float64, read_depth: Callable[[], Float32]) -> StoredFrame:
     return replace(stored, T_world_camera=T, read_depth=read_depth, depth_unit=None, depth_file=None)
 
 
@@ -284,7 +284,7 @@ class Perturbation:
         """The frame at pose T (4, 4), with noise in its depth."""
         if not self.depth_noise:
             return replace(stored, T_world_camera=T)
-        return _with_depth(stored, T, lambda: self.depth(stored.camera, stored.stamp_ns, stored.depth))
+        return _replace_depth(stored, T, lambda: self.depth(stored.camera, stored.stamp_ns, stored.depth))
 
     def digests(self) -> dict[str, str]:
         """Values as on the command line, in place of a file's digest."""

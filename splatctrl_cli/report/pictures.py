@@ -75,7 +75,7 @@ def span_of(seconds: Float64) -> tuple[float, float]:
 
 @contextmanager
 def drawn_figure(path: Path, height: float, told: str = "") -> Iterator["mpl.figure.Figure"]:
-    """A figure of the house style, 1200 pixels wide, written without a date when the block ends.
+    """A figure of the house style, 1200 pixels wide, written undated when the block ends.
 
     told: its description in the file.
     """

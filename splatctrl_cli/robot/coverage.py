@@ -120,11 +120,11 @@ def coverage_of_solids(
         f"sphere set: link '{''.join(unknown[:1])}' is not in {urdf.path}",
         remedy=f"links there: {', '.join(urdf.links)}",
     )
-    return _measured(pickle.dumps((bodies, dict(solids), spheres, resolution)))
+    return _measure_packed(pickle.dumps((bodies, dict(solids), spheres, resolution)))
 
 
 @lru_cache(maxsize=32)
-def _measured(packed: bytes) -> CoverageReport:
+def _measure_packed(packed: bytes) -> CoverageReport:
     bodies, solids, spheres, resolution = pickle.loads(packed)
     leaders = {link: leader for link, (leader, _) in bodies.items()}
     measured = {leaders[link] for link in solids}
@@ -138,7 +138,9 @@ def _measured(packed: bytes) -> CoverageReport:
             ]
         ).reshape(-1, 3)
         own = np.array([spheres.links[i] == link for i in np.flatnonzero(member)], dtype=bool)
-        links.append(_of_link(link, parts, centers, spheres.radii[member], np.flatnonzero(member), own, resolution))
+        links.append(
+            _measure_link(link, parts, centers, spheres.radii[member], np.flatnonzero(member), own, resolution)
+        )
     return CoverageReport(
         links=tuple(links),
         num_spheres=len(spheres.radii),
@@ -221,7 +223,7 @@ def refine_triangles(triangles: Float64, longest: float) -> Float64:
     return np.concatenate(parts)
 
 
-def _of_link(
+def _measure_link(
     link: str,
     parts: Sequence[Solid],
     centers: Float64,
@@ -231,7 +233,7 @@ def _of_link(
     resolution: float,
 ) -> LinkCoverage:
     area = sum(float(areas(part.surface.corners).sum()) for part in parts)
-    deficits = [_of_part(part, centers, radii) for part in parts if len(radii)]
+    deficits = [_measure_part(part, centers, radii) for part in parts if len(radii)]
     shares = [
         uncovered_area(
             part.surface.corners[: 0 if deficit.proven <= 0 else None],
@@ -257,7 +259,7 @@ def _of_link(
     )
 
 
-def _of_part(part: Solid, centers: Float64, radii: Float64) -> Deficit:
+def _measure_part(part: Solid, centers: Float64, radii: Float64) -> Deficit:
     """A solid's deficit, its slack added; a ball within one sphere is covered exactly."""
     found = largest_deficit(part.surface.corners, centers, radii - part.slack)
     proven = found.proven

@@ -19,12 +19,12 @@ from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import (
     RENAMED,
+    add_boxes,
     are_links_renamed,
     lever_arms,
     match_links,
     read_spheres,
     spheres_of,
-    with_boxes,
 )
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
@@ -107,7 +107,7 @@ class RobotModel:
         file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
         with refuse_faults(f"{file.path}: not a URDF that can be built", ValueError, RuntimeError):
             model = pinocchio.buildModelFromXML(file.text)
-        model = _without(model, file.with_followers(locked or {}), file.path)
+        model = _without(model, file.add_followers(locked or {}), file.path)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
             spheres = spheres_of(file)
@@ -127,7 +127,7 @@ class RobotModel:
             return self
         middle = dict(zip(self.joint_names, self.middle, strict=True))
         led = {joint.name for joint in self.urdf.joints if joint.mimic is not None and joint.mimic[0] in fingers}
-        held = self.urdf.with_followers({name: float(middle[name]) for name in fingers if name not in led})
+        held = self.urdf.add_followers({name: float(middle[name]) for name in fingers if name not in led})
         return RobotModel(
             self.urdf,
             _without(self._model, held, self.urdf.path),
@@ -144,17 +144,17 @@ class RobotModel:
         robot = RobotModel(
             self.urdf,
             self._model,
-            with_boxes(self.sphere_set, boxes),
+            add_boxes(self.sphere_set, boxes),
             self.T_world_base,
             self.left_out,
             are_links_renamed=self.are_links_renamed,
             packages=self._packages,
             held=self.held,
         )
-        robot._surface = self.surface.with_boxes(boxes)
+        robot._surface = self.surface.add_boxes(boxes)
         return robot
 
-    def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
+    def replace_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
         """Robot with measured coverage; `unknown` explains a missing one."""
         deficit = (
             np.full(len(self.sphere_set.radii), np.nan)
@@ -170,7 +170,7 @@ class RobotModel:
             self._surface = RobotSurface.of(self.urdf, self.sphere_set, self._packages)
         return self._surface
 
-    def with_self_model(self, found: SelfModel) -> "RobotModel":
+    def join_self_model(self, found: SelfModel) -> "RobotModel":
         """Robot with a self-model's permanent parts; `surface_at` adds temporary ones."""
         return self._change(_surface=self.surface.joined(found.pieces()), self_model=found, _surfaces={})
 
@@ -198,10 +198,10 @@ class RobotModel:
         surface = self.surface
         return surface.extents(surface.poses({link: self.frame_pose(q, link) for link in surface.links}))
 
-    def with_self_pairs(self, pairs: Index) -> "RobotModel":
+    def replace_self_pairs(self, pairs: Index) -> "RobotModel":
         return self._change(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2), _allowance=None)
 
-    def with_self_allowance(self, allowance: Float64) -> "RobotModel":
+    def replace_self_allowance(self, allowance: Float64) -> "RobotModel":
         return self._change(_allowance=allowance)
 
     @property

@@ -121,7 +121,7 @@ def self_collision_pairs(
     )
 
 
-def without_disabled(model: RobotModel, disabled: Collection[frozenset[str]]) -> Index:
+def drop_disabled(model: RobotModel, disabled: Collection[frozenset[str]]) -> Index:
     """`self_pairs` (P, 2) without links that `disabled` (an SRDF) names."""
     links, pairs = model.sphere_set.links, model.self_pairs()
     return np.asarray(

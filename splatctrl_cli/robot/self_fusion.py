@@ -209,9 +209,9 @@ def _learn_link(
         stays, moves, is_other = np.zeros((3, len(cells)), bool)
         stays[is_solid], moves[is_solid] = _stays_in_world(*its, shown, poses[run, number])
         is_other[is_solid] = _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
-        grid = _without_scene(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, stays, 0) > 0)
+        grid = _drop_scene(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, stays, 0) > 0)
         is_elsewhere = spread_cells(mask, is_other | (stays & moves), 0) > 0
-        grid = _without_scene(np.where(is_elsewhere, np.float32(TRUNCATION), grid), np.zeros_like(mask))
+        grid = _drop_scene(np.where(is_elsewhere, np.float32(TRUNCATION), grid), np.zeros_like(mask))
         is_part = (grid < 0)[mask]
         if not is_part.any() and (index or len(np.unique(at[num_own >= LEAST_CELLS])) < NUM_CONFIGURATIONS):
             continue
@@ -330,7 +330,7 @@ def _candidates(points: Float64, configurations: Index) -> tuple[Float64, Bool]:
     return edge * first + VOXEL / 2, mask.repeat(BLOCK, 0).repeat(BLOCK, 1).repeat(BLOCK, 2)
 
 
-def _without_scene(distance: Float32, stays: Bool) -> Float32:
+def _drop_scene(distance: Float32, stays: Bool) -> Float32:
     pieces, num = ndimage.label(distance < 0, TOUCHING)
     sizes = np.bincount(pieces.ravel(), minlength=num + 1)
     is_out = (sizes < LEAST_CELLS) | (np.bincount(pieces.ravel(), stays.ravel(), num + 1) > MOST_LOST * sizes)

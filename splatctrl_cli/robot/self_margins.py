@@ -244,16 +244,16 @@ def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None
             surface = None if surfaces is None else surfaces.gaps_of(links, postures, centers, margin)
             if surfaces is not None and surface is not None and surface.max() < margin / SELF_SHARE:
                 surface = surfaces.gaps_of(links, postures, centers)  # exact, for a share of the largest counts
-            found.append(_kept(links, gap, margin, surface))
+            found.append(_fit_margin(links, gap, margin, surface))
     return tuple(pair for pair in found if pair.margin is None or pair.margin < margin)
 
 
-def with_kept_margins(model: RobotModel, margin: float, kept: Sequence[KeptMargin]) -> RobotModel:
+def apply_kept_margins(model: RobotModel, margin: float, kept: Sequence[KeptMargin]) -> RobotModel:
     """Robot with self_allowance for these pairs, relative to `margin` [m]."""
     less = {frozenset(pair.links): margin - pair.margin for pair in kept if pair.margin is not None}
     names = model.sphere_set.links
     allowance = [less.get(frozenset((names[a], names[b])), 0.0) for a, b in model.self_pairs()]
-    return model.with_self_allowance(np.array(allowance, dtype=np.float64))
+    return model.replace_self_allowance(np.array(allowance, dtype=np.float64))
 
 
 def least_gap(model: RobotModel, surfaces: SelfSurfaces | None, pair: KeptMargin, postures: Float64) -> float:
@@ -274,7 +274,7 @@ def sphere_gaps(model: RobotModel, links: tuple[str, str], postures: Float64) ->
     return np.asarray(gaps.min(axis=1))
 
 
-def _kept(links: tuple[str, str], gap: Float64, margin: float, surface: Float64 | None) -> KeptMargin:
+def _fit_margin(links: tuple[str, str], gap: Float64, margin: float, surface: Float64 | None) -> KeptMargin:
     apart = min(margin, SELF_SHARE * float((gap if surface is None else surface).max()))
     if surface is None:
         least = min(margin, float(np.quantile(gap, SELF_KEPT)))

@@ -80,13 +80,13 @@ class SelfModel:
         return [(part.link, part.triangles) for part in self.learned if part.is_always and len(part.triangles)]
 
     @property
-    def held(self) -> list[LearnedLink]:
+    def temporary(self) -> list[LearnedLink]:
         """Temporary parts."""
         return [part for part in self.learned if not part.is_always and len(part.triangles)]
 
     def held_at(self, stamp_ns: int) -> list[tuple[str, Float64]]:
         """Temporary parts at a stamp [ns]."""
-        return [(part.link, part.triangles) for part in self.held if part.start_ns <= stamp_ns < part.end_ns]
+        return [(part.link, part.triangles) for part in self.temporary if part.start_ns <= stamp_ns < part.end_ns]
 
     @property
     def parts(self) -> list[LearnedLink]:
@@ -94,7 +94,7 @@ class SelfModel:
 
     def changes(self) -> list[int]:
         """Stamps [ns], in order, at which `held_at` may change."""
-        return sorted({stamp for part in self.held for stamp in (part.start_ns, part.end_ns)} - set(ALWAYS))
+        return sorted({stamp for part in self.temporary for stamp in (part.start_ns, part.end_ns)} - set(ALWAYS))
 
     def arrays(self) -> dict[str, Array]:
         """All of it by name, for a file."""

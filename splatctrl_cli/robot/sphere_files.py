@@ -52,7 +52,7 @@ def own_spheres(urdf: UrdfFile) -> SphereSet:
     )
 
 
-def with_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSet:
+def add_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSet:
     """Add spheres that cover boxes in link frames, one per `CARRIED_CELL`."""
     links, centers, radii = [*spheres.links], [spheres.centers], [spheres.radii]
     for link, box in boxes:

@@ -113,12 +113,12 @@ class RobotSurface:
         )
 
     @classmethod
-    def of_balls(cls, centers_world: Float64, radii: Float64) -> "RobotSurface":
+    def from_balls(cls, centers_world: Float64, radii: Float64) -> "RobotSurface":
         """Build a surface of balls (S, 3), (S,) [m]; the link's frame is the world."""
         balls = [_ball("spheres", c, r) for c, r in zip(centers_world, radii, strict=True)]
         return cls.from_parts(balls, by_spheres=("spheres",))
 
-    def with_boxes(self, boxes: Sequence[tuple[str, Box]]) -> "RobotSurface":
+    def add_boxes(self, boxes: Sequence[tuple[str, Box]]) -> "RobotSurface":
         """Surface with carried boxes, each in the frame of its link."""
         shapes = [
             Shape(

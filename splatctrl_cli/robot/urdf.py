@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from defusedxml import ElementTree
 
-from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if, require
 from splatctrl_cli.formats.unpacking import read_text
 from splatctrl_cli.records import Float64
 
@@ -149,7 +149,7 @@ class UrdfFile:
             joint = by_child[joint.parent]
             yield joint.name
 
-    def with_followers(self, locked: Mapping[str, float]) -> dict[str, float]:
+    def add_followers(self, locked: Mapping[str, float]) -> dict[str, float]:
         """`locked` values, with unnamed joints that mimic them."""
         followers = {
             joint.name: joint.mimic[1] * locked[joint.mimic[0]] + joint.mimic[2]
@@ -278,9 +278,8 @@ def _check_limits(where: str, kind: str, limit: Any) -> None:
 
 def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape | tuple[str, str]]:
     geometry = collision.find("geometry")
-    element = None if geometry is None else next(iter(geometry), None)
-    if element is None:
-        raise InputError(f"{path}: link '{link}': collision without geometry")
+    first = next(iter(() if geometry is None else geometry), None)
+    element = require(first, f"{path}: link '{link}': collision without geometry")
     where = f"{path}: link '{link}': {element.tag}"
     T_link_shape = _origin(where, collision.find("origin"))
     if element.tag == "mesh":
@@ -321,11 +320,11 @@ def _origin(where: str, origin: Any) -> Float64:
         return T
     T[:3, 3] = _numbers(where, origin.get("xyz", "0 0 0"), 3)
     roll, pitch, yaw = _numbers(where, origin.get("rpy", "0 0 0"), 3)
-    T[:3, :3] = _about("z", yaw) @ _about("y", pitch) @ _about("x", roll)
+    T[:3, :3] = _rotate_about("z", yaw) @ _rotate_about("y", pitch) @ _rotate_about("x", roll)
     return T
 
 
-def _about(axis: str, angle: float) -> Float64:
+def _rotate_about(axis: str, angle: float) -> Float64:
     c, s = np.cos(angle), np.sin(angle)
     rows = {
         "x": [[1, 0, 0], [0, c, -s], [0, s, c]],

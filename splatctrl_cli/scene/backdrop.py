@@ -28,7 +28,7 @@ BLANK = 0.02  # share of a cell's pixels with depth
 
 
 def backdrop_seeds(frames: Sequence[RgbdFrame], opacities: Sequence[Float32], background: Color, most: int) -> Seeds:
-    """At most `most` seeds at pixels without depth that neither the map nor its background explains.
+    """At most `most` seeds at pixels without depth that map and background leave unexplained.
 
     opacities: rendered (H, W). Cells of pixels become larger until the seeds are few enough.
     """
@@ -85,7 +85,7 @@ class _Cells:
         has_depth, is_open = self._mean(frame.depth > 0), self._mean(opacity) < fixed.OPAQUE_ENOUGH
         self.color = self._mean(frame.color).astype(np.float32) / 255
         self.depth = self._mean(frame.depth) / np.maximum(has_depth, 1e-9)
-        self.is_blank = (has_depth < BLANK) & is_open & (self._mean(frame.in_view) == 1)
+        self.is_blank = (has_depth < BLANK) & is_open & (self._mean(frame.is_in_view) == 1)
         self.T_camera_world = invert_transform(frame.T_world_camera)
 
     def _mean(self, image: NDArray[np.generic]) -> Float64:
@@ -130,7 +130,7 @@ class _Cells:
         return found
 
     def compare(self, points: Float64, colors: Float32) -> tuple[Float64, Bool]:
-        """Colour differences (K,) to points (K, 3), 1 before measured depth, and False behind it or out of view."""
+        """Colour differences (K,) to points (K, 3), 1 before depth, and False behind it or out of view."""
         u, v, z = self._locate(points)
         h, w = self.depth.shape
         is_in = (z > 0) & (u > -0.5) & (v > -0.5) & (u < w - 0.5) & (v < h - 0.5)

@@ -106,7 +106,7 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
     fitter.window.newest = [fitter.view(frame) for frame in _frames(arrays, "newest")]
     fitter.window.keyframes = [fitter.view(frame) for frame in _frames(arrays, "keyframe")]
     fitter.unrepresented, fitter.bare = (
-        Balls.of_voxels(
+        Balls.from_voxels(
             np.asarray(arrays[f"{name}/centers"], np.float32),
             fitter.occupancy.config.voxel,
             np.asarray(arrays[f"{name}/labels"], np.uint8),

@@ -90,7 +90,7 @@ def lasts_at_fixed_links(
     config: OccupancyConfig,
     points: Float32,
 ) -> Bool:
-    """True for points (K, 3) [m], world, away from fixed links, or on a `lasting` pixel (H, W) of a frame.
+    """True for points (K, 3) [m], world, away from fixed links or on `lasting` pixels (H, W).
 
     Stereo gives pixels outside a link's outline the link's depth in some frames.
     """

@@ -218,7 +218,7 @@ class _BlockView:
         is_lost = (
             (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~find_shadows(frame.depth, frame.intrinsics.fx)
         )
-        is_lost = cv2.erode(_blocks(is_lost & frame.in_view, side).all(axis=2).view(np.uint8), BESIDE) > 0
+        is_lost = cv2.erode(_blocks(is_lost & frame.is_in_view, side).all(axis=2).view(np.uint8), BESIDE) > 0
         return cls(
             frame=frame,
             side=side,

@@ -54,13 +54,13 @@ def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
         return np.zeros_like(is_blank)
     is_shadow = is_blank & find_shadows(frame.depth, frame.intrinsics.fx)
     is_blank &= ~is_shadow
-    is_end = _with_shadow(cv2.dilate(is_robot.view(np.uint8), BESIDE_ROBOT) > 0, is_shadow) | ~frame.in_view
+    is_end = _add_shadow(cv2.dilate(is_robot.view(np.uint8), BESIDE_ROBOT) > 0, is_shadow) | ~frame.is_in_view
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
 
 
-def _with_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
+def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
     """Robot pixels (H, W) and the stereo shadows that touch them, with their neighbours."""
     _, groups = cv2.connectedComponents(is_shadow.view(np.uint8), connectivity=8)
     is_beside = is_shadow & np.isin(groups, np.unique(groups[is_robot & is_shadow]))
@@ -129,7 +129,7 @@ def _edges_of(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> Lost
         cv2.dilate(pixels.view(np.uint8), reach) > 0
         for pixels, reach in ((is_object, BESIDE), (is_robot, NEAR_ROBOT))
     )
-    v, u = np.nonzero((frame.depth <= 0) & is_beside & ~is_outline & frame.in_view)
+    v, u = np.nonzero((frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view)
     depths = beside[v, u]
     places = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depths))
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))
@@ -202,15 +202,15 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> 
     points = occupancy.centers_of(voxels)
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
     for frame, mask in seen:
-        np.maximum(reasons, _in_frame(points, frame, mask), out=reasons)
+        np.maximum(reasons, _explain_points(points, frame, mask), out=reasons)
     reasons[robot.distance(points) <= 0] = Unseen.SWEPT
     occupancy.last_seen.reshape(-1)[voxels] = reasons
 
 
-def _in_frame(points: Float32, frame: RgbdFrame, mask: SelfMask) -> UInt16:
+def _explain_points(points: Float32, frame: RgbdFrame, mask: SelfMask) -> UInt16:
     """Reason `Unseen` (K,) why a frame does not show points (K, 3) [m]."""
     pixel, z = pixels_at(frame, points)
-    is_in_view = (pixel >= 0) & frame.in_view.reshape(-1)[pixel]
+    is_in_view = (pixel >= 0) & frame.is_in_view.reshape(-1)[pixel]
     robot = cv2.dilate(mask.robot_depth, OUTLINE).reshape(-1)[pixel]
     depth = frame.depth.reshape(-1)[pixel]
     is_lost = (frame.depth <= 0) & ~find_shadows(frame.depth, frame.intrinsics.fx)

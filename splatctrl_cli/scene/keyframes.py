@@ -50,7 +50,7 @@ def make_view(
     The colour loss counts pixels without depth, but none that are invalid, `mounted`, or outside the workspace.
     """
     counted = mappable | (frame.depth <= 0)
-    counted &= frame.in_view
+    counted &= frame.is_in_view
     if mounted is not None:
         counted &= ~mounted
     target = TargetView(

@@ -8,7 +8,7 @@ from scipy.ndimage import label
 
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
+from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Index, Label, RgbdFrame, UInt8, UInt16
 from splatctrl_cli.voxels import (
     MOST_VOXELS,
@@ -49,7 +49,7 @@ class OccupancyMap:
         self.edges: dict[str, LostEdges] = {}  # of the newest image of each camera
         self._hits: UInt8 = np.zeros(shape, np.uint8)
         self._was_free: Bool = np.zeros(shape, bool)  # before this time step
-        self._packed = pack_grid(self.origin, config.voxel, shape)
+        self._packed: Float64 = np.concatenate([self.origin, [config.voxel], shape]).astype(np.float64)  # for kernels
 
     def take_in(self, frames: Sequence[RgbdFrame]) -> None:
         """Add the depth images of one time step; human pixels set the human bit.
@@ -80,30 +80,18 @@ class OccupancyMap:
         self.step_stamps_ns.append(min(frame.stamp_ns for frame in frames))
 
     def integrate(self, frame: RgbdFrame) -> None:
-        """Add one depth image: voxels are free along its rays, hit at their ends."""
-        integrate_depth(
-            self._packed,
-            self.log_odds,
-            self.num_updates,
-            self.last_seen,
-            self._hits,
-            self._image(frame),
-            hit=self.config.log_odds_hit,
-            miss=self.config.log_odds_miss,
-            limit=self.config.log_odds_limit,
-            step=len(self.step_stamps_ns),
-            num_threads=self.num_threads,
-        )
+        """Add one depth image: voxels are free along its rays, hit at their ends.
 
-    def _image(self, frame: RgbdFrame) -> DepthImage:
-        k = frame.intrinsics
-        return DepthImage(
-            intrinsics=np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64),
-            T_world_camera=np.ascontiguousarray(frame.T_world_camera, np.float64),
-            depth=np.ascontiguousarray(frame.depth, np.float32),
-            min_range=self.config.min_range,
-            max_range=self.config.max_range,
-        )
+        A voxel with a pixel's point is a hit, else a miss if its centre is before its pixel's depth. A pixel without
+        depth takes the nearest one's, while their rays are within half a voxel. Depth below min_range does not count;
+        beyond max_range it is no hit, but frees nearer voxels.
+        """
+        config = self.config
+        native.integrate_depth(
+            self._packed, self.log_odds, self.num_updates, self.last_seen, self._hits, *_camera_arrays(frame),
+            config.min_range, config.max_range, config.log_odds_hit, config.log_odds_miss, config.log_odds_limit,
+            len(self.step_stamps_ns), self.num_threads,
+        )  # fmt: skip
 
     def mark_unseen(self, points: Float64, reason: Unseen) -> None:
         """Note why no camera saw the voxels at points (K, 3) [m], world.
@@ -119,7 +107,7 @@ class OccupancyMap:
     def unexplained(self, centers: Float64, radii: Float64) -> Index:
         """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] with changeable reasons."""
         is_near = np.zeros_like(self.entity)
-        mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
+        native.mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
         voxels = np.flatnonzero(is_near)
         last = self.last_seen.reshape(-1)[voxels]
         is_open = (last == 0) | (last >= Unseen.OUT_OF_VIEW) & (last < Unseen.CONTRADICTED)
@@ -184,18 +172,13 @@ class OccupancyMap:
     def mark_robot(self, centers: Float64, radii: Float64) -> None:
         """Set the robot bit only in voxels that spheres (S, 3), (S,) [m] meet; mark these swept."""
         self.entity &= np.uint8(~Label.ROBOT & 0xFF)
-        mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
+        native.mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
 
     def _label_hits(self, frame: RgbdFrame, chosen: Bool, *, set_bits: int = 0, clear_bits: int = 0) -> None:
-        label_hits(
-            self._packed,
-            self.entity,
-            self._image(frame),
-            np.ascontiguousarray(chosen).view(np.uint8),
-            set_bits=set_bits,
-            clear_bits=clear_bits,
-            num_threads=self.num_threads,
-        )
+        native.label_hits(
+            self._packed, self.entity, *_camera_arrays(frame), np.ascontiguousarray(chosen).view(np.uint8),
+            self.config.min_range, self.config.max_range, set_bits, clear_bits, self.num_threads,
+        )  # fmt: skip
 
     def entity_at(self, points_world: Float32) -> UInt8:
         """Entity bits (N,) at points (N, 3); 0 outside."""
@@ -248,10 +231,6 @@ class OccupancyMap:
         cells = np.stack(np.unravel_index(voxels, self.log_odds.shape), axis=1)
         return (self.origin + self.config.voxel * cells).astype(np.float32)
 
-    def occupied_centers(self) -> Float32:
-        """Centres (K, 3) [m] of `occupied_voxels`."""
-        return self.centers_of(self.occupied_voxels())
-
     def grid(self) -> OccupancyGrid:
         return OccupancyGrid(
             origin=self.origin.copy(),
@@ -300,3 +279,14 @@ class PeopleMemory:
         self.stamps_ns = np.full(len(self.voxels), now_ns, np.int64)
         is_still = np.isin(unseen, self.voxels)
         self.stamps_ns[np.searchsorted(self.voxels, unseen[is_still])] = since_ns[is_still]
+
+
+def _camera_arrays(frame: RgbdFrame) -> tuple[Float64, Float64, Float32]:
+    """Intrinsics (6,), T_world_camera (4, 4) and depth (H, W) [m] as the kernels take them."""
+    k = frame.intrinsics
+    intrinsics = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64)
+    return (
+        intrinsics,
+        np.ascontiguousarray(frame.T_world_camera, np.float64),
+        np.ascontiguousarray(frame.depth, np.float32),
+    )

@@ -30,7 +30,7 @@ class RobotPosture:
     def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
         """Surface and poses (L, 4, 4) of its links at a stamp; without a surface, the spheres serve as one."""
         if self.surface is None:
-            return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
+            return RobotSurface.from_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]
 
     def distance(self, points_world: Floats, without: Sequence[str] = ()) -> Float64:
@@ -59,7 +59,7 @@ def posture_of(
 
     at_frames: joint positions (J,) by frame stamp [ns]; carried: boxes in link frames.
     """
-    spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried) if carried else robot.surface
+    spheres, surface = robot.sphere_set, robot.surface.add_boxes(carried) if carried else robot.surface
     surfaces = {stamp: robot.surface_at(stamp) for stamp in at_frames} if robot.changes else {}
     pose = {link: robot.frame_pose(q, link) for link in set(spheres.links)}
     return RobotPosture(
@@ -67,7 +67,7 @@ def posture_of(
         radii=spheres.radii,
         T_world_link=np.array([pose[link] for link in spheres.links]),
         surface=surface,
-        surfaces={stamp: its.with_boxes(carried) if carried else its for stamp, its in surfaces.items()},
+        surfaces={stamp: its.add_boxes(carried) if carried else its for stamp, its in surfaces.items()},
         T_world_surface={
             stamp_ns: surface.poses({link: robot.frame_pose(there, link) for link in surface.links})
             for stamp_ns, there in at_frames.items()

@@ -90,7 +90,7 @@ def room_for(
     stands = splats.labels != Label.ROBOT
     others, may_go = live[stands], live[splats.labels == Label.OBJECT]
     weakest = may_go[np.argsort(shown[may_go], kind="stable")][: fixed.EVICT_ASKED * num]
-    order, voxels = np.searchsorted(others, weakest), occupancy.occupied_centers()
+    order, voxels = np.searchsorted(others, weakest), occupancy.centers_of(occupancy.occupied_voxels())
     chosen = others[find_redundant(order, num, splats.select(stands), voxels, tolerance, occupancy.num_threads)]
     is_evicted = np.zeros(len(shown), bool)
     is_evicted[chosen] = True

@@ -235,9 +235,8 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
 
 
 def _voxel_seeds(centers: Float32, splats: SplatSet) -> Seeds:
-    colors = np.full((len(centers), 3), 0.5, np.float32)
-    if len(splats):
-        colors = splats.colors[cKDTree(splats.centers).query(centers)[1]]
+    grey = np.full((len(centers), 3), 0.5, np.float32)
+    colors = splats.colors[cKDTree(splats.centers).query(centers)[1]] if len(splats) else grey
     return Seeds(centers=centers, radii=np.zeros(len(centers), np.float32), colors=colors)
 
 

@@ -135,9 +135,10 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     return replace(
         mask,
         reach=float(np.median(tolerance_at(rendered[is_robot], config))),
-        residuals=_by_link(offset[is_told], link[is_told], surface.links),
+        residuals=_group_by_link(offset[is_told], link[is_told], surface.links),
         num_inside={
-            name: len(found) for name, found in _by_link(inside[is_inside], inside[is_inside], surface.links).items()
+            name: len(found)
+            for name, found in _group_by_link(inside[is_inside], inside[is_inside], surface.links).items()
         },
     )
 
@@ -243,7 +244,7 @@ def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float
     return np.where(is_inside, v * k.width + u, -1), z
 
 
-def _by_link(values: Array, links: Int16, names: Sequence[str]) -> dict[str, Array]:
+def _group_by_link(values: Array, links: Int16, names: Sequence[str]) -> dict[str, Array]:
     order = np.argsort(links, kind="stable")
     ends = np.searchsorted(links[order], np.arange(len(names) + 1))
     parts = {name: values[order[first:end]] for name, first, end in zip(names, ends, ends[1:], strict=False)}

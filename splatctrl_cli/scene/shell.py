@@ -31,7 +31,7 @@ Masked = Sequence[tuple[View, Bool]]
 def pixels_beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
     """Valid pixels (H, W) with depth of at least `min_range` [m] outside the workspace, except `mounted` ones."""
     depth = view.target.depth
-    left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0) & view.frame.in_view
+    left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0) & view.frame.is_in_view
     return np.asarray(left_out if mounted is None else left_out & ~mounted)
 
 

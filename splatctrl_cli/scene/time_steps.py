@@ -35,7 +35,7 @@ class TimeStep:
             frame.stamp_ns: self.position + 1e-9 * (frame.stamp_ns - last_ns) * self.velocity for frame in self.frames
         }
 
-    def without_depth(self) -> "TimeStep":
+    def drop_depth(self) -> "TimeStep":
         """The step as colour cameras would see it."""
         return replace(self, frames=tuple(replace(frame, depth=np.zeros_like(frame.depth)) for frame in self.frames))
 

@@ -30,7 +30,7 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     centers = occupancy.centers_of(voxels)
     is_missing = SplatTree(others.centers, others.radii, occupancy.num_threads).are_further(centers, reach)
     is_human = occupancy.entity.reshape(-1)[voxels[is_missing]] & Label.HUMAN > 0
-    return Balls.of_voxels(
+    return Balls.from_voxels(
         centers[is_missing], occupancy.config.voxel, np.where(is_human, np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     )
 

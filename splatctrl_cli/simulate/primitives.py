@@ -167,10 +167,9 @@ def closest_point(primitive: Primitive, points_world: Float64) -> tuple[Float64,
         distance = np.linalg.norm(p, axis=1) - primitive.size[0]
     elif primitive.kind == "box":
         distance, surface = _box_closest(p, np.array(primitive.size) / 2)
-    elif primitive.kind == "capsule":
-        distance, surface = _capsule_closest(p, primitive.size[0], primitive.size[1] / 2)
     else:
-        distance, surface = _cylinder_closest(p, primitive.size[0], primitive.size[1] / 2)
+        closest = _capsule_closest if primitive.kind == "capsule" else _cylinder_closest
+        distance, surface = closest(p, primitive.size[0], primitive.size[1] / 2)
     return distance, transform_points(primitive.T_world_shape, surface)
 
 
@@ -218,10 +217,9 @@ def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) 
             near, far = _round_span(origin, directions, primitive.size[0])
         elif primitive.kind == "box":
             near, far = _slab_span(origin, directions, np.array(primitive.size) / 2)
-        elif primitive.kind == "capsule":
-            near, far = _capsule_span(origin, directions, primitive.size[0], primitive.size[1] / 2)
         else:
-            near, far = _cylinder_span(origin, directions, primitive.size[0], primitive.size[1] / 2)
+            span = _capsule_span if primitive.kind == "capsule" else _cylinder_span
+            near, far = span(origin, directions, primitive.size[0], primitive.size[1] / 2)
         return np.where((near <= far) & (near > 1e-6), near, np.inf)
 
 

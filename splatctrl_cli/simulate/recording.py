@@ -8,7 +8,7 @@ import numpy as np
 
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, SphereSet, UInt8, by_stamp
+from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, SphereSet, UInt8, merge_by_stamp
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import visual_urdf
@@ -178,14 +178,14 @@ class Recording:
 
     def records(self) -> Iterator[Record]:
         """Joint states and images by stamp, states first."""
-        return by_stamp(self.joint_states(), self.frames())
+        return merge_by_stamp(self.joint_states(), self.frames())
 
     def link_poses(self, q: Float64) -> dict[str, Float64]:
         """T_world_link (4, 4) by link at q (J,)."""
         return {link: self.robot.frame_pose(q, link) for link in self.robot.urdf.links}
 
     def static_transforms(self) -> list[Transform]:
-        """world -> camN_link -> camN_optical_frame, and world -> the arm's root link."""
+        """Frames world -> camN_link -> camN_optical_frame, and world -> the arm's root link."""
         transforms: list[Transform] = [("world", self.robot.urdf.links[0], self.robot.T_world_base)]
         for camera in self.cameras:
             transforms.append(("world", f"{camera.name}_link", camera.T_world_camera @ OPTICAL_FROM_LINK.T))

@@ -91,7 +91,7 @@ def test_residuals_change_with_the_offsets_as_the_derivative_says(views: list[Rg
     def distances() -> tuple[Float64, Float64]:
         rows = rows_of(bends.now[0], bends.now[1], T, 1e9)  # so wide that all weights are the same
         basis = np.kron(np.eye(2), bends_alone())
-        return rows.residuals, bends.by_offsets(0, 1, rows) @ basis @ step
+        return rows.residuals, bends.derive_by_offsets(0, 1, rows) @ basis @ step
 
     first, by_offsets = distances()
     bends.move(step)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.calibration.displacement import (
+    correct_pose,
     displaced_cameras,
     displacement_of,
     is_corrected,
     is_displaced,
-    placed,
 )
 from splatctrl_cli.calibration.evidence import Arm, transform_of
 from splatctrl_cli.jobs.reconstruct.reconstruct import arm_of, frames_of
@@ -95,8 +95,8 @@ def test_a_camera_that_is_off_is_placed_where_it_truly_stands(arm: Arm, frames: 
     rows = displaced_cameras(arm, off)
     assert rows[CAMERA]["left_mm"] < 0.5
     for true, frame in zip(frames, off, strict=True):
-        assert placed(frame, rows).T_world_camera == pytest.approx(true.T_world_camera, abs=1e-3)
-    assert placed(frames[0], {}) is frames[0]
+        assert correct_pose(frame, rows).T_world_camera == pytest.approx(true.T_world_camera, abs=1e-3)
+    assert correct_pose(frames[0], {}) is frames[0]
 
 
 @pytest.mark.parametrize("move", [0.06, 0.1, 0.15, 0.2])
@@ -109,7 +109,7 @@ def test_a_camera_that_is_too_far_off_is_placed_rightly_or_stays_displaced(
     row = displaced_cameras(arm, off).get(CAMERA)
     assert row is None or is_displaced(row)
     if row is not None and is_corrected(row):
-        frame = placed(off[0], {CAMERA: row})
+        frame = correct_pose(off[0], {CAMERA: row})
         assert frame.T_world_camera == pytest.approx(frames[0].T_world_camera, abs=2e-3)
 
 
@@ -140,7 +140,7 @@ def test_where_one_camera_cannot_be_corrected_none_is(arm: Arm, frames: list[Rgb
 def test_a_joint_whose_zero_is_off_does_not_move_a_camera(
     arm: Arm, frames: list[RgbdFrame], joint: int, degrees: float
 ) -> None:
-    posture = arm._posture
+    posture = arm.posture
 
     def bent(stamp_ns: int) -> Float64 | None:
         q = posture(stamp_ns)

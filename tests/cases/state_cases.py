@@ -69,7 +69,7 @@ def read(folder: Path, topic: str | None = None, name: str = "*.mcap") -> tuple[
     model = RobotModel.from_urdf(next(folder.glob("*.urdf")))
     source = open_states(path, SourceOptions(joint_topic=topic), model.joint_names)
     model = model.moved_by(source.joint_names)
-    return model, source.states.of_log(*model.joint_columns(source.joint_names)), list(source.loss.notes)
+    return model, source.states.convert_joints(*model.joint_columns(source.joint_names)), list(source.loss.notes)
 
 
 def checked(folder: Path, run: Run, *words: str) -> None:

@@ -217,7 +217,7 @@ def test_joints_or_a_camera_of_another_clock_are_named_with_the_offset(table: Ta
 
 
 def test_exchanged_joints_are_named(table: Table) -> None:
-    (finding,) = table.motion(table.few, table.states.of_joints(np.array([0, 2, 1, 3, 4, 5, 6])))
+    (finding,) = table.motion(table.few, table.states.select_joints(np.array([0, 2, 1, 3, 4, 5, 6])))
     assert (finding.code, finding.where) == ("arm", "cameras cam0, cam1, cam2")
     assert finding.remedy.startswith("exchange joint2 and joint3: ")
 

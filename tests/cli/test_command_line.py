@@ -134,6 +134,8 @@ def test_what_people_look_for_is_in_the_short_help(
 def test_help_prints_a_page_and_names_the_nearest_for_a_wrong_word(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["help", "ci"]) == 0
     assert capsys.readouterr().out == (ROOT / "docs" / "ci.md").read_text()
+    assert main(["help", "scannet"]) == 0
+    assert capsys.readouterr().out == (ROOT / "docs" / "examples" / "scannet.toml").read_text()
     assert main(["help"]) == 0
     assert capsys.readouterr().out == (ROOT / "docs" / "README.md").read_text()
     assert main(["help", "settings"]) == 0

@@ -8,8 +8,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.columns import NamedColumns
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
-from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
-from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
+from splatctrl_cli.control.replay import OpenLoopTask, Outcome, ReplayTask, ReplayTrace, closed_loop, open_loop
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Bool, DistanceField, Float64
 from tests.control.fakes import PlanarArm, Plane, far_away
@@ -160,7 +159,7 @@ def test_angular_twists_turn_with_the_link_too() -> None:
     """The link's x axis is the world's y, its y the world's z."""
     arm = PlanarArm()
     arm.frame_pose = lambda q, frame: pose_at([0, 0, 0], [[0, 0, 1], [1, 0, 0], [0, 1, 0]])  # type: ignore[method-assign]
-    found = track([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], axes="tip").in_world(arm, BENT, 0, 0.5)
+    found = track([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], axes="tip").find_world_twist(arm, BENT, 0, 0.5)
     np.testing.assert_allclose(found, [0.3, 0.1, 0.2, 0.6, 0.4, 0.5])
 
 

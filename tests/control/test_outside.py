@@ -16,10 +16,9 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import line_process, outside
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.line_process import Fault
-from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.outside import OutsideController, class_command
 from splatctrl_cli.control.qp import Rung
-from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
+from splatctrl_cli.control.replay import OpenLoopTask, Outcome, ReplayTask, ReplayTrace, closed_loop, open_loop
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm, far_away

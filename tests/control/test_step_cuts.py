@@ -211,7 +211,7 @@ def test_a_surface_within_the_margin_is_what_a_row_lacks(smaller: float, by_surf
 def test_rows_by_surface_are_less_the_derivative_of_their_distance() -> None:
     arm, wall, q = BallArm(0.02, left=0.01), half_space(1, 0.05), np.array([0.01, -0.02])
     every, box = np.ones(4, dtype=np.bool_), (-arm.velocity_limit, arm.velocity_limit)
-    builder = RowBuilder(arm, DRIVEN, wall[0]).with_field(*wall)
+    builder = RowBuilder(arm, DRIVEN, wall[0]).replace_field(*wall)
     rows = builder.at(State(model=arm, frame="tip", q=q, box=box, by_surface=every))
     steps = 1e-5 * np.eye(2)
     slopes = [(builder.distances(q + e, every) - builder.distances(q - e, every)) / 2e-5 for e in steps]

@@ -14,9 +14,9 @@ from splatctrl_cli.evaluate.score import (
     CORRECTED,
     as_json,
     free_mass,
-    in_front,
     metric_scales,
     score_view,
+    share_in_front,
     total_score,
 )
 from splatctrl_cli.evaluate.score_report import Doubts
@@ -162,8 +162,8 @@ def test_mass_is_opacity_times_radius_squared_of_what_stands_in_free_voxels(
 
 def test_in_front_counts_pixels_that_have_both_depths() -> None:
     reference, depth = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0]), np.array([0.9, 0.98, 1.2, 0.0, 0.5, 0.5])
-    assert in_front(depth, reference, np.arange(6) < 5) == pytest.approx(1 / 3)
-    assert math.isnan(in_front(depth, reference, np.zeros(6, bool)))
+    assert share_in_front(depth, reference, np.arange(6) < 5) == pytest.approx(1 / 3)
+    assert math.isnan(share_in_front(depth, reference, np.zeros(6, bool)))
 
 
 HIGH, WIDE = 24, 32

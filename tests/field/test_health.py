@@ -58,7 +58,7 @@ CENTERS = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
 
 def balls(*labels: int) -> Balls:
     centers = np.array([[0.2, 0.1 * i, 0.3] for i in range(len(labels))], np.float32).reshape(-1, 3)
-    return Balls.of_voxels(centers, 0.02, np.array(labels, np.uint8))
+    return Balls.from_voxels(centers, 0.02, np.array(labels, np.uint8))
 
 
 def test_balls_follow_the_splats_and_say_that_they_are_none() -> None:

@@ -8,7 +8,6 @@ from splatctrl_cli.field.distance import field_over
 from splatctrl_cli.field.probability import (
     CalibratedProbability,
     PaperProbability,
-    make_probability,
     probability_of_occupancy,
 )
 from splatctrl_cli.field.slabs import bake
@@ -95,4 +94,4 @@ def test_a_header_names_no_probability_without_the_channel_and_how_a_full_proces
 
 def test_the_probability_of_the_paper_has_no_full_process() -> None:
     with pytest.raises(UsageError, match=r"expected field.weights = rowsum or voxel, got cg"):
-        make_probability(Spheres.of(*cloud(10)), FieldConfig(probability="paper", weights="cg"))
+        PaperProbability(Spheres.of(*cloud(10)), FieldConfig(weights="cg"))

@@ -10,7 +10,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.files.output import Parts, Stopwatch, part_digests, sha256, write_run
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.formats.splat.splats import read_ply, read_world_splats, write_ply
-from splatctrl_cli.jobs.replay.known_scene import from_grid
+from splatctrl_cli.jobs.replay.known_scene import read_grid_scene
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
 from tests.refused import expect_refusal
 
@@ -45,7 +45,9 @@ def test_every_file_is_known_but_run_json_and_the_checkpoint(scene: Path) -> Non
     assert not {"run.json", "checkpoint/state.npz"} & set(digests)
     assert json.loads((scene / "run.json").read_text())["parts"].keys() == digests.keys()
     (scene / "other.ply").write_bytes(b"x")
-    expect_refusal("other.ply: not among the parts", Parts.beside(scene / "other.ply").checked, scene / "other.ply")
+    expect_refusal(
+        "other.ply: not among the parts", Parts.from_folder(scene / "other.ply").checked, scene / "other.ply"
+    )
     for parts in (3, {"splats.ply": 3}):
         without_parts(scene, parts=parts)
         expect_refusal("run.json: parts: expected digests", open_scene(scene).splats)
@@ -103,10 +105,10 @@ def test_an_altered_field_is_refused_and_one_alone_is_read(scene: Path, tmp_path
     assert not any(name.startswith("channels") for name in names)
     alone.write_bytes((field / "field.npz").read_bytes())
     for path in (alone, field):
-        from_grid(path)
+        read_grid_scene(path)
     spoil(field / "field.npz")
     for path in (field, field / "field.npz"):
-        expect_refusal("field.npz: was changed", from_grid, path)
+        expect_refusal("field.npz: was changed", read_grid_scene, path)
     assert main(["sdf-bake", str(scene), "--update", str(field), "-o", str(tmp_path / "new"), *BOX, "-q"]) == 4
 
 

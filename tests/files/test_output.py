@@ -197,7 +197,7 @@ def test_a_killed_writer_leaves_no_lock_and_can_be_gone_on_from(tmp_path: Path, 
 def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
 
-    held = output.held
+    held = output.lock_output
 
     @contextmanager
     def held_late(partial: Path, *, is_folder: bool) -> Iterator[None]:
@@ -205,7 +205,7 @@ def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monke
         with held(partial, is_folder=is_folder):
             yield
 
-    monkeypatch.setattr(output, "held", held_late)
+    monkeypatch.setattr(output, "lock_output", held_late)
     with pytest.raises(UsageError, match="already exists"), output_path(out, force=False, is_folder=True):
         pytest.fail("must not get here")
     assert names(tmp_path) == ["out"]

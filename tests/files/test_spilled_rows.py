@@ -155,6 +155,6 @@ def test_what_some_states_lack_is_none_there(block: int) -> None:
         collector.add(still)
     columns = collector.columns()
     assert [i for i, s in enumerate(columns) if s.T_world_ee is not None] == [4, 7]
-    assert columns.T_base_ee is None and columns.of_joints(np.array([1, 0]))[8].position.tolist() == [8, 8]
+    assert columns.T_base_ee is None and columns.select_joints(np.array([1, 0]))[8].position.tolist() == [8, 8]
     with pytest.raises(IndexError):
         columns[9]

@@ -178,7 +178,7 @@ def voxels(seen_ns: int = 0, *, is_seen: ArrayLike = True, is_known: ArrayLike =
         grid=grid,
         last_seen=np.broadcast_to(np.asarray(is_seen, np.uint16), grid.num_updates.shape).copy(),
         step_stamps_ns=np.array([seen_ns], np.int64),
-        unrepresented=Balls.of_voxels(np.zeros((0, 3), np.float32), grid.voxel, np.zeros(0, np.uint8)),
+        unrepresented=Balls.from_voxels(np.zeros((0, 3), np.float32), grid.voxel, np.zeros(0, np.uint8)),
     )
 
 

@@ -21,7 +21,7 @@ from splatctrl_cli.planner.configuration_clearance import (
     check_edges,
     check_sampled_edges,
 )
-from splatctrl_cli.planner.planned import resampled
+from splatctrl_cli.planner.planned import resample
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 
@@ -82,7 +82,7 @@ def test_no_edge_that_the_kernel_accepts_collides_at_dense_samples(arm: RobotMod
         room, start, end = room_of(arm, KINDS, 100 + seed)
         share = check_edges(room, start, end, contact=CONTACT, only_whole=False).free_share
         for a, b, free in zip(start, end, share, strict=True):
-            assert np.all(room.at(resampled(np.array([a, a + free * (b - a)]), 5e-3)) >= 0)
+            assert np.all(room.at(resample(np.array([a, a + free * (b - a)]), 5e-3)) >= 0)
 
 
 def test_an_edge_of_no_length_is_free_or_not_as_its_posture_is(arm: RobotModel) -> None:

@@ -11,7 +11,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner import birrt
 from splatctrl_cli.planner.birrt import PlanOutcome, plan, shorten_path
 from splatctrl_cli.planner.configuration_clearance import Clearance, EdgeCheck, OnlyDistance, Solids, check_edges
-from splatctrl_cli.planner.planned import resampled
+from splatctrl_cli.planner.planned import resample
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, Nowhere, PlanarArm, Plane
 from tests.planner.walls import clearance, closed_ring, one_wall, thin_post
@@ -25,7 +25,7 @@ APART = np.array([1.5, 0.1]), np.array([-1.5, 0.1])  # postures on either side o
 
 def densest(room: Clearance, waypoints: Float64) -> float:
     """The least clearance at samples 2 mrad apart."""
-    return float(np.min(room.at(resampled(waypoints, 2e-3))))
+    return float(np.min(room.at(resample(waypoints, 2e-3))))
 
 
 def densest_of(room: Clearance, start: Float64, end: Float64) -> Float64:

@@ -26,7 +26,7 @@ from splatctrl_cli.planner.planned import (
     path_to_nearest,
     planned_detours,
     planned_path,
-    resampled,
+    resample,
     time_path,
 )
 from splatctrl_cli.records import Float64
@@ -160,7 +160,7 @@ PATH = np.array([[0.7, 0.2], [0.9, 2.0], [-0.4, 1.5], [-0.42, 1.5]])
 
 
 def test_resampling_keeps_waypoints_length_and_spacing() -> None:
-    rows = resampled(PATH, 0.05)
+    rows = resample(PATH, 0.05)
     assert joint_length(rows) == pytest.approx(joint_length(PATH))
     assert np.max(np.linalg.norm(np.diff(rows, axis=0), axis=1)) <= 0.05 + 1e-12
     assert all(np.any(np.all(np.abs(rows - q) < 1e-12, axis=1)) for q in PATH)

@@ -113,7 +113,7 @@ def folding_arm(folder: Path, spheres: SphereSet, urdf: str = URDF) -> tuple[Rob
     file = written(folder, urdf)
     solids = read_solids(read_urdf(file))
     model = RobotModel.from_urdf(file, spheres)
-    model = model.with_coverage(coverage_of_solids(model.urdf, solids, model.sphere_set))
+    model = model.replace_coverage(coverage_of_solids(model.urdf, solids, model.sphere_set))
     return model, SelfSurfaces(model, solids)
 
 

@@ -158,7 +158,7 @@ def test_spheres_of_a_rigid_body_cover_all_of_it_and_its_worst_link_counts_for_t
     three = spheres(("base", [0, 0, 0], 0.08), ("tip", [0, 0, 0], 0.07), ("pad", [0, 0, 0], 0.05))
     model = RobotModel.from_urdf(path, three)
     assert np.isnan(model.sphere_deficit).all() and "not read" in model.coverage_unknown
-    measured = model.with_coverage(coverage_deficit(model.urdf, three))
+    measured = model.replace_coverage(coverage_deficit(model.urdf, three))
     np.testing.assert_allclose(measured.sphere_deficit, [0.0, 0.01, 0.01], atol=1e-9)
     assert np.isnan(model.sphere_deficit).all()
     with pytest.raises(InputError, match=r"sphere set: link 'wing' is not in .*; links there: base, tip"):

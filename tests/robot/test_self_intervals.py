@@ -59,7 +59,7 @@ def off_box(triangles: Float64) -> float:
 
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 def test_a_box_that_is_taken_and_put_down_is_robot_in_between(noise: float) -> None:
-    (part,) = learned(8, 17, noise).held
+    (part,) = learned(8, 17, noise).temporary
     assert (part.link, learned(8, 17, noise).pieces()) == ("arm", [])
     assert part.start_ns == pytest.approx(7.5 * PERIOD, abs=PERIOD)
     assert part.end_ns == pytest.approx(16.5 * PERIOD, abs=PERIOD)
@@ -76,7 +76,7 @@ def test_what_is_held_from_the_first_or_until_the_last_moment_has_no_bound_there
 
 def test_a_bracket_is_robot_always_beside_a_box_that_is_held_for_a_time() -> None:
     found = learned(8, 17, has_bracket=True)
-    (_, bracket), (part,) = found.pieces()[0], found.held
+    (_, bracket), (part,) = found.pieces()[0], found.temporary
     assert bracket[..., 2].min() > 0.03 and part.triangles[..., 0].min() > 0.37
     assert found.changes() == [part.start_ns, part.end_ns]
     counts = [len(found.held_at(stamp)) for stamp in (0, part.start_ns, part.end_ns - 1, part.end_ns)]

@@ -24,10 +24,10 @@ from splatctrl_cli.robot.self_margins import (
     KeptMargin,
     LinkSurface,
     SelfSurfaces,
+    apply_kept_margins,
     depth_in,
     kept_margins,
     surface_gap,
-    with_kept_margins,
 )
 from splatctrl_cli.robot.urdf import read_urdf
 from tests.control.fakes import Balls, num_on_rung
@@ -194,7 +194,7 @@ def kept(arm: tuple[RobotModel, SelfSurfaces]) -> KeptMargin:
 
 @pytest.fixture(scope="module")
 def eased(arm: tuple[RobotModel, SelfSurfaces], kept: KeptMargin) -> RobotModel:
-    return with_kept_margins(arm[0], MARGIN, [kept])
+    return apply_kept_margins(arm[0], MARGIN, [kept])
 
 
 def sphere_gaps(model: RobotModel, postures: Float64) -> Float64:
@@ -207,7 +207,7 @@ def sphere_gaps(model: RobotModel, postures: Float64) -> Float64:
 def test_a_margin_that_the_spheres_keep_stays_as_it_was_asked_for(tmp_path: Path) -> None:
     near, surfaces = folding_arm(tmp_path, covering_spheres())
     assert sphere_gaps(near, random_postures(near, 500, seed=1)).max() < 0.01
-    assert kept_margins(near.with_self_pairs(np.zeros((0, 2), dtype=np.int64)), MARGIN, surfaces) == ()
+    assert kept_margins(near.replace_self_pairs(np.zeros((0, 2), dtype=np.int64)), MARGIN, surfaces) == ()
     far, surfaces = folding_arm(tmp_path, covering_spheres(), URDF.replace("0 0 0.052", "0 0 0.09"))
     assert sphere_gaps(far, random_postures(far, 500, seed=1)).min() < 0.0
     assert kept_margins(far, MARGIN, surfaces) == ()
@@ -235,7 +235,7 @@ def test_without_surfaces_spheres_are_never_let_overlap(arm: tuple[RobotModel, S
     assert kept.margin is not None and 0 <= kept.margin < 0.01 and kept.surface_gap is None
     fat = covering_spheres(1.2)
     every = np.array([(a, b) for a in range(8) for b in range(9, len(fat.links))], dtype=np.int64)
-    (kept,) = kept_margins(folding_arm(tmp_path, fat)[0].with_self_pairs(every), MARGIN, None)
+    (kept,) = kept_margins(folding_arm(tmp_path, fat)[0].replace_self_pairs(every), MARGIN, None)
     assert kept.margin is None and kept.surface_gap is None
 
 

@@ -12,7 +12,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Box, SphereSet
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.sphere_files import lever_arms, read_sphere_file, spheres_yaml, with_boxes
+from splatctrl_cli.robot.sphere_files import add_boxes, lever_arms, read_sphere_file, spheres_yaml
 from tests.robot.shapes import BALL, BOX, arm_of, written
 
 CUROBO = """robot_cfg:
@@ -147,7 +147,7 @@ def test_the_robot_knows_its_lever_arms(plain_arm: Path) -> None:
 def test_spheres_of_a_carried_box_cover_it_and_stick_out_by_millimetres() -> None:
     box = Box(lower=np.array([-0.025, -0.03, 0.07]), upper=np.array([0.025, 0.05, 0.12]))
     alone = SphereSet(links=("arm",), centers=np.zeros((1, 3)), radii=np.array([0.1]))
-    spheres = with_boxes(alone, [("hand", box)])
+    spheres = add_boxes(alone, [("hand", box)])
     assert (spheres.links[0], set(spheres.links[1:])) == ("arm", {"hand"})
     centers, radii = spheres.centers[1:], spheres.radii[1:]
     corners = np.array(list(product(*zip(box.lower, box.upper, strict=True))))

@@ -44,8 +44,8 @@ def test_a_joint_that_mimics_is_locked_with_its_leader(tmp_path: Path) -> None:
         '<axis xyz="1 0 0"/><limit lower="-9" upper="9" velocity="1" effort="1"/></joint></robot>',
     )
     path = written(tmp_path, text)
-    assert read_urdf(path).with_followers({"slide": 0.1}) == {"follower": pytest.approx(0.3), "slide": 0.1}
-    assert read_urdf(path).with_followers({"slide": 0.1, "follower": 0.0})["follower"] == 0.0
+    assert read_urdf(path).add_followers({"slide": 0.1}) == {"follower": pytest.approx(0.3), "slide": 0.1}
+    assert read_urdf(path).add_followers({"slide": 0.1, "follower": 0.0})["follower"] == 0.0
     model = RobotModel.from_urdf(path, locked={"slide": 0.1})
     assert model.joint_names == ("hinge",)
     assert model.frame_pose(np.zeros(1), "finger")[0, 3] == pytest.approx(0.3)

@@ -59,7 +59,7 @@ def test_a_carried_box_that_pixels_need_is_used_and_one_in_the_air_is_not() -> N
         carried=tuple(DeclaredContact(link="arm", box=box, start=0.0, end=1.0) for box in (held, aside))
     )
     at_frame = {0: np.repeat(robot.T_world_surface[0], 3, axis=0)}  # the link's pose, and that of each box
-    holding = replace(robot, surface=robot.surface.with_boxes(declared.carried_at(0.5)), T_world_surface=at_frame)
+    holding = replace(robot, surface=robot.surface.add_boxes(declared.carried_at(0.5)), T_world_surface=at_frame)
     mask = self_mask(view, holding, OccupancyConfig())
     assert (mask.kinds == PixelKind.ROBOT).sum() > 100
     count_carried(declared, view, mask, holding, robot.surface, 0.5)

@@ -261,7 +261,7 @@ def test_an_object_that_arrives_where_the_robot_was_is_occupied() -> None:
     grid, robot = grid_of(), ball(0.2)
     labelled(grid, robot, seen_with(robot))
     labelled(grid, ball(5.0), frame(block=VISITOR), times=4)
-    centers = grid.occupied_centers()
+    centers = grid.centers_of(grid.occupied_voxels())
     on_top = (np.abs(centers[:, :2]).max(axis=1) < 0.08) & (np.abs(centers[:, 2] - VISITOR) < 0.02)
     assert on_top.sum() > 30
     assert bits(grid, (0.0, 0.0, VISITOR))[0] & (SWEPT | SOLID) == SWEPT | SOLID
@@ -273,7 +273,7 @@ def test_what_the_robots_pixels_added_to_a_voxel_is_no_evidence_of_an_object() -
     labelled(grid, robot, seen_with(robot), times=3)
     for is_occupied in (False, True):
         labelled(grid, ball(5.0), frame(block=0.4))
-        away = np.abs(grid.occupied_centers() - np.float32([0.0, 0.0, 0.4])).max(axis=1)
+        away = np.abs(grid.centers_of(grid.occupied_voxels()) - np.float32([0.0, 0.0, 0.4])).max(axis=1)
         assert bits(grid, (0.0, 0.0, 0.4))[0] & SOLID and (away.min() < 0.5 * grid.config.voxel) == is_occupied
 
 
@@ -281,7 +281,7 @@ def test_a_voxel_that_the_robot_left_is_not_occupied() -> None:
     grid, robot = grid_of(), ball(0.3)
     labelled(grid, robot, seen_with(robot), times=3)
     labelled(grid, ball(5.0), DARK)
-    assert not (np.linalg.norm(grid.occupied_centers() - [0.0, 0.0, 0.3], axis=1) < 0.15).any()
+    assert not (np.linalg.norm(grid.centers_of(grid.occupied_voxels()) - [0.0, 0.0, 0.3], axis=1) < 0.15).any()
 
 
 def test_what_the_robot_hides_of_an_object_is_solid_as_long_as_the_rest_of_it_is_there() -> None:

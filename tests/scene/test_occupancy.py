@@ -18,7 +18,7 @@ from tests.refused import expect_refusal
 from tests.scene.wall import WORKSPACE, frame
 
 CONFIG = OccupancyConfig(voxel=0.05)
-NO_BALLS = Balls.of_voxels(np.zeros((0, 3), np.float32), 0.05, np.zeros(0, np.uint8))
+NO_BALLS = Balls.from_voxels(np.zeros((0, 3), np.float32), 0.05, np.zeros(0, np.uint8))
 AROUND = Box(lower=np.array([-0.63, -0.61, -0.17]), upper=np.array([0.98, 0.94, 1.02]))  # the tilted camera is in it
 
 

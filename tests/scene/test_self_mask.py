@@ -364,7 +364,7 @@ def test_a_carried_box_is_the_robots() -> None:
     at_frame = {5: np.tile(np.eye(4), (2, 1, 1))}  # the link's pose, and the box's
     for near in (1.0, 0.95):
         held = Box(lower=np.array([-0.1, 0.2, near]), upper=np.array([0.1, 0.4, 1.1]))
-        holding = replace(posture, surface=posture.surface.with_boxes([("arm", held)]), T_world_surface=at_frame)
+        holding = replace(posture, surface=posture.surface.add_boxes([("arm", held)]), T_world_surface=at_frame)
         assert (kinds(depth, holding)[101:109, 71:89] == PixelKind.ROBOT).all()
 
 

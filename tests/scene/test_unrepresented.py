@@ -50,7 +50,7 @@ def reads_bare(grid: OccupancyMap, splats: SplatSet = NONE, error: float = 0.0) 
 def test_the_voxels_are_those_of_the_plain_reference(voxel: float) -> None:
     """And a ball contains its voxel."""
     grid, splats = occupied(voxel=voxel, share=0.2), some_splats()
-    found, centers = reads_bare(grid, splats), grid.occupied_centers().astype(np.float64)
+    found, centers = reads_bare(grid, splats), grid.centers_of(grid.occupied_voxels()).astype(np.float64)
     reach = representing_reach(CONFIG, voxel)
     missing = unrepresented(centers, splats.centers.astype(float), splats.radii.astype(float), reach)
     assert 20 < missing.sum() < 0.9 * len(missing)
@@ -60,7 +60,7 @@ def test_the_voxels_are_those_of_the_plain_reference(voxel: float) -> None:
 
 def balls(*cells: tuple[int, int, int]) -> Balls:
     centers = 0.02 * np.array(cells, np.float32).reshape(-1, 3)
-    return Balls.of_voxels(centers, 0.02, np.full(len(cells), Label.OBJECT, np.uint8))
+    return Balls.from_voxels(centers, 0.02, np.full(len(cells), Label.OBJECT, np.uint8))
 
 
 Cells = list[tuple[int, int, int]]
@@ -190,7 +190,7 @@ def test_few_splats_and_nothing_to_compare_do_not_agree(fitter: SceneFitter) -> 
 
 
 def test_balls_stand_for_their_voxels_and_only_for_them(fitter: SceneFitter) -> None:
-    known, centers = fitter.known_voxels(), fitter.occupancy.occupied_centers()
+    known, centers = fitter.known_voxels(), fitter.occupancy.centers_of(fitter.occupancy.occupied_voxels())
     few = fitter.splats().select(fitter.splats().centers[:, 0] > 0)
     assert not agreement(few, known).holds
     every = replace(known.unrepresented, centers=centers, labels=np.zeros(len(centers), np.uint8))

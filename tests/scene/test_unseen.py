@@ -104,7 +104,7 @@ def test_the_robots_body_sweeps_and_what_sticks_out_of_it_does_not(is_drawn: boo
     """Its spheres are 5 cm larger than what is drawn of it."""
     large = replace(ROBOT, radii=np.array([RADIUS + 0.05]))
     if is_drawn:
-        surface = RobotSurface.of_balls(MIDDLE[None], np.array([RADIUS]))
+        surface = RobotSurface.from_balls(MIDDLE[None], np.array([RADIUS]))
         large = replace(large, surface=surface, T_world_surface={0: np.eye(4)[None]})
     expected = EvidenceClass.HIDDEN_BY_ARM if is_drawn else EvidenceClass.SWEPT
     assert class_at(explained(robot_and_floor(), robot=large), (0.0, 0.0, 0.175)) == [expected]

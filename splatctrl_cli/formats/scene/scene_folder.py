@@ -168,7 +168,7 @@ class SceneFolder:
 
     @cached_property
     def parts(self) -> Parts:
-        return Parts.of_run(self.path, self.run)
+        return Parts.from_run(self.path, self.run)
 
     @property
     def made_from(self) -> dict[str, Any]:
@@ -338,10 +338,10 @@ class SplatFile(SceneFolder):
     @property
     def is_anisotropic(self) -> bool:
         """True if stretched or with view-dependent colour."""
-        return isinstance(self._found, GaussianSet)
+        return isinstance(self._content, GaussianSet)
 
     @cached_property
-    def _found(self) -> SplatSet | GaussianSet:
+    def _content(self) -> SplatSet | GaussianSet:
         found, comments = read_splats(self.path)
         check_world(self.path, comments)
         refuse_if(
@@ -350,12 +350,12 @@ class SplatFile(SceneFolder):
         return found
 
     def gaussians(self) -> GaussianSet:
-        assert isinstance(self._found, GaussianSet)
-        return self._found
+        assert isinstance(self._content, GaussianSet)
+        return self._content
 
     def splats(self) -> SplatSet:
-        assert isinstance(self._found, SplatSet)
-        return self._found
+        assert isinstance(self._content, SplatSet)
+        return self._content
 
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:

@@ -198,7 +198,7 @@ def _balls(arrays: Arrays, voxel: float) -> Balls:
         error=ValueError,
     )
     refuse_if(not np.isfinite(centers).all(), "unrepresented: expected finite centres", error=ValueError)
-    return Balls.of_voxels(centers, voxel, labels)
+    return Balls.from_voxels(centers, voxel, labels)
 
 
 def _edges(arrays: Arrays) -> LostEdges:

@@ -156,7 +156,7 @@ class SplatFormat:
         return self.bound is not float32_bound
 
 
-def without_labels(gaussians: GaussianSet) -> GaussianSet:
+def drop_labels(gaussians: GaussianSet) -> GaussianSet:
     return replace(gaussians, labels=np.zeros_like(gaussians.labels))
 
 
@@ -223,7 +223,7 @@ def gaussians_of(ply: PlyFile) -> GaussianSet:
         scales=scales,
         quats_wxyz=unit_quaternions(str(path), np.column_stack([ply.column(f"rot_{index}") for index in range(4)])),
         opacities=sigmoid(ply.column("opacity")),
-        harmonics=without_zero_degrees(_harmonics(ply)),
+        harmonics=drop_zero_degrees(_harmonics(ply)),
         labels=labels_of(ply),
     )
     check_gaussians(str(path), gaussians)
@@ -307,7 +307,7 @@ def labels_of(ply: PlyFile) -> UInt8:
     return values.astype(np.uint8)
 
 
-def without_zero_degrees(harmonics: Float32) -> Float32:
+def drop_zero_degrees(harmonics: Float32) -> Float32:
     """(N, K, 3) up to the last nonzero degree: the same colours."""
     degree = 3
     while degree and not harmonics[:, degree * degree :].any():
@@ -361,7 +361,7 @@ _PLY = SplatFormat(
 REFERENCE_PLY = replace(
     _PLY,
     name="3D-GS PLY, 62 properties",
-    write=lambda path, gaussians, comments: write_gaussian_ply(path, without_labels(gaussians), comments),
-    held=without_labels,
+    write=lambda path, gaussians, comments: write_gaussian_ply(path, drop_labels(gaussians), comments),
+    held=drop_labels,
 )
 ENTRIES = (_PLY,)

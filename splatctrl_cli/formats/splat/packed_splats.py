@@ -30,8 +30,8 @@ from splatctrl_cli.formats.splat.gaussian_ply import (
     SplatFormat,
     check_finite,
     check_gaussians,
+    drop_labels,
     unit_quaternions,
-    without_labels,
 )
 from splatctrl_cli.formats.unpacking import FREE_BYTES, BadBlockError, read_bytes, unpacked
 from splatctrl_cli.records import Float32, GaussianSet, UInt8
@@ -81,7 +81,7 @@ def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
     """Limit to degree-0 colours in 0 to 1, without labels."""
     limit = 0.5 / SH_C0
-    return replace(without_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
+    return replace(drop_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
 
 
 # Half a step of each byte: 1/510 of colour and opacity, 1/256 of quaternions. Four of 1/256 move a unit quaternion by
@@ -151,7 +151,7 @@ def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
     harmonics = np.clip(gaussians.harmonics, *HARMONICS)
     harmonics[:, 0] = np.clip(gaussians.harmonics[:, 0], -127.5 / COLOR_SCALE, 127.5 / COLOR_SCALE)
     return replace(
-        without_labels(gaussians),
+        drop_labels(gaussians),
         harmonics=harmonics,
         scales=np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32),
     )

@@ -20,7 +20,7 @@ from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
 from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import (
-    Kept,
+    EarlierBake,
     UnknownSpace,
     bake_planes,
     bytes_per_cell,
@@ -67,7 +67,7 @@ CHECKPOINT = f"{FOLDER}/progress.json"
 
 
 def bake_to_disk(
-    job: "_Job", kept: Kept | None, unknown: UnknownSpace | None, partial: Path, progress: Progress
+    job: "_Job", kept: EarlierBake | None, unknown: UnknownSpace | None, partial: Path, progress: Progress
 ) -> GridSlabs:
     """Bake the channels into ``partial/channels``; the baker's counts then cover all slabs.
 
@@ -304,7 +304,7 @@ def _bake_grid(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGr
         if changes.reason:
             progress.log(f"--update: every block is baked anew: {changes.reason}")
         if changes.mask is not None:
-            kept = Kept(
+            kept = EarlierBake(
                 grid=previous.grid, mask=changes.mask, occupancy=source.occupancy, thresholds=config.occupancy
             )
     is_free = config.field.unknown == "free"

@@ -10,7 +10,7 @@ import numpy as np
 from splatctrl_cli import __version__
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import CARD_LEAST_BAKE, CARD_SPLATS
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, refuse_if
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.field.clusters import DEFAULT_LABELS, field_splats
 from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box, check_room
@@ -148,13 +148,11 @@ def read_previous(path: Path, scene: Path) -> Previous:
     file = path / "field.npz"
     if file.is_file():
         check_room(f"--update: {file}", file.stat().st_size, "bake without --update, which needs less")
-    try:
+    with refuse_faults(
+        lambda _: f"--update {path}: has no readable run.json", InputError, remedy="bake it once without --update"
+    ):
         run = read_object(path / "run.json")
-    except InputError:
-        raise InputError(
-            f"--update {path}: has no readable run.json", remedy="bake it once without --update"
-        ) from None
-    grid = read_npz(Parts.of_run(path, run).checked(file))
+    grid = read_npz(Parts.from_run(path, run).checked(file))
     is_ours = run.get("command") == "sdf-bake" and run.get("splatctrl") == __version__
     refuse_if(
         not is_ours or "unrepresented_voxels" not in grid.header,

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import DAMAGED, UsageError, refuse_if
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, verdict_of
+from splatctrl_cli.errors import DAMAGED, UsageError, refuse_faults, refuse_if
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, plural, verdict_of
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, select_shard
 from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Ledger, Run, keys_of
@@ -65,14 +65,14 @@ class BatchResult:
 
 def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:
     """Run unfinished nodes. Raises UsageError for an invalid suite, InputError for missing files."""
-    suite, every, nodes, out = planned(request, command_line)
+    suite, every, nodes, out = plan_batch(request, command_line)
     with (
         Ledger(out) as ledger,
         scheduling(
             ledger, command_line.entry, progress, workers=request.workers, dask=request.dask, again=request.again
         ) as scheduler,
     ):
-        progress.log(f"batch: {counted(len(nodes), 'node')} into {out}")
+        progress.log(f"batch: {plural(len(nodes), 'node')} into {out}")
         try:
             runs = list(scheduler.run(nodes).values())
         except KeyboardInterrupt:
@@ -90,8 +90,8 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
     )
 
 
-def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], list[Node], Path]:
-    """The suite, its nodes in order of need, of every shard and of this one, and the output folder.
+def plan_batch(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], list[Node], Path]:
+    """The suite, its nodes in order, those of this shard, and the output folder.
 
     Raises UsageError for a shard without a recording.
     """
@@ -111,7 +111,7 @@ def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, li
 
 def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node, str]]:
     """Every node with "done" or "to do"; writes nothing but a ledger's digests."""
-    *_, nodes, out = planned(request, command_line)
+    *_, nodes, out = plan_batch(request, command_line)
     with Ledger(out) as ledger:
         keys, latest = keys_of(nodes, ledger, command_line.entry), ledger.latest()
     stand = {name for name, run in latest.items() if run.state in {DONE, FAILED} and run.key == keys.get(name)}
@@ -125,7 +125,7 @@ def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
     return verdict_of(
         "batch",
         [_reason(run) for run in runs],
-        scope=f"{counted(len(runs), 'node')} of {counted(num, 'recording')}",
+        scope=f"{plural(len(runs), 'node')} of {plural(num, 'recording')}",
         passed="as expected",
         notes=[f"damaged: {', '.join(damaged)}"] if damaged else [],
         is_damaged=bool(damaged),
@@ -229,12 +229,12 @@ def scheduling(
         with local_executor(workers) as executor:
             yield scheduler(executor=executor, slots=workers)
         return
-    try:
+    lacks, silent = "--dask: dask is not installed", f"--dask {dask}: no scheduler answers"
+    with (
+        refuse_faults(lambda _: lacks, ImportError, remedy="pip install 'splatctrl[dask]'", error=UsageError),
+        refuse_faults(silent, OSError, ValueError, remedy="check the address", error=UsageError),
+    ):
         client = distributed.Client(dask, timeout=CONNECT_S)
-    except ImportError:
-        raise UsageError("--dask: dask is not installed", remedy="pip install 'splatctrl[dask]'") from None
-    except (OSError, ValueError) as error:
-        raise UsageError(f"--dask {dask}: no scheduler answers: {error}", remedy="check the address") from None
     with client:
         yield scheduler(
             executor=client.get_executor(pure=False, retries=2),

@@ -147,14 +147,15 @@ class Ledger(AbstractContextManager["Ledger"]):
             self._base.execute("INSERT OR REPLACE INTO claims VALUES (?, ?)", (node, self._owner))
         return True
 
-    def record(self, run: Run) -> None:
-        """Store an ended run, and release its node."""
+    def record(self, run: Run) -> Run:
+        """Store an ended run, release its node, and return the run."""
         places = ", ".join("?" * len(COLUMNS))
         with self._transaction():
             self._base.execute(
                 f"INSERT INTO runs ({', '.join(COLUMNS)}) VALUES ({places})", tuple(asdict(run).values())
             )
             self._base.execute("DELETE FROM claims WHERE node = ?", (run.node,))
+        return run
 
     def release(self, node: str) -> None:
         self._base.execute("DELETE FROM claims WHERE node = ? AND owner = ?", (node, self._owner))

@@ -72,7 +72,7 @@ class Scheduler:
                     waiting[node.name] = node
                 else:
                     run = run_of(node, self.keys[node.name], end, self.ledger.folder)
-                    self._settle(node, self._record(run), clock)
+                    self._settle(node, self.ledger.record(run), clock)
         return {node.name: self.runs[node.name] for node in nodes}
 
     def _submit(
@@ -123,7 +123,7 @@ class Scheduler:
         if lacking:
             run = not_run(node, key, folder, state=SKIPPED, cause=f"needs {lacking[0]}, which left nothing")
             is_known = before is not None and (before.state, before.key) == (SKIPPED, key)
-            return run if is_known else self._record(run)
+            return run if is_known else self.ledger.record(run)
         if self.again:
             return None
         stamp = None if node.out is None else stamp_of(node.out)
@@ -132,18 +132,14 @@ class Scheduler:
         if before is not None and is_same and stamp in (None, before.stamp):
             self.num_kept += 1
             judged = _judge_again(before, node)
-            return judged if judged == before else self._record(judged)
+            return judged if judged == before else self.ledger.record(judged)
         end = read_end(Path(self._place(node, ".end")), key)
-        if end is None or end.exit_code is None or (before is not None and end.started <= before.started):
+        if end is None or end.exit_code is None or stamp not in (None, end.stamp):
             return None
-        if stamp not in (None, end.stamp):
+        if before is not None and end.started <= before.started:
             return None
-        run = self._record(run_of(node, key, end, folder))
+        run = self.ledger.record(run_of(node, key, end, folder))
         return run if run.state in (DONE, FAILED) else None
-
-    def _record(self, run: Run) -> Run:
-        self.ledger.record(run)
-        return run
 
     def _settle(self, node: Node, run: Run, clock: "Clock") -> None:
         self.runs[node.name] = run

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config.ranges import format_value
-from splatctrl_cli.errors import InputError, UsageError, did_you_mean, refuse_if
+from splatctrl_cli.errors import UsageError, did_you_mean, refuse_faults, refuse_if
 
 Table = Mapping[str, Any]
 
@@ -68,14 +68,13 @@ class Suite:
 
 def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     """Read a suite; commands: allowed ones. Raises InputError, or UsageError for its content."""
-    try:
+    example = "see splatctrl help batch for an example"
+    refuse_if(path.is_dir(), f"{path}: is a folder", remedy="give the suite's file, or --list with it")
+    with (
+        refuse_faults(lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy="check the path"),
+        refuse_faults(f"{path}: is not TOML", ValueError, remedy=example, error=UsageError),
+    ):
         document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: is not TOML: {error}", remedy="see splatctrl help batch for an example") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a folder", remedy="give the suite's file, or --list with it") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the path") from None
     _check_keys(path.name, document, ("name", "out", "recordings", "jobs"))
     folder = path.absolute().parent
     name = _worded(path.name, "name", document.get("name", path.stem))
@@ -114,10 +113,12 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     )
     _check_name(where, name)
     command = _worded(where, "command", table.get("command", base.command))
-    if command not in commands:
-        raise UsageError(
-            f"{where}: no job is called {command!r}", remedy=_suggest(command, commands, "give command = one of")
-        )
+    refuse_if(
+        command not in commands,
+        f"{where}: no job is called {command!r}",
+        remedy=_suggest(command, commands, "give command = one of"),
+        error=UsageError,
+    )
     own = next((option for option in ("out", "force", "resume", "json", "verbose", "quiet") if option in table), None)
     refuse_if(own is not None, f"{where}: a batch gives {own} itself", remedy="leave it out", error=UsageError)
     matrix = table.get("matrix", {})
@@ -127,10 +128,12 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
         error=UsageError,
     )
     expect = _worded(where, "expect", table.get("expect", base.expect))
-    if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
-        raise UsageError(
-            f"{where} expect: no verdict is called {expect!r}", remedy=_suggest(expect, (*EXPECTED, "exit N"))
-        )
+    refuse_if(
+        expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect),
+        f"{where} expect: no verdict is called {expect!r}",
+        remedy=_suggest(expect, (*EXPECTED, "exit N")),
+        error=UsageError,
+    )
     return Job(
         name=name,
         command=command,
@@ -217,11 +220,19 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> N
             error=UsageError,
         )
         for job in recording.only:
-            if job not in jobs:
-                raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_suggest(job, jobs))
+            refuse_if(
+                job not in jobs,
+                f"[[recordings]] only: no job is called {job!r}",
+                remedy=_suggest(job, jobs),
+                error=UsageError,
+            )
         for job in recording.overrides:
-            if job not in (recording.only or jobs):
-                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_suggest(job, jobs))
+            refuse_if(
+                job not in (recording.only or jobs),
+                f"[recordings.jobs.{job}]: no job has this name",
+                remedy=_suggest(job, jobs),
+                error=UsageError,
+            )
 
 
 def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:

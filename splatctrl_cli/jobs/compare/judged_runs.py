@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate import field_accuracy, score_report
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale
@@ -172,14 +172,12 @@ def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
 
 def read_baseline(path: Path) -> Judged:
     """Read a baseline. Raises InputError for another or newer file, or unknown figures."""
-    try:
+    make = "make one with --update-baseline"
+    with (
+        refuse_faults(lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy=make),
+        refuse_faults(f"{path}: expected a baseline in TOML", ValueError, remedy=ANEW),
+    ):
         document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror}", remedy="make one with --update-baseline"
-        ) from None
-    except ValueError as error:
-        raise InputError(f"{path}: expected a baseline in TOML: {error}", remedy=ANEW) from None
     refuse_if(
         document.get("format") != BASELINE,
         f"{path}: expected a baseline, got another TOML file",

@@ -18,7 +18,7 @@ from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.field.clusters import DEFAULT_LABELS, ObstacleSpheres, Spheres, obstacle_spheres
 from splatctrl_cli.field.distance import OnDevice, SphereField, field_over, march
 from splatctrl_cli.field.grid_cells import GridField, check_room
-from splatctrl_cli.field.probability import make_probability
+from splatctrl_cli.field.probability import PROBABILITIES
 from splatctrl_cli.files.output import Parts, Stopwatch, output_path
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.ply import point_blocks
@@ -85,7 +85,7 @@ def scene_answers(
     else:
         exact = OnDevice(spheres, replace(config.field, distance="hard"), device)
         field = OnDevice(spheres, config.field, device, threads=threads)
-    probability = make_probability(spheres, config.field, threads=threads)
+    probability = PROBABILITIES[config.field.probability](spheres, config.field, threads)
     reach = float(np.abs(splats.centers - spheres.anchor).max())
     states = None if known is None else known.states(limits.free_below, limits.occupied_above)
 
@@ -281,7 +281,7 @@ def _open_source(request: QueryRequest, progress: Progress) -> Answering:
         error=UsageError,
     )
     check_room(str(file), file.stat().st_size, "bake a smaller --box or a larger --voxel")
-    grid = read_npz(Parts.beside(file).checked(file))
+    grid = read_npz(Parts.from_folder(file).checked(file))
     box, of_grid = grid_answers(grid, str(file))
     if request.scene is None:
         refuse_if(

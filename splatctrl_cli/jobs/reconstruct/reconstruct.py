@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.calibration.displacement import displaced_cameras, placed
+from splatctrl_cli.calibration.displacement import correct_pose, displaced_cameras
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
 from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
-from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names, counted
+from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names, plural
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
@@ -135,7 +135,9 @@ def _learn_self(
     if seen and is_new and request.self_model is None:
         arm, frames = seen
         try:
-            robot = robot.with_self_model(learn_from(arm, [placed(f, off) for f in frames], request.source.name))
+            robot = robot.join_self_model(
+                learn_from(arm, [correct_pose(f, off) for f in frames], request.source.name)
+            )
         except InputError as error:
             progress.log(f"nothing is learned of the robot's own parts: {error.message}")
     if not is_new and request.self_model is None:
@@ -227,13 +229,15 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
         arm = arm_of(model.moved_by(source.joint_names), source)
         frames = frames_of(arm, source, progress)
         off = displaced_cameras(arm, frames)
-        found = learn_from(arm, [placed(frame, off) for frame in frames], source.name, request.reach)
+        found = learn_from(arm, [correct_pose(frame, off) for frame in frames], source.name, request.reach)
         savez(partial, found.arrays())
     return found
 
 
 def arm_of(model: RobotModel, source: FrameSource) -> Arm:
-    return Arm(model, source.states.of_log(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS))
+    return Arm(
+        model, source.states.convert_joints(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS)
+    )
 
 
 def arm_seen(model: RobotModel, source: RecordSource, progress: Progress) -> tuple[Arm, list[RgbdFrame]] | None:
@@ -272,7 +276,9 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
     frames = [
         depth_frame(item)
         for item in source.stored()
-        if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen and arm.is_posed(item.stamp_ns)
+        if isinstance(item, StoredFrame)
+        and (item.camera, item.stamp_ns) in chosen
+        and arm.posture(item.stamp_ns) is not None
     ]
-    progress.log(f"the robot is measured in {counted(len(frames), 'frame')} of {counted(len(order), 'moment')}")
+    progress.log(f"the robot is measured in {plural(len(frames), 'frame')} of {plural(len(order), 'moment')}")
     return frames

@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from splatctrl_cli.calibration.displacement import placed
+from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.formats.ply import read_points
@@ -186,7 +186,7 @@ class Reconstruction:
         for frame in step.frames:
             if frame.camera not in self.first_frames:
                 self.first_frames[frame.camera] = first_frame(frame)
-        step = replace(step, frames=tuple(placed(frame, self._cameras_off) for frame in step.frames))
+        step = replace(step, frames=tuple(correct_pose(frame, self._cameras_off) for frame in step.frames))
         if self._fitter is None:
             self._fit_to(RecordedDepth.of(step.frames), console)
             frames, self.corrected = self.request.corrections.of(
@@ -254,7 +254,7 @@ class Reconstruction:
     def metrics(self) -> dict[str, object]:
         last = self.rows[-1]
         learned = None if self.robot is None else self.robot.self_model
-        holding = {part.link for part in learned.held} if learned is not None else set[str]()
+        holding = {part.link for part in learned.temporary} if learned is not None else set[str]()
         return {
             "cameras": self.cameras,
             "devices": self.device.history,
@@ -357,7 +357,7 @@ class Reconstruction:
     def time_steps(self) -> Iterator[TimeStep]:
         records, has_clock = self.source.records(), self.source.has_clock
         steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see, repeats=self.repeats)
-        return steps if self.cloud is None else (step.without_depth() for step in steps)
+        return steps if self.cloud is None else (step.drop_depth() for step in steps)
 
     def _see(self, record: Record) -> None:
         if isinstance(record, RgbdFrame):

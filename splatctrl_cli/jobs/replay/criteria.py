@@ -8,7 +8,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import CLOCKS_APART, LIMIT_EXCEEDED, SAME_MOMENT_NS, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, counted, failed, held, lacking
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, lacking, passed_reason, plural
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
@@ -66,7 +66,7 @@ def nearby(trace: Trace, column: str) -> tuple[float, float, int] | None:
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """The depth about the arm is at most `--max-map-age` old and not newer than the state. After half a second
+    """Depth about the arm is at most `--max-map-age` old and not newer than the state. After half a second
     without any, the next depth shows nothing where the arm was. A baked field has no times (a note).
     """
     first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
@@ -99,7 +99,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
         age, time_s, count = near
         words, remedy = _end_words(judged, age, time_s)
         yield (
-            held(f"depth from about the arm at most {age:.2f} s before", age, oldest, "s", count)
+            passed_reason(f"depth from about the arm at most {age:.2f} s before", age, oldest, "s", count)
             if age <= oldest
             else lacking(
                 sentence=f"{words}the newest depth near the arm is {age:.2f} s old, allowed {oldest:g} s",
@@ -137,7 +137,7 @@ def map_age(judged: Judged) -> Iterator[Reason]:
             count=judged.replay.num_states,
         )
     elif len(known) and most <= allowed:
-        yield held(f"at most {most:.2f} s", most, allowed, "s", len(known))
+        yield passed_reason(f"at most {most:.2f} s", most, allowed, "s", len(known))
     elif len(known):
         worst = max(events_of(judged.replay, EventKind.STALE_MAP), key=lambda event: event.worst)
         words, remedy = _end_words(judged, most, worst.worst_s)
@@ -182,7 +182,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
 
 
 def judged_time(judged: Judged) -> Iterator[Reason]:
-    """No gap longer than `verdict.longest_interval` in which the arm could reach the margin within its velocity
+    """No gap over `verdict.longest_interval` in which the arm could reach the margin within its velocity
     limits. No state without a distance or dropped for its stamp (*judged states*). At most `verdict.lead_in` before
     the first map.
     """
@@ -205,7 +205,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
         longest = int(np.argmax(unbounded))
         yield lacking(
             sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "
-            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {unbounded[longest]:.2f} s, "
+            f"the motion ({plural(int((unbounded > 0).sum()), 'gap')}, the longest {unbounded[longest]:.2f} s, "
             "ending",
             value=share,
             threshold=config.unjudged,
@@ -243,7 +243,7 @@ def clocks(judged: Judged) -> Iterator[Reason]:
         return
     offset, uncertainty = float(clock.offset_s), float(clock.uncertainty_s)
     yield (
-        held(f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
+        passed_reason(f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
         if abs(offset) - uncertainty <= CLOCKS_APART
         else lacking(
             sentence=f"the cameras' clock is {1e3 * abs(offset):.0f} ms {'ahead of' if offset > 0 else 'behind'} "
@@ -265,10 +265,10 @@ def controller(judged: Judged) -> Iterator[Reason]:
     if outside is not None:
         num, failure = outside.num_answers, outside.failure
         yield (
-            held(f"all {num} steps answered", 0.0, 0.0, "", num)
+            passed_reason(f"all {num} steps answered", 0.0, 0.0, "", num)
             if failure is None
             else failed(
-                sentence=f"{failure.fault}: {failure.sentence}; after {counted(num, 'answer')},",
+                sentence=f"{failure.fault}: {failure.sentence}; after {plural(num, 'answer')},",
                 value=1.0,
                 threshold=0.0,
                 time_s=float(failure.stamp_ns - judged.replay.trace.stamp_ns[0]) * 1e-9,
@@ -283,7 +283,7 @@ def controller(judged: Judged) -> Iterator[Reason]:
     bad = {"relaxed": num_near, **{name: metrics[f"num_{name}"] or 0 for name in ("minimum_violation", "hold")}}
     if not sum(bad.values()):
         far = f", {num_relaxed} of them with rows relaxed, all over twice their margin away" if num_relaxed else ""
-        yield held(f"all {len(trace.steps)} steps solved{far}", 0.0, 0.0, "", len(trace.steps))
+        yield passed_reason(f"all {len(trace.steps)} steps solved{far}", 0.0, 0.0, "", len(trace.steps))
         return
     kinds = [kind for kind in EventKind if bad.get(kind.replace("-", "_"))]
     first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)

@@ -13,7 +13,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.calibration.displacement import placed
+from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.sections import VerdictConfig
 from splatctrl_cli.control.audit import DistanceFunction
@@ -188,7 +188,9 @@ def misses_of(
         points = np.concatenate(
             [
                 apart_from_robot(
-                    inputs.model, motion.at(frame.stamp_ns)[0], swept.near(surface_points(placed(frame, cameras)))
+                    inputs.model,
+                    motion.at(frame.stamp_ns)[0],
+                    swept.near(surface_points(correct_pose(frame, cameras))),
                 )
                 for frame in step.frames
             ]

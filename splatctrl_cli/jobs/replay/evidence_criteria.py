@@ -18,7 +18,7 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.metrics import lowest
-from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, lacking, passed_reason
 from splatctrl_cli.jobs.reconstruct.verdict import displaced_camera
 from splatctrl_cli.jobs.replay.criteria import (
     MARGIN,
@@ -177,7 +177,7 @@ def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = l
             return
         words = f"{100 * worst[0]:.0f} % {limit.words}"
         if not limit.is_broken(near, judged.replay.margin):
-            yield held(words, worst[0], limit.most, "", worst[2])
+            yield passed_reason(words, worst[0], limit.most, "", worst[2])
             return
         yield broken(
             sentence=f"{words}, allowed {100 * limit.most:g} %",
@@ -214,7 +214,7 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
     if share is None:
         yield lacking(sentence="the space that cameras saw is not recorded")
     elif share <= allowed:
-        yield held(
+        yield passed_reason(
             f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.replay.num_states
         )
     else:
@@ -251,7 +251,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         return
     value = found.bound.bound
     if surface >= value:
-        yield held(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
+        yield passed_reason(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return
     yield lacking(
         sentence=f"the map may miss surface by {mm(value)} ({bound_words(found.bound)}), but the motion keeps only "
@@ -294,7 +294,7 @@ def find_displaced(judged: Judged) -> tuple[str, float] | None:
 
 
 def calibration(judged: Judged) -> Iterator[Reason]:
-    """Each camera sees the robot, and all together each link, within 5 mm of where its joints put it."""
+    """Each camera sees the robot, all cameras each link, within 5 mm of the joints."""
     figures = judged.inputs.scene.figures()
     if (camera := find_displaced(judged)) is not None:
         yield lacking(
@@ -318,7 +318,7 @@ def calibration(judged: Judged) -> Iterator[Reason]:
         judged_links.items(), key=lambda row: abs(float(row[1]["median_mm"])), default=("", dict[str, Any]())
     )
     yield (
-        held(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
+        passed_reason(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
         if value <= MISPLACED
         else lacking(
             sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
@@ -334,7 +334,7 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
-    """The map's voxels are at most 25 mm, the size of an obstacle without a splat. The robot's mask reaches at most
+    """Voxels are at most 25 mm, the size of an obstacle without a splat. The robot's mask reaches at most
     the margin: an obstacle touching the robot may go unseen that far.
     """
     figures, margin = judged.inputs.scene.figures(), judged.replay.margin

@@ -193,7 +193,9 @@ def twist_figures(
         reference = track.reference(model, config, q, int(stamp))
         if is_known[i]:
             num_known += 1
-            num_capped += not np.array_equal(reference, track.in_world(model, q, int(stamp), config.twist_timeout))
+            num_capped += not np.array_equal(
+                reference, track.find_world_twist(model, q, int(stamp), config.twist_timeout)
+            )
         missed = model.frame_jacobian(q, frame) @ v - reference
         linear[i], angular[i] = np.linalg.norm(missed[:3]), np.linalg.norm(missed[3:])
     values = [float(is_known.mean()), num_capped / num_known if num_known else None]

@@ -29,13 +29,13 @@ from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
 from splatctrl_cli.robot.declared_contact import DeclaredContact
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import read_srdf, without_disabled
+from splatctrl_cli.robot.self_collision import drop_disabled, read_srdf
 from splatctrl_cli.robot.self_margins import (
     KeptMargin,
     SelfSurfaces,
+    apply_kept_margins,
     fixture_margins,
     kept_margins,
-    with_kept_margins,
 )
 from splatctrl_cli.robot.self_model import ALWAYS
 
@@ -90,13 +90,13 @@ def measured_robot(
     disabled: Collection[frozenset[str]] = ()
     if request.srdf is not None:
         disabled, _ = read_srdf(request.srdf, model.urdf)
-        model = model.with_self_pairs(without_disabled(model, disabled))
+        model = model.replace_self_pairs(drop_disabled(model, disabled))
     try:
         solids = read_solids(model.urdf, list(request.packages))
     except InputError as error:
-        model, surfaces = model.with_coverage(None, str(error)), None
+        model, surfaces = model.replace_coverage(None, str(error)), None
     else:
-        model = model.with_coverage(
+        model = model.replace_coverage(
             coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=COVERED_COARSE)
         )
         surfaces = SelfSurfaces(model, solids, disabled, recorded)
@@ -104,7 +104,7 @@ def measured_robot(
         _check_bounded(model)
     kept = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
     beside = () if surfaces is None else fixture_margins(model, surfaces, config.margin)
-    model = with_kept_margins(model, config.self_margin, kept)
+    model = apply_kept_margins(model, config.self_margin, kept)
     return MeasuredRobot(model=model, surfaces=surfaces, kept=(*kept, *beside))
 
 
@@ -266,7 +266,7 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
 
     Raises InputError if they cannot be the robot's.
     """
-    states = source.states.of_log(*model.joint_columns(source.joint_names))
+    states = source.states.convert_joints(*model.joint_columns(source.joint_names))
     check_states(states, model.joint_names)
     check_angles(model, states, source.name)
     return LoggedStates(source=source, states=states, poses=pose_agreement(model, states))
@@ -279,7 +279,7 @@ def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[Declared
     """
     bodies = model.urdf.rigid_bodies(set(model.joint_names) - set(model.urdf.grippers))
     first_ns = int(states.stamp_ns[0])
-    for part in [] if model.self_model is None else model.self_model.held:
+    for part in [] if model.self_model is None else model.self_model.temporary:
         for stamp, before in ((part.start_ns, GRASPING), (part.end_ns, 0.0)):
             if stamp in ALWAYS:
                 continue

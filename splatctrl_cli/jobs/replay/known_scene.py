@@ -128,10 +128,10 @@ def fields_at(
     return at
 
 
-def from_grid(path: Path) -> KnownScene:
+def read_grid_scene(path: Path) -> KnownScene:
     """Read a baked grid (folder or ``field.npz``) as one scene for all times."""
     file = path / "field.npz" if path.is_dir() else path
-    grid = read_npz(Parts.beside(file).checked(file))
+    grid = read_npz(Parts.from_folder(file).checked(file))
     barrier = GridField(grid)
     states = grid.channels.get("observed")
     observed = None if states is None else partial(observed_at, states.astype("uint8"), grid.origin, grid.voxel)
@@ -161,7 +161,7 @@ def from_grid(path: Path) -> KnownScene:
     )
 
 
-def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0) -> KnownScene:
+def read_splat_scene(path: Path, config: Config, threads: int, *, latency_ns: int = 0) -> KnownScene:
     """Read a reconstruction; each stamp uses the newest snapshot as old as the latency.
 
     Known space is where a camera looked, or the robot ever was in the log.

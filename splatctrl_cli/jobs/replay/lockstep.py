@@ -25,9 +25,9 @@ from splatctrl_cli.jobs.replay.known_scene import (
     KnownFields,
     KnownScene,
     fields_at,
-    from_grid,
-    from_splats,
     known_space,
+    read_grid_scene,
+    read_splat_scene,
     seen_of,
     splat_fields,
 )
@@ -72,15 +72,15 @@ def choose_scene(
             raise UsageError(
                 "control.human_margin: a baked field does not tell people from things", remedy="give --scene"
             )
-        return from_grid(request.field)
+        return read_grid_scene(request.field)
     if request.scene is not None:
-        return from_splats(
+        return read_splat_scene(
             request.scene, request.config, request.threads, latency_ns=int(request.latency * 1e9 + 0.5)
         )
-    return from_log(request, model, folder, console, declared, source, observe)
+    return reconstruct_scene(request, model, folder, console, declared, source, observe)
 
 
-def from_log(
+def reconstruct_scene(
     request: ReplayRequest,
     model: RobotModel,
     folder: Path,

@@ -9,10 +9,17 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.columns import step_columns
 from splatctrl_cli.control.goals import LoggedMotion, PlanDetour, TwistTrack
-from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.outside import OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
-from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
+from splatctrl_cli.control.replay import (
+    OpenLoopTask,
+    ReplayTask,
+    ReplayTrace,
+    closed_loop,
+    divergence,
+    open_loop,
+    scene_change,
+)
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.spilled_rows import ObjectFile
@@ -39,7 +46,7 @@ def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, conso
 def _audit(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     for stamps, positions, velocities in _blocks(record, inputs.states, first):
-        record.measured(stamps, positions, velocities)
+        record.measure_block(stamps, positions, velocities)
     return _finish_logged(request, inputs, config, record, first)
 
 
@@ -55,7 +62,7 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
     console.log(f"replay: asking the controller at {len(states) - first} states")
     with commander_of(request, model, config.control, console, frame=frame, home=task.home) as commander:
         for stamps, positions, velocities in _blocks(record, states, first):
-            part = record.measured(stamps, positions, velocities)
+            part = record.measure_block(stamps, positions, velocities)
             commanded = open_loop(
                 model,
                 config.control,
@@ -115,7 +122,7 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
     for first, last in record.blocks(trace.stamp_ns):
         stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])
         straight = np.zeros_like(positions)  # the driven arm moves straight from state to state
-        record.measured(stamps, positions, straight)
+        record.measure_block(stamps, positions, straight)
         apart = divergence(model, task.frame, stamps, positions, motion)
         record.trace.append({**step_columns(trace.steps[first:last], model.num_joints), **apart})
     return replace(

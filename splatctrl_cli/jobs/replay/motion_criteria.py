@@ -8,7 +8,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.evaluate.metrics import lowest
-from splatctrl_cli.evaluate.verdict import Criterion, Reason, counted, failed, held, lacking
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, lacking, passed_reason, plural
 from splatctrl_cli.jobs.replay.criteria import (
     BROKEN,
     CONTACT,
@@ -76,7 +76,7 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     if least is None:
         return
     if least >= judged.threshold:
-        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.replay.num_states)
+        yield passed_reason(f"at least {mm(least)}", least, replay.margin, "m", judged.replay.num_states)
         return
     is_contact = least < 0 and represented is None
     events = events_of(replay, EventKind.IN_COLLISION if is_contact else EventKind.BELOW_MARGIN, source)
@@ -112,7 +112,7 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
         worst,
         failed(
             sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}, {states} states in "
-            f"{counted(len(events), 'interval')}, worst",
+            f"{plural(len(events), 'interval')}, worst",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -168,7 +168,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
         yield (
             _check_fixture(judged)
             or _brought_together(judged)
-            or held(f"at least {mm(least)}", least, 0.0, "m", judged.replay.num_states)
+            or passed_reason(f"at least {mm(least)}", least, 0.0, "m", judged.replay.num_states)
         )
 
 
@@ -218,7 +218,7 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
-    """No new obstacle comes within the margin of a fixed link's surface in two scenes in a row. New is 1 cm or more
+    """No new obstacle comes within a fixed link's margin in two scenes in a row. New is 1 cm or more
     (at its mount 3 cm) from all that stood there, in space that was free before; the old is a note.
     """
     broken = {
@@ -255,11 +255,11 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
             label=LIMITS,
         )
     else:
-        yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.replay.num_states)
+        yield passed_reason(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.replay.num_states)
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
-    """Velocities of the motion, and a user's commands, exceed the URDF's limits by at most one percent."""
+    """Velocities and a user's commands exceed the URDF's limits by at most one percent."""
     too_fast = commanded(judged)
     yield from _share_of_limit(judged, "velocity") if too_fast is None else (too_fast,)
 
@@ -283,7 +283,7 @@ def _share_of_limit(judged: Judged, name: str) -> Iterator[Reason]:
             label=LIMITS,
         )
     elif name == "velocity" or most > 0:
-        yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.replay.num_states)
+        yield passed_reason(f"at most {most:.2f} of the limit", most, 1.0, "", judged.replay.num_states)
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
@@ -317,7 +317,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             count=judged.replay.num_states,
         )
     elif between is None or between >= judged.threshold:
-        yield held(f"at least {mm(surface)}", surface, judged.replay.margin, "m", judged.replay.num_states)
+        yield passed_reason(f"at least {mm(surface)}", surface, judged.replay.margin, "m", judged.replay.num_states)
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:

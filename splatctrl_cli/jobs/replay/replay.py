@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatctrl_cli.calibration.displacement import placed
+from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, check_gate_names
@@ -130,7 +130,7 @@ def _watch(request: ReplayRequest, inputs: ReplayInputs, replay: Replay) -> tupl
     off = inputs.scene.figures().get("displaced_cameras") or {}
     recorded = frames_of(inputs.source) if inputs.source.cameras else iter(())
     replay, surfaces = add_truth(inputs, replay)
-    seen = (placed(frame, off) for frame in recorded)
+    seen = (correct_pose(frame, off) for frame in recorded)
     frames = seen if surfaces is None else surfaces.watching(seen)
     sights = worst_sights(inputs, replay, request.worst_frames, frames)
     if surfaces is not None:

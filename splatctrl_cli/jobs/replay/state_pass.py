@@ -119,11 +119,11 @@ class ReplayRecord:
             yield first, last
             first = last
 
-    def measured(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
+    def measure_block(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
         """Audit and store the next block of states (T, J), which see one scene."""
         scene, self._model = self._scene, self._robot.at(int(stamps[0]))
         part = audit(self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed)
-        part = self._look_at_self(self._without_expected(part))
+        part = self._look_at_self(self._drop_expected(part))
         self.fields = tuple(part.clearance)
         self.newer_depth.add(stamps, positions, part.clearance["exact"].distance)
         strain = self._limits.add(stamps, positions if self._is_continuous else np.zeros_like(positions))
@@ -162,7 +162,7 @@ class ReplayRecord:
 
         return events_of(trace.stamp_ns, signals, near)
 
-    def _without_expected(self, part: AuditTrace) -> AuditTrace:
+    def _drop_expected(self, part: AuditTrace) -> AuditTrace:
         if not self._declared.expected_contact:
             return part
         clearance, of_spheres, moving = dict(part.clearance), dict(part.of_spheres), self._reach.moving
@@ -275,7 +275,7 @@ class ReplayRecord:
                 before, q = part.position[at - 1] if at else self._posture_before, part.position[at]
                 way = self._near.postures_between(before, q) if before is not None and self._is_continuous else ()
                 accounts = [self._near.look(stamp, each, known, exact) for each in (q, *way)]
-                for name, value in _folded(accounts).items():
+                for name, value in _fold_accounts(accounts).items():
                     columns[name][at] = value
                 if not self._scene.has_seen_times:
                     columns["assumed"][at] = np.nan  # space seen free once may be occupied now
@@ -306,7 +306,7 @@ class ReplayRecord:
         return found
 
 
-def _folded(accounts: Sequence[Account]) -> dict[str, float | Float64]:
+def _fold_accounts(accounts: Sequence[Account]) -> dict[str, float | Float64]:
     """Fold the accounts of a state and the postures before it.
 
     Shares are of the state; distances are the least and unseen shares the largest of all.

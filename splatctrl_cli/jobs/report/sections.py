@@ -175,7 +175,7 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
             title="What changed",
             header=HEADER,
             rows=[*first, *rows(worse), *unlike],
-            text=". ".join([found.verdict.sentence, *map(str, found.verdict.said)]),
+            text=". ".join([found.verdict.sentence, *map(str, found.verdict.shown)]),
         )
     ]
     if better:

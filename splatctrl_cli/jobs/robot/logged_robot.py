@@ -89,7 +89,7 @@ def add_self_model(model: RobotModel, given: Path | None, scene: Path | None = N
         if given is None:  # a replay reports a scene of another robot
             return model
         raise
-    return model.with_self_model(found)
+    return model.join_self_model(found)
 
 
 def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:

@@ -197,7 +197,7 @@ def describe_robot(request: RobotRequest) -> tuple[RobotModel, dict[str, Any]]:
     Limits are in rad or m, velocities per second; meshes_not_found: sentences.
     """
     urdf, lost = read_urdf(request.urdf), []
-    locked = urdf.with_followers(request.locked)
+    locked = urdf.add_followers(request.locked)
     spheres = own_spheres(urdf) if request.spheres is None else request.spheres
     model = RobotModel.from_urdf(request.urdf, spheres, locked=locked)
     for mesh in urdf.meshes:

@@ -35,7 +35,7 @@ class RunOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Device:
-    """cpu, or cuda:N with its card and memory."""
+    """Device cpu, or cuda:N with its card and memory."""
 
     name: str = CPU
     card: Card | None = None

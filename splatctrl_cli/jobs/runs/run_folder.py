@@ -54,7 +54,7 @@ class RunFolder:
     @cached_property
     def parts(self) -> Parts:
         """Digests to check files on opening."""
-        return Parts.of_run(self.path, self.run)
+        return Parts.from_run(self.path, self.run)
 
     @property
     def command(self) -> str:

@@ -110,7 +110,7 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
         folder.mkdir(exist_ok=True)
     scorer = _open_scorer(request, folder, progress)
     scene, reference = scorer.scene, scorer.reference
-    cloud = None if request.cloud is None else request.cloud.of_scan(reference.scan)
+    cloud = None if request.cloud is None else request.cloud.select_scan(reference.scan)
     digests = reference.source.digests()
     same = recording_check(request.scene, scene, reference, digests, allow_other=request.allow_other_recording)
     scorer.run(progress, stopwatch)

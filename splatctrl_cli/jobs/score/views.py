@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.calibration.displacement import placed
+from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, space_out, thin
@@ -78,7 +78,7 @@ class Scorer:
             training=scene.cameras,
             has_clock=has_clock,
             numbered_by_stamp=self.reference.numbered_by_stamp,
-            corrected=lambda frame: corrected(placed(frame, off), scene.corrections),
+            corrected=lambda frame: corrected(correct_pose(frame, off), scene.corrections),
         )
         may_train = self.allow_training or self.reference.scores_training
         wait = Wait(progress, f"scores {', '.join(self.cameras)}", "views").announce()
@@ -115,11 +115,12 @@ class Scorer:
             error=NotEvaluableError,
         )
         has_training = self.scene.names_its_views
-        if has_training and self.reference.has_depth and not any(view["seen_share"] for view in self.figures):
-            raise NotEvaluableError(
-                f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
-                remedy="is it the same world and the same scene? give the recording that reconstruct was given",
-            )
+        refuse_if(
+            has_training and self.reference.has_depth and not any(view["seen_share"] for view in self.figures),
+            f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
+            remedy="is it the same world and the same scene? give the recording that reconstruct was given",
+            error=NotEvaluableError,
+        )
 
     def _score_one(self, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None) -> None:
         frame = view.frame
@@ -217,7 +218,7 @@ class CloudSettings:
     masks: Path | None = None
     space: ObservedSpace | None = None
 
-    def of_scan(self, scan: str | None) -> "CloudSettings":
+    def select_scan(self, scan: str | None) -> "CloudSettings":
         """Settings with one scan's files. Raises InputError naming missing files."""
         path = cloud_of_scan(self.path, scan or "") if self.path.is_dir() else self.path
         return replace(self, path=path, space=None if self.masks is None else read_observed(self.masks, scan or ""))

@@ -214,7 +214,7 @@ def copy_arm(
         spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
     moved = [joint.name for joint in original.joints if joint.kind != "fixed" and joint.name not in original.grippers]
     model = RobotModel.from_urdf(copy, spheres).moved_by(moved)
-    model = model.with_coverage(
+    model = model.replace_coverage(
         coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=fixed.COVERED_COARSE)
     )
     return model, SelfSurfaces(model, solids)

@@ -171,9 +171,9 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
     options = command_line.options_of(run.arguments)
     found: list[Path] = []
 
-    def placed(value: Any) -> Any:
+    def find_place(value: Any) -> Any:
         if isinstance(value, list):
-            return [placed(each) for each in value]
+            return [find_place(each) for each in value]
         if not isinstance(value, Path):
             return value
         place = require(
@@ -184,7 +184,7 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
         found.append(place)
         return str(place)
 
-    options = {name: placed(value) for name, value in options.items()}
+    options = {name: find_place(value) for name, value in options.items()}
     for recorded, digest in run.run.get("inputs", {}).items():
         name = recorded.removeprefix(CALIBRATION)
         places = [p for at in found for p in (*((at,) if at.name == name else ()), at / name, at.parent / name)]

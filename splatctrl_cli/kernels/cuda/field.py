@@ -79,9 +79,9 @@ class DeviceField:
         for name, values in {"centers": spheres.centers, "boxes": spheres.boxes}.items():
             rows = 4 * values.shape[1] * np.arange(len(values))
             base["spheres"][name] = self._put(name, values) + rows.astype(np.uint64)
-        self._tasks = {HARD: self._with_offsets(base, HARD, radii)}
+        self._tasks = {HARD: self._fill_offsets(base, HARD, radii)}
         for name, kernel in kernels.items():
-            task = self._with_offsets(base, name, kernel.offsets)
+            task = self._fill_offsets(base, name, kernel.offsets)
             task["exact"] = self._put(f"{name}.exact", kernel.exact)
             task["radius"] = self._put(f"{name}.radii", kernel.radii)
             task["numbers"][:2] = (kernel.length, kernel.tolerance)
@@ -169,7 +169,7 @@ class DeviceField:
         grid = (-(-num // per_block), 1, 1)
         return Launch(kernel=kernel, grid=grid, block=threads, arguments=(self._put(name, task),), source=FIELD)
 
-    def _with_offsets(self, base: Array, name: str, offsets: Offsets) -> Array:
+    def _fill_offsets(self, base: Array, name: str, offsets: Offsets) -> Array:
         task = base.copy()
         task["offsets"] = (self._put(f"{name}.offsets", offsets.values), self._put(f"{name}.maxima", offsets.maxima))
         return task

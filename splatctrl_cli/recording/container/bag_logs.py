@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import quote
 
-from splatctrl_cli.errors import InputError, refuse_if
+from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import add_ros_type
@@ -276,14 +276,13 @@ class Db3Log(RawLog):
         """Copy the files; size [bytes]: of the database."""
         folder = Path(tempfile.mkdtemp(prefix="splatctrl-", dir=scratch_folder()))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        try:
+        what = f"cannot be copied to {folder.parent} to read {' and '.join(file.name for file in self.files)}"
+        with refuse_faults(
+            lambda error: f"{self.path}: {what}: {error.strerror}",
+            OSError,
+            remedy="set TMPDIR to a folder with room for it",
+        ):
             copies = [Path(shutil.copyfile(file, folder / file.name)) for file in self.files]
-        except OSError as error:
-            names = " and ".join(file.name for file in self.files)
-            raise InputError(
-                f"{self.path}: cannot be copied to {folder.parent} to read {names}: {error.strerror}",
-                remedy="set TMPDIR to a folder with room for it",
-            ) from None
         self._database = copies[0]
         os.truncate(self._database, size)
 

@@ -45,12 +45,11 @@ def read_protobuf(descriptor_set: bytes, type_name: str, data: bytes) -> Any:
 
     Raises ValueError for another set, and if the message does not decode.
     """
-    try:
+    with (
+        refuse_faults(lambda _: f"the schema does not define {type_name}", KeyError, error=ValueError),
+        refuse_faults("protobuf", DecodeError, TypeError, error=ValueError),
+    ):
         return GetMessageClass(_pool(descriptor_set).FindMessageTypeByName(type_name)).FromString(data)
-    except KeyError:
-        raise ValueError(f"the schema does not define {type_name}") from None
-    except (DecodeError, TypeError) as error:
-        raise ValueError(f"protobuf: {error}") from None
 
 
 _STANDS_FOR = {

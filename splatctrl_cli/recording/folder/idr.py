@@ -250,7 +250,7 @@ class DtuSource:
         else:
             self.split = _held_out(numbers, frozenset(holdout), root)
         self._held = set(self.split.scored) - set(self.split.training)
-        self.cameras = (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held else (TRAINING_CAMERA,)
+        self.cameras: tuple[str, ...] = (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held else (TRAINING_CAMERA,)
         is_left_out = self.layout == "MVSNet"
         notes = [f"{name}: without depth{', left out' if is_left_out else ''}" for name in found.without_depth]
         self.loss = LossReport(unpaired_color=len(notes), notes=notes)

@@ -36,7 +36,7 @@ from splatctrl_cli.recording.folder.folder_views import UNITS, View, find_files,
 from splatctrl_cli.recording.folder.idr import idr_scans
 from splatctrl_cli.recording.folder.layout import Layout, images_of
 from splatctrl_cli.recording.folder.layout_nerfstudio import fill_transforms
-from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
+from splatctrl_cli.recording.log.messages import convert_floats, metres, num_invalid
 from splatctrl_cli.recording.log.registration import Lens, correct_lens
 from splatctrl_cli.recording.log.stored_frame import (
     FrameSource,
@@ -74,7 +74,7 @@ class ImageFolderSource(FrameSource):
         of_each = [views_of(description, options, self._loss) for description in self._descriptions]
         self._views = list(heapq.merge(*of_each, key=lambda view: view.stamp_ns))
         self._lenses: dict[str, Lens] = {}
-        self.guess = "" if self.has_clock else self._in_metres()
+        self.guess = "" if self.has_clock else self._convert_to_metres()
         """In which unit lengths look to be, in words; empty where they may be metres."""
         refuse_unknown_cameras(
             path, (*options.camera_poses, *options.intrinsics), sorted({view.lens.name for view in self._views})
@@ -101,7 +101,7 @@ class ImageFolderSource(FrameSource):
             notes=[*loss.notes, *self._damaged],
         )
 
-    def _in_metres(self) -> str:
+    def _convert_to_metres(self) -> str:
         """Convert lengths that look like millimetres or centimetres; return a note, or ""."""
         places = np.ptp([view.T_world_camera[:3, 3] for view in self._views], axis=0)
         apart = float(np.linalg.norm(places))  # the diagonal of their box, in the unit of the poses
@@ -249,7 +249,7 @@ class ImageFolderSource(FrameSource):
             if pixels is None:
                 return None
             self._num_invalid += num_invalid(pixels)
-            return measured(pixels, scale)
+            return convert_floats(pixels, scale)
         counts = decode_file(path.read_bytes(), color=False)
         if counts is None:
             return None

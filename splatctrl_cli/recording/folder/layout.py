@@ -21,7 +21,7 @@ from splatctrl_cli.recording.folder.folder_description import (
     check_camera,
 )
 from splatctrl_cli.recording.folder.poses import read_numbers
-from splatctrl_cli.recording.log.survey import paired
+from splatctrl_cli.recording.log.survey import pair_images
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
@@ -61,8 +61,8 @@ def ask_description(name: str, *examples: str) -> Callable[[Path, SourceOptions]
     def refuse(folder: Path, _: SourceOptions) -> Description:
         raise InputError(
             f"{folder}: laid out as {name}, whose lens and poses a description names",
-            remedy=f"write {' or '.join(examples)} as `splatctrl help input` shows it ({name}), and give it with"
-            f" --root {folder}",
+            remedy=f"write {' or '.join(f'{one}.toml (`splatctrl help {one}` prints it)' for one in examples)}, enter"
+            f" your numbers, and give it with --root {folder}",
         )
 
     return refuse
@@ -109,7 +109,7 @@ def pair_stamps(
             matrix=pose_at(colors[i][0]),
             stamp_ns=colors[i][0],
         )
-        for i, j in paired(
+        for i, j in pair_images(
             [stamp for stamp, _ in colors], [stamp for stamp, _ in depths], round(options.pairing_tolerance_s * 1e9)
         ).tolist()
     ]
@@ -125,7 +125,7 @@ def describe(
     has_stamps: bool = False,
     **fields: Any,
 ) -> Description:
-    """Complete listed views with the lens of --intrinsics, else `lens` of the first image, and further fields.
+    """Complete listed views with the lens of --intrinsics, else `lens` of the first image.
 
     Without `lens` each view has one. Raises InputError if a camera is impossible.
     """
@@ -152,7 +152,7 @@ def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[floa
 
 
 def read_K(path: Path) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of a text file's 3x3 matrix."""
+    """Intrinsics fx, fy, cx, cy of a text file's 3x3 matrix."""
     values = read_numbers(path)
     refuse_if(
         len(values) != 9,

@@ -61,7 +61,7 @@ def read_arkit(folder: Path, options: SourceOptions) -> Description:
     options.refuse(("intrinsics",), "a video of ARKitScenes", folder)
     root = _frames(folder)
     assert root is not None
-    colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
+    colors, depths = _list_by_stamp(root / "lowres_wide"), _list_by_stamp(root / "lowres_depth")
     pairs = pair_stamps(root / TRAJECTORY, colors, depths, trajectory(_poses(root / TRAJECTORY)), options)
     lenses: list[CameraTable] = []
     pincams = {
@@ -85,7 +85,7 @@ def _frames(folder: Path) -> Path | None:
     return next((f for f in candidates if (f / TRAJECTORY).is_file() and (f / "lowres_depth").is_dir()), None)
 
 
-def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
+def _list_by_stamp(folder: Path) -> list[tuple[int, Path]]:
     refuse_if(not folder.is_dir(), f"{folder}: no such folder", remedy="download lowres_wide and lowres_depth")
     return [(stamp_ns, path) for path in images_of(folder).values() if (stamp_ns := _stamp_ns(path)) is not None]
 

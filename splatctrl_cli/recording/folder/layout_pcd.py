@@ -18,7 +18,7 @@ from splatctrl_cli.config.fixed import CLOUD_POINTS, CLOUD_RESIDUAL
 from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.formats.image_file import MOST_PIXELS
 from splatctrl_cli.geometry import invert_transform, project, transform_from, transform_points
-from splatctrl_cli.libraries import of_extra
+from splatctrl_cli.libraries import import_extra
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     DepthTable,
@@ -41,7 +41,7 @@ _DAMAGE = (ValueError, TypeError, KeyError, RuntimeError, OSError, MemoryError, 
 _AGAIN = "copy the file again"
 
 
-_library = partial(of_extra, "pypcd4", "pcd", "point clouds (.pcd)")
+_library = partial(import_extra, "pypcd4", "pcd", "point clouds (.pcd)")
 
 
 def read_cloud(path: Path) -> tuple[Float64, UInt8, Float64]:

@@ -87,7 +87,7 @@ def read_frames(folder: Path, options: SourceOptions) -> Description:
     first = pairs.listed[0]
     places = (colors[first.name].parent, folder, folder.parent)
     if any((place / name).is_file() for place in places for name in ("_info.txt", "info.txt")):
-        return ask_description("12-Scenes", "twelve_scenes.toml")(folder, options)
+        return ask_description("12-Scenes", "twelve_scenes")(folder, options)
     published = (place / "camera-intrinsics.txt" for place in (folder, folder.parent))
     values = next((read_K(file) for file in published if file.is_file()), DEPTH_LENS)
     depth_camera = None
@@ -217,7 +217,7 @@ Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.
         name="ScanNet export",
         order=2,
         matches=find_marks(*(f"color/ depth/ pose/ {lens}" for lens in ("intrinsic/", "intrinsics_color.txt"))),
-        read=ask_description("ScanNet export", "scannet.toml"),
+        read=ask_description("ScanNet export", "scannet"),
         docs="""
 ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | by a
     [description](#datasets-by-description)
@@ -227,7 +227,7 @@ ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color
         name="ICL-NUIM",
         order=5,
         matches=find_marks("rgb/ depth/ *.gt.freiburg"),
-        read=ask_description("ICL-NUIM", "icl_nuim.toml"),
+        read=ask_description("ICL-NUIM", "icl_nuim"),
         docs="""
 ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description](#datasets-by-description)
 """,
@@ -236,7 +236,7 @@ ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description
         name="Replica",
         order=6,
         matches=find_marks("traj.txt results/frame*", "traj_w_c.txt rgb/rgb_*"),
-        read=ask_description("Replica", "replica_nice_slam.toml", "replica_semantic_nerf.toml"),
+        read=ask_description("Replica", "replica_nice_slam", "replica_semantic_nerf"),
         docs="""
 Replica of NICE-SLAM or Semantic-NeRF | `traj.txt`, `results/frame*`; `traj_w_c.txt`, `rgb/rgb_*` | by a
     [description](#datasets-by-description)

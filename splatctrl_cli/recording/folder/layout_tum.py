@@ -147,7 +147,7 @@ def marker_to_camera(T_ground_truth: Float64) -> Float64:
 
 def read_sun3d(folder: Path, options: SourceOptions) -> Description:
     """Describe images within the tolerance of a depth image."""
-    colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
+    colors, depths = _list_by_stamp(folder / "image"), _list_by_stamp(folder / "depth")
     extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
     poses = _poses(extrinsics[-1]) if extrinsics else []
     at = {stamp_ns: pose_or_none(poses[index]) for index, (stamp_ns, _) in enumerate(colors) if index < len(poses)}
@@ -162,7 +162,7 @@ def read_sun3d(folder: Path, options: SourceOptions) -> Description:
     )
 
 
-def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
+def _list_by_stamp(folder: Path) -> list[tuple[int, Path]]:
     found = [(stamp_of_text(f"{path.stem.partition('-')[2]}e-6"), path) for path in images_of(folder).values()]
     return [(stamp_ns, path) for stamp_ns, path in found if stamp_ns is not None]
 

@@ -44,7 +44,7 @@ def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
 
     ``unlike``: the name contradicts the image, such as 16-bit infrared or depth in a JPEG.
     """
-    topics = [(t, t.first_image) for t in survey.of_type(IMAGE, COMPRESSED_IMAGE)]
+    topics = [(t, t.first_image) for t in survey.select_types(IMAGE, COMPRESSED_IMAGE)]
     return [t for t, image in topics if image is not None and kind == ("unlike" if _unlike(t) else image.kind)]
 
 
@@ -127,7 +127,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
     view = ("", 0, 0) if its is None else (its.frame_id, its.width, its.height)
     level = len(folder) - 1 if namespace is None else len(namespace)
     found: list[tuple[int, int, str]] = []
-    for info in survey.of_type(CAMERA_INFO):
+    for info in survey.select_types(CAMERA_INFO):
         calibration = info.calibration
         if calibration is None:
             continue
@@ -214,7 +214,7 @@ def _name_cameras(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
 
 def no_camera(log: RawLog, survey: Survey) -> InputError:
     colors, depths = ([t.topic.name for t in image_topics(survey, kind)] for kind in ("color", "depth"))
-    broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
+    broken = [t.topic.name for t in survey.select_types(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
     topics = [t.topic for t in survey.topics.values() if t.count]
     rgbd = [f"{t.type_name} on {t.name}" for t in topics if t.type_name.rpartition("/")[2].startswith("RGBD")]
     named, first = _named_unlike(survey), "".join(broken[:1])
@@ -329,7 +329,7 @@ def join_pose_topics(
 
 
 def pose_topics(survey: Survey) -> list[str]:
-    return [topic.topic.name for topic in survey.of_type(*POSE_TYPES)]
+    return [topic.topic.name for topic in survey.select_types(*POSE_TYPES)]
 
 
 def _child_of(log: RawLog, survey: Survey, camera: str, given: tuple[str, str], frame: str) -> str:
@@ -360,7 +360,7 @@ def _child_of(log: RawLog, survey: Survey, camera: str, given: tuple[str, str], 
 def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set[str]) -> dict[str, str]:
     known = set(survey.tf.frames)
     found: dict[str, str] = {}
-    for topic in survey.of_type(ODOMETRY):
+    for topic in survey.select_types(ODOMETRY):
         parent, child, *_ = next(_poses(log, survey, topic.topic.name, Damage()), ("", ""))
         if not child or child == parent or survey.tf.root_of(child) != child:
             continue

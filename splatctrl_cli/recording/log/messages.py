@@ -304,7 +304,7 @@ def color_of(image: ImageMessage) -> UInt8:
 
 def depth_of(image: ImageMessage, scale: float | None) -> Float32:
     """Depth (H, W) float32 [m] in the `unit` of `scale`; 0 = no return."""
-    return (metres if image.is_counts else measured)(image.pixels, image.unit(scale))
+    return (metres if image.is_counts else convert_floats)(image.pixels, image.unit(scale))
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
@@ -315,7 +315,7 @@ def num_invalid(depth: NDArray[Any]) -> int:
     return int(is_invalid.sum())
 
 
-def measured(depth: NDArray[Any], scale: float) -> Float32:
+def convert_floats(depth: NDArray[Any], scale: float) -> Float32:
     """Convert float depth (H, W) to float32 [m]; 0 = no return.
 
     No return: 0, negative, non-finite (REP 118), 65535, 65.535 (its metres), and from `FARTHEST` on.

@@ -103,7 +103,7 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
     found = camera_topics(log, survey, options)
     if not found:
         lacks = [str(no_camera(log, survey)).removeprefix(f"{log.path}: ")]
-        if not survey.of_type(CAMERA_INFO):
+        if not survey.select_types(CAMERA_INFO):
             lacks.append("no CameraInfo topic; record the colour camera's camera_info")
         return lacks if survey.tf.frames else [*lacks, "no tf (/tf, /tf_static); record it, or give --camera-pose"]
     lacks = []
@@ -176,7 +176,9 @@ def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> Im
     if not says_rectified or image_topic.endswith("rect_raw"):
         return "distorted"
     folder, P = image_topic.rpartition("/")[0], calibration.projection
-    has_raw = any(t.topic.name.startswith(f"{folder}/image_raw") for t in survey.of_type(IMAGE, COMPRESSED_IMAGE))
+    has_raw = any(
+        t.topic.name.startswith(f"{folder}/image_raw") for t in survey.select_types(IMAGE, COMPRESSED_IMAGE)
+    )
     is_depth = any(t.topic.name == image_topic for t in image_topics(survey, "depth"))
     is_own = P[0, 0] > 0 and not np.allclose(P, calibration.K, rtol=1e-3)
     return "rectified" if has_raw or is_depth or is_own else "contradicted"
@@ -198,7 +200,7 @@ class _Builder:
         self._check_depth()
         self._check_clock()
         lens = self._lens(self._calibration(topics.info, topics.color), topics.info)
-        lens = lens if self._is_registered else self._with_depth(lens)
+        lens = lens if self._is_registered else self._add_depth_lens(lens)
         fixed = self._options.camera_poses.get(topics.name)
         return Camera(
             **vars(lens),
@@ -220,7 +222,7 @@ class _Builder:
             self._check_clock,
             lambda: self._calibration(self._topics.info, self._topics.color),
             self._check_world,
-            lambda: None if self._is_registered else self._with_depth(any_lens),
+            lambda: None if self._is_registered else self._add_depth_lens(any_lens),
             self.build,
         ]
         for step in steps:
@@ -243,8 +245,8 @@ class _Builder:
         calibration = self._survey.topics[info].calibration if info else None
         given = self._options.intrinsics.get(self._topics.name)
         if given is not None and image_topic == self._topics.color:
-            return self._given(given, image_topic)
-        there = [t.topic.name for t in self._survey.of_type(CAMERA_INFO)]
+            return self._read_intrinsics(given, image_topic)
+        there = [t.topic.name for t in self._survey.select_types(CAMERA_INFO)]
         calibration = require(
             calibration,
             f"{self._where}: topic {image_topic} has no usable CameraInfo",
@@ -285,7 +287,7 @@ class _Builder:
             remedy=f"give {pinhole} if the images are rectified, {pinhole},{bent} if they are as the lens sees them",
         )
 
-    def _given(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
+    def _read_intrinsics(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
         image = self._survey.topics[image_topic].image
         fx, fy, cx, cy, *distortion = intrinsics
         return Calibration(
@@ -353,7 +355,7 @@ class _Builder:
         except InputError as error:
             raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
 
-    def _with_depth(self, lens: Lens) -> Lens:
+    def _add_depth_lens(self, lens: Lens) -> Lens:
         topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
         depth_image = self._survey.topics[topics.depth].image
         size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"
@@ -397,14 +399,14 @@ def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
     cameras = []
     for given in options.camera_topics:
         for topic, kind in ((given.color, "colour"), (given.depth, "depth")):
-            images = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is not None]
+            images = [t.topic.name for t in survey.select_types(IMAGE, COMPRESSED_IMAGE) if t.first_image is not None]
             refuse_if(
                 topic not in images,
                 f"{log.path}: --camera {given.name}: no {kind} images on topic {topic}",
                 remedy=f"image topics there: {listed(images)}",
             )
         refuse_if(
-            given.info and given.info not in [t.topic.name for t in survey.of_type(CAMERA_INFO)],
+            given.info and given.info not in [t.topic.name for t in survey.select_types(CAMERA_INFO)],
             f"{log.path}: --camera {given.name}: no CameraInfo on topic {given.info}",
             remedy="leave INFO out to have it found",
         )
@@ -425,7 +427,7 @@ def check_mask_topics(path: Path, survey: Survey, topics: Mapping[str, str], cam
     """Raise InputError for a mask topic without camera or grey images."""
     grey = [
         topic.topic.name
-        for topic in survey.of_type(IMAGE, COMPRESSED_IMAGE)
+        for topic in survey.select_types(IMAGE, COMPRESSED_IMAGE)
         if topic.first_image is not None and topic.first_image.encoding in GRAY
     ]
     for camera, topic in topics.items():

@@ -33,15 +33,15 @@ from splatctrl_cli.recording.log.stored_frame import (
     is_kept,
     merge_joints,
 )
-from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, paired, survey
+from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, pair_images, survey
 from splatctrl_cli.recording.source_options import SourceOptions, still_note
-from splatctrl_cli.records import SECOND_NS, Float64, Index, LossReport, Record, UInt8, by_stamp
+from splatctrl_cli.records import SECOND_NS, Float64, Index, LossReport, Record, UInt8, merge_by_stamp
 
 NO_MASK = -1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planned:
+class PlannedFrame:
     """A planned frame: message numbers by topic (human_index None: no mask), and the pose."""
 
     stamp_ns: int
@@ -69,9 +69,9 @@ class FramePlan:
     def __len__(self) -> int:
         return self._columns.shape[1]
 
-    def __getitem__(self, number: int) -> Planned:
+    def __getitem__(self, number: int) -> PlannedFrame:
         stamp, camera, color, depth, human, row = self._columns[:, number].tolist()
-        return Planned(
+        return PlannedFrame(
             stamp_ns=stamp,
             camera=self._cameras[camera],
             color_index=color,
@@ -170,7 +170,7 @@ class HeldMessages:
 
 def planned_images(
     log: RawLog, plan: FramePlan, damage: Damage, held: HeldMessages
-) -> Iterator[tuple[Planned, list[RawMessage]]]:
+) -> Iterator[tuple[PlannedFrame, list[RawMessage]]]:
     """Yield frames in plan order with colour, depth and mask messages.
 
     `held` keeps waiting ones; missing frames go to `damage`.
@@ -233,10 +233,10 @@ class RosLogSource(FrameSource):
         loss, first_note = LossReport(), len(self._loss.notes)
         self.joint_names, self.states = joint_records(found, options, loss, joints)
         self.joint_topics = JointTopics(
-            topics=found.of_type(*STATE_TYPES), loss=loss, first_note=first_note, chosen=options.joint_topic
+            topics=found.select_types(*STATE_TYPES), loss=loss, first_note=first_note, chosen=options.joint_topic
         )
         self._loss = merge_joints(self._loss, loss, first_note)
-        self._plan = self._planned(found)
+        self._plan = self._plan_frames(found)
         self._passes = [Damage()]  # incomplete where a pass ends early
 
     @property
@@ -251,7 +251,7 @@ class RosLogSource(FrameSource):
         )
 
     def records(self) -> Iterator[Record]:
-        return decoded(by_stamp(self.states, self._frames(lazily=False)))
+        return decoded(merge_by_stamp(self.states, self._frames(lazily=False)))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         plans = map(self._plan.__getitem__, range(len(self._plan)))
@@ -270,14 +270,14 @@ class RosLogSource(FrameSource):
             file.name if is_unique else f"{file.parent.name}/{file.name}": sha256(file) for file in self._log.files
         }
 
-    def _planned(self, found: Survey) -> FramePlan:
+    def _plan_frames(self, found: Survey) -> FramePlan:
         plan = FramePlan(self._rig)
         for camera in self._rig:
             (color, color_ns), (depth, depth_ns) = (
                 self._images(found, topic) for topic in (camera.color_topic, camera.depth_topic)
             )
             tolerance_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
-            pairs = paired(color_ns, depth_ns, tolerance_ns)
+            pairs = pair_images(color_ns, depth_ns, tolerance_ns)
             if not len(pairs):
                 gap = nearest_gap_ns(color_ns.tolist(), depth_ns.tolist()) / SECOND_NS
                 raise InputError(
@@ -368,7 +368,11 @@ def _images(
 
 
 def _stored_frame(
-    planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, messages: Sequence[RawMessage]
+    planned: PlannedFrame,
+    color: ImageMessage,
+    depth: ImageMessage,
+    human: UInt8 | None,
+    messages: Sequence[RawMessage],
 ) -> StoredFrame:
     camera = planned.camera
     is_counts = depth.is_counts and camera.depth_lens is None
@@ -402,7 +406,7 @@ def _mask_by_color(
     if not mask_topic:
         return {}
     color_ns, mask_ns = survey.topics[color_topic].stamps_ns, survey.topics[mask_topic].stamps_ns
-    pairs = dict(paired(color_ns, mask_ns, tolerance_ns).tolist())
+    pairs = dict(pair_images(color_ns, mask_ns, tolerance_ns).tolist())
     if len(pairs) < len(color_ns):
         loss.notes.append(
             f"camera {camera}: {len(color_ns) - len(pairs)} of {len(color_ns)} images have no mask on {mask_topic}"

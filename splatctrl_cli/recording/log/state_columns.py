@@ -92,12 +92,12 @@ class StateColumns(Sequence[JointState]):
         """States of an index (K,), in its order."""
         return self._changed(lambda table, _: select(table, index), COLUMNS, stamp_ns=self.stamp_ns[index])
 
-    def of_joints(self, order: Index) -> Self:
+    def select_joints(self, order: Index) -> Self:
         return self._changed(lambda table, _: select(table, columns=order), OF_JOINTS)
 
-    def of_log(self, order: Index, factor: Float64, offset: Float64) -> Self:
+    def convert_joints(self, order: Index, factor: Float64, offset: Float64) -> Self:
         """Joints (J,): ``position[order] * factor + offset``; velocities without offset."""
-        plain = self.of_joints(order)
+        plain = self.select_joints(order)
         if (factor == 1.0).all() and (offset == 0.0).all():
             return plain
 

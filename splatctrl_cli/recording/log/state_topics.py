@@ -61,8 +61,8 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
     Raises InputError for an unknown --joint-topic.
     """
-    found = [t for t in survey.of_type(*STATE_TYPES) if t.joints.streams]
-    for topic in survey.of_type(*STATE_TYPES):
+    found = [t for t in survey.select_types(*STATE_TYPES) if t.joints.streams]
+    for topic in survey.select_types(*STATE_TYPES):
         if not topic.topic.definition and topic.topic.type_name not in STANDARD_TYPES:
             kind = topic.topic.type_name
             loss.notes.append(f"{topic.topic.name}: the log has no definition of {kind}: its states are not read")
@@ -101,7 +101,7 @@ def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
     others = topic.joints.num - len(chosen)
     if others:
         loss.notes.append(f"{chosen.where}: {others} of {topic.joints.num} states name other joints: left out")
-    return _with_clock(chosen, loss)
+    return _check_clock(chosen, loss)
 
 
 def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: LossReport) -> RawTrack:
@@ -112,7 +112,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     """
     tracks = _rename_joints(_tracks(topics), wanted, loss)
     base = _base(tracks, wanted)
-    track = _with_clock(base, loss)
+    track = _check_clock(base, loss)
     missing = [name for name in wanted if name not in base.names]
     used = [base.where]
     while missing:
@@ -120,7 +120,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
         added = tuple(name for name in missing if name in best.names)
         if not added:
             break
-        track = _fill_joints(track, _with_clock(best, loss).of_names(added), loss)
+        track = _fill_joints(track, _check_clock(best, loss).select_names(added), loss)
         missing = [name for name in missing if name not in added]
         used.append(best.where)
     others = sorted({t.topic.name for t in topics} - set(used))
@@ -128,7 +128,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
         loss.notes.append(
             f"joint states are taken from {', '.join(dict.fromkeys(used))}, not from {', '.join(others)}"
         )
-    return track if missing else track.of_names(wanted)
+    return track if missing else track.select_names(wanted)
 
 
 def _tracks(topics: Sequence[TopicSurvey]) -> list[RawTrack]:
@@ -252,7 +252,7 @@ def match_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
     return fitting[-1] if is_sure else {}
 
 
-def _with_clock(track: RawTrack, loss: LossReport) -> RawTrack:
+def _check_clock(track: RawTrack, loss: LossReport) -> RawTrack:
     return replace(track, stamp_ns=checked_stamps(track.stamp_ns, track.log_ns, track.where, loss))
 
 

@@ -120,9 +120,9 @@ class RawTrack(StateColumns):
     names: tuple[str, ...]
     log_ns: Stamps = field(default_factory=lambda: np.zeros(0, np.int64))
 
-    def of_names(self, names: Sequence[str]) -> "RawTrack":
+    def select_names(self, names: Sequence[str]) -> "RawTrack":
         order = np.array([self.names.index(name) for name in names], dtype=np.int64)
-        return replace(self.of_joints(order), names=tuple(names))
+        return replace(self.select_joints(order), names=tuple(names))
 
 
 def clean_states(raw: RawTrack, loss: LossReport) -> StateColumns:

@@ -35,7 +35,7 @@ from splatctrl_cli.records import (
     Record,
     RgbdFrame,
     UInt8,
-    by_stamp,
+    merge_by_stamp,
 )
 
 _Image = TypeVar("_Image")
@@ -257,7 +257,7 @@ class FrameSource:
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
         """Yield `records`, undecoded."""
-        return by_stamp(self.states, self._frames())
+        return merge_by_stamp(self.states, self._frames())
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Yield stamp [ns], camera, T_world_camera (4, 4) by stamp, without images."""

@@ -38,7 +38,7 @@ Stamps = Sequence[int] | NDArray[np.int64]
 _BLOCK = 1 << 14  # pairs that are Python's numbers at once
 
 
-def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.int64]:
+def pair_images(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.int64]:
     """Pair colour and depth by index (K, 2), at most `tolerance_ns` apart, closest pairs first.
 
     Each index is used once; of equally close pairs the earlier wins. Sorted by colour stamp.
@@ -166,7 +166,7 @@ class Survey:
     def num_messages(self) -> int:
         return sum(topic.count for topic in self.topics.values())
 
-    def of_type(self, *types: str) -> list[TopicSurvey]:
+    def select_types(self, *types: str) -> list[TopicSurvey]:
         """Non-empty topics of these types, sorted by name."""
         found = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
         return sorted(found, key=lambda t: t.topic.name)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError, refuse_if, require
-from splatctrl_cli.libraries import is_installed, of_extra
+from splatctrl_cli.libraries import import_extra, is_installed
 from splatctrl_cli.recording.container.log_formats import AZURE_KINECT, open_raw_log, refuse_foreign
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import IMAGE, VIDEO, MessageDecoder, UndecodableMessageError, pack_image
@@ -101,7 +101,7 @@ def _stream(name: str) -> _Stream | None:
     codec = next((codec for word, codec in CODECS.items() if word in name.lower()), None)
     if codec is None:
         return None
-    context = of_extra(LIBRARY, EXTRA, "video topics").CodecContext.create(codec, "r")
+    context = import_extra(LIBRARY, EXTRA, "video topics").CodecContext.create(codec, "r")
     context.thread_count = 1
     return _Stream(context=context)
 
@@ -133,7 +133,7 @@ def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[Ra
 
 
 def _decode(context: Any, data: bytes | None, number: int) -> tuple[list[Any], bool]:
-    av = of_extra(LIBRARY, EXTRA, "video topics")
+    av = import_extra(LIBRARY, EXTRA, "video topics")
     packet = None if data is None else av.Packet(data)
     if packet is not None:
         packet.pts = number
@@ -195,7 +195,7 @@ class VideoFileLog(RawLog):
             remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
             + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
         )
-        self._av = of_extra(LIBRARY, EXTRA, "video files")
+        self._av = import_extra(LIBRARY, EXTRA, "video files")
         self.files, self._stamps = (path, beside), _read_stamps(beside)
         self.channels = {0: Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)}
 

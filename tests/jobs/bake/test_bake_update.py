@@ -291,7 +291,7 @@ def test_odd_splats_are_baked(tmp_path: Path, name: str) -> None:
 
 def test_a_box_without_a_splat_is_baked_with_a_note(tmp_path: Path) -> None:
     result = bake_splats(spheres(), tmp_path, box=(5, 5, 5, 5.2, 5.2, 5.2))
-    assert any("the box holds no splat: the nearest is" in reason.sentence for reason in result.verdict.said)
+    assert any("the box holds no splat: the nearest is" in reason.sentence for reason in result.verdict.shown)
     said = field_json(result.out)
     assert any("holds no splat" in warning for warning in said["warnings"])
     assert said["statistics"]["lowest"] > 4.0

@@ -177,7 +177,7 @@ def test_a_batch_fails_where_one_recording_got_worse_and_names_it(audit: Path, t
     (reason,) = result.verdict.decisive
     assert (reason.criterion, reason.who, reason.time_s) == ("min_clearance of b/audit", "b", 0.92)
     assert result.only_after == ("c/audit",)
-    assert any("c/audit" in one.sentence for one in result.verdict.said)
+    assert any("c/audit" in one.sentence for one in result.verdict.shown)
 
 
 def test_a_node_that_ended_as_expected_and_does_no_more_is_a_regression(audit: Path, tmp_path: Path) -> None:
@@ -227,7 +227,7 @@ def test_over_eight_recordings_the_interval_of_the_mean_decides(
     assert one.harm.low <= one.harm.mean <= one.harm.high
     assert result.verdict.exit_code == (1 if change is Change.WORSE else 0)
     assert compared(old, new) == result, "seeded"
-    assert any("r0/audit" in note.sentence for note in result.verdict.said) == (drops[0] == 0.02)
+    assert any("r0/audit" in note.sentence for note in result.verdict.shown) == (drops[0] == 0.02)
     if change is Change.WORSE:
         assert result.verdict.decisive[0].who == "r0"
         assert "95 % interval 0.004 to 0.004" in result.verdict.decisive[0].sentence
@@ -291,7 +291,7 @@ def test_a_shard_of_a_batch_is_compared_and_the_others_are_named(
     result = since(new)
     assert (result.only_before, result.only_after) == (("a/audit", "c/audit"), ("d/audit",))
     assert result.verdict.decisive[0].criterion == "num_in_collision of b/audit"
-    assert f"only in {before}: a/audit, c/audit" in [note.sentence for note in result.verdict.said]
+    assert f"only in {before}: a/audit, c/audit" in [note.sentence for note in result.verdict.shown]
     page = tmp_path / "page.html"
     write_report(WriteReportRequest(path=same, out=page, against=before))
     assert "a/audit, c/audit" in page.read_text()

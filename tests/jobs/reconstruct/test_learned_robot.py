@@ -130,7 +130,7 @@ def test_a_hand_may_touch_what_it_takes_and_leaves_at_its_place_and_no_other_lin
         replace(part, start_ns=ALWAYS[0], end_ns=ALWAYS[1]).words(0)
         == "panda_hand has a part that stands out by 50 mm"
     )
-    model = bare.with_self_model(replace(found, learned=(part,)))
+    model = bare.join_self_model(replace(found, learned=(part,)))
     contacts = [*grasp_contacts(model, states)]
     assert {contact.link for contact in contacts} >= {"panda_hand"} and "panda_link0" not in {
         each.link for each in contacts

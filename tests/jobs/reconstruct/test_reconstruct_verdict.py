@@ -65,13 +65,13 @@ STEPS = tuple(row(step) for step in range(30))
 def notes(reconstructed: Reconstructed) -> tuple[Reason, ...]:
     verdict = reconstruct_verdict(reconstructed, [])
     assert (verdict.outcome, verdict.exit_code) == (Outcome.PASSED, 0)
-    return verdict.said
+    return verdict.shown
 
 
 def test_a_sound_map_passes_without_a_note() -> None:
     verdict = reconstruct_verdict(made(*STEPS), [])
     assert verdict.sentence == "reconstruct: PASSED (30 time steps of cam0, cam1, 100 splats)"
-    assert (verdict.said, verdict.exit_code) == ((), 0)
+    assert (verdict.shown, verdict.exit_code) == ((), 0)
 
 
 OFF = {
@@ -160,7 +160,7 @@ def test_a_link_within_its_tolerance_or_hardly_seen_is_not_noted() -> None:
 def test_what_the_input_lost_is_noted_and_damage_is_exit_3_below_everything_worse() -> None:
     loss = replace(LossReport(), damaged=1, notes=["chunk 3: its checksum differs"])
     verdict = reconstruct_verdict(made(*STEPS, loss=loss), [])
-    assert [str(said) for said in verdict.said] == ["input: chunk 3: its checksum differs"]
+    assert [str(said) for said in verdict.shown] == ["input: chunk 3: its checksum differs"]
     assert (verdict.exit_code, verdict.as_dict()["exit_code"]) == (3, 3)
     assert reconstruct_verdict(made(*STEPS, loss=loss), ["psnr>=21"]).exit_code == 1
     assert reconstruct_verdict(made(*STEPS, loss=loss, splats=40), []).exit_code == 5

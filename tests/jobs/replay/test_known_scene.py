@@ -89,7 +89,7 @@ def test_an_obstacle_comes_to_a_fixed_link_where_space_was_free_before(
     )
     record = ReplayRecord(model, scene, config=Config(), max_map_age=9.0, is_continuous=False)
     for second in range(4):
-        record.measured(np.array([second * SECOND]), q[None], np.zeros((1, 7)))
+        record.measure_block(np.array([second * SECOND]), q[None], np.zeros((1, 7)))
     first, least = record.fixed_parts.found["link0[0]"]
     assert first > 0.1
     assert least == (pytest.approx(-0.01, abs=0.03) if has_come else first)
@@ -115,7 +115,7 @@ def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_c
         at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={}, seen_at=lambda _: seen
     )
     record = ReplayRecord(model, scene, config=Config(), max_map_age=1.0, is_continuous=is_continuous)
-    record.measured(np.array([0, SECOND // 10]), np.array([q - turn, q + turn]), np.zeros((2, 7)))
+    record.measure_block(np.array([0, SECOND // 10]), np.array([q - turn, q + turn]), np.zeros((2, 7)))
     first, second = record.trace["class_distance"][:, EvidenceClass.DEPTH_EDGE]
     assert first > 0.02
     assert (second == 0.0) if is_continuous else (second > 0.02)
@@ -128,7 +128,7 @@ def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measur
     arm, q = simulated_arm(), np.array([[0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785]])
     link = arm.sphere_set.links[-1]
     ball_at_hand = np.asarray(trimesh.creation.icosphere(radius=0.02).triangles)
-    drawn = arm.with_self_model(held_part(link, ball_at_hand, *ALWAYS))
+    drawn = arm.join_self_model(held_part(link, ball_at_hand, *ALWAYS))
     model = drawn._change(sphere_deficit=np.where(np.array(arm.sphere_set.links) == link, 0.05, 0.0))
     center = model.sphere_centers(q[0])[-1] + [0.0, 0.0, -0.3]
     ball = SphereField(Spheres.of(center[None], np.array([0.01])))
@@ -142,7 +142,7 @@ def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measur
     )
     known = KnownScene(at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={})
     record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
-    record.measured(np.array([0]), q, np.zeros((1, 7)))
+    record.measure_block(np.array([0]), q, np.zeros((1, 7)))
     gap = model.surface_gaps(q, scene.centers, scene.radii)[link][0]
     assert record.trace["clearance_exact"][0] == pytest.approx(gap)
     assert record.trace["clearance_surface"][0] == pytest.approx(gap)
@@ -155,8 +155,8 @@ def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> Non
     hand = arm.sphere_centers(q)[-1]
     place = np.linalg.inv(arm.frame_pose(q, link)) @ [*hand - [0.0, 0.0, 0.1], 1.0]
     ball = trimesh.creation.icosphere(radius=0.02)
-    base = arm.with_self_model(held_part(link, np.asarray(ball.triangles), *ALWAYS))
-    model = base.with_self_model(held_part(link, ball.triangles + place[:3], SECOND // 4, 55 * SECOND // 100))
+    base = arm.join_self_model(held_part(link, np.asarray(ball.triangles), *ALWAYS))
+    model = base.join_self_model(held_part(link, ball.triangles + place[:3], SECOND // 4, 55 * SECOND // 100))
     center = (hand - [0.0, 0.0, 0.3])[None]
     scene = BallDistance(of_points=away, centers=center, radii=np.array([0.01]))
     fields = KnownFields(
@@ -170,7 +170,7 @@ def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> Non
     record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
     assert [*record.blocks(stamps)] == [(0, 3), (3, 6), (6, 8)]
     for first, last in record.blocks(stamps):
-        record.measured(stamps[first:last], np.tile(q, (last - first, 1)), np.zeros((last - first, 7)))
+        record.measure_block(stamps[first:last], np.tile(q, (last - first, 1)), np.zeros((last - first, 7)))
     robots = (base, model.at(SECOND // 2))
     alone, holding = (robot.surface_gaps(q[None], scene.centers, scene.radii)[link][0] for robot in robots)
     assert holding == pytest.approx(0.17, abs=2e-3) and alone > 0.2

@@ -17,8 +17,8 @@ from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.jobs.replay import known_scene
 from splatctrl_cli.jobs.replay import replay as job
-from splatctrl_cli.jobs.replay.known_scene import KnownFields, from_splats
-from splatctrl_cli.jobs.replay.lockstep import check_lockstep, from_log
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, read_splat_scene
+from splatctrl_cli.jobs.replay.lockstep import check_lockstep, reconstruct_scene
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.container.mcap_log import McapLog
@@ -201,7 +201,7 @@ def opened(
         threads=1,
         config=load_config(None, SETTINGS),
     )
-    return from_log(request, arm, folder, console)
+    return reconstruct_scene(request, arm, folder, console)
 
 
 def test_a_map_is_known_only_after_the_latency(desk: Desk, arm: RobotModel) -> None:
@@ -227,7 +227,7 @@ def test_the_fields_of_two_scenes_are_kept_and_no_more(tmp_path: Path, monkeypat
         return fields
 
     monkeypatch.setattr(known_scene, "splat_fields", counted)
-    scene = from_splats(
+    scene = read_splat_scene(
         write_scene(tmp_path / "scene", *((k * SECOND, splats_of(BALL)) for k in range(6))), Config(), 1
     )
     for stamp in range(0, 6 * SECOND, SECOND // 4):

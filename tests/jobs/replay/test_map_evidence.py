@@ -16,7 +16,7 @@ from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.replay import evidence
 from splatctrl_cli.jobs.replay.evidence import apart_from_robot, open_evidence, select_held_out, select_trained
-from splatctrl_cli.jobs.replay.lockstep import from_log
+from splatctrl_cli.jobs.replay.lockstep import reconstruct_scene
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -265,7 +265,7 @@ def test_frame_sets_that_are_evidence_are_not_fed_to_the_fitter(
     asked = request(recording, tmp_path, evidence="3")
     evidence = open_evidence(asked, arm)
     shown = [step.stamp_ns for step in evidence.frame_sets()]
-    scene = from_log(asked, arm, tmp_path, SILENT)
+    scene = reconstruct_scene(asked, arm, tmp_path, SILENT)
     scene.at(2**62)
     stamps = {round((stamp - scene.stamps_ns[0]) / 1e9 * 8) for stamp in scene.stamps_ns}
     assert stamps == {0, 1, 3, 4, 6, 7}

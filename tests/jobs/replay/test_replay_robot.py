@@ -106,7 +106,7 @@ def test_collision_geometry_that_cannot_be_read_is_said_and_refused_as_a_margin(
 def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotModel, plain_arm: Path) -> None:
     spheres = shrunk(arm.sphere_set)
     model = RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", spheres)
-    model = model.with_coverage(coverage_deficit(model.urdf, spheres))
+    model = model.replace_coverage(coverage_deficit(model.urdf, spheres))
     ball, frame = Balls([BALL[0]], [BALL[1]]), model.frame_names[-1]
     goal = model.frame_pose(START, frame)
     goal[:3, 3] = np.array(BALL[0]) - [0.02, 0.02, 0.0]

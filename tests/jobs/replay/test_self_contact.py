@@ -260,7 +260,7 @@ def test_the_closed_loop_arrives_with_every_step_solved(name: str, request: pyte
 
 
 def test_the_margin_as_asked_for_relaxes_every_step_of_an_fr3(fr3: MeasuredRobot) -> None:
-    asked = fr3.model.with_self_allowance(np.zeros(len(fr3.model.self_pairs())))
+    asked = fr3.model.replace_self_allowance(np.zeros(len(fr3.model.self_pairs())))
     trace = driven(asked, FREE, replace(CONFIG, max_time=0.4))
     assert num_on_rung(trace, Rung.RELAXED) == len(trace.steps) == 40
 

@@ -12,7 +12,7 @@ from splatctrl_cli.config import Config, ControlConfig
 from splatctrl_cli.control.events import UNREPRESENTED
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import open_scene
-from splatctrl_cli.jobs.replay.known_scene import from_splats, splat_fields
+from splatctrl_cli.jobs.replay.known_scene import read_splat_scene, splat_fields
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import Balls, OccupancyGrid
@@ -35,7 +35,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("stamp_ns", [0, SECOND])
 def test_both_fields_of_a_replay_know_them_at_every_time(scene: Path, stamp_ns: int) -> None:
-    fields = from_splats(scene, Config(), 1).at(stamp_ns)
+    fields = read_splat_scene(scene, Config(), 1).at(stamp_ns)
     assert fields.distances["exact"](POINTS) == pytest.approx([0.3 - RADIUS, 0.15], abs=1e-6)
     assert fields.barrier.query(POINTS)[0][0] == pytest.approx(0.3 - RADIUS, abs=1e-3)
     assert fields.barrier.query(POINTS)[0][0] <= 0.3 - RADIUS + 1e-6
@@ -47,7 +47,7 @@ def test_both_fields_of_a_replay_know_them_at_every_time(scene: Path, stamp_ns: 
 
 
 def test_a_persons_voxels_count_as_people() -> None:
-    balls = Balls.of_voxels(np.float32([PLACE]), 0.1, np.array([Label.HUMAN], np.uint8))
+    balls = Balls.from_voxels(np.float32([PLACE]), 0.1, np.array([Label.HUMAN], np.uint8))
     config = Config(control=ControlConfig(margin=0.02, human_margin=0.12))
     fields = splat_fields(splats_of(((0.0, 0.0, 0.0), 0.05)), config, 1, balls)
     assert fields.human.query(POINTS)[0][0] == pytest.approx(0.3 - RADIUS, abs=1e-6)
@@ -114,7 +114,7 @@ def occupied_in(visitor: dict[str, Any], grid: OccupancyGrid) -> Float64:
 def test_a_scene_of_an_older_version_has_none(tmp_path: Path, scene: Path) -> None:
     old = write_scene(tmp_path / "old", (0, splats_of(((0.0, 0.0, 0.0), 0.05))))
     (old / "snapshots" / "000000.npz").unlink()
-    distances = from_splats(old, Config(), 1).at(0).distances["exact"](POINTS)
+    distances = read_splat_scene(old, Config(), 1).at(0).distances["exact"](POINTS)
     assert distances[0] > 0.6
 
 

@@ -158,7 +158,7 @@ def test_warnings_are_noted_counted_and_can_be_gated(place: Path, tmp_path: Path
         cv2.imwrite(str(tmp_path / path.name), 255 - cv2.imread(str(path)))  # type: ignore[operator]
     result = scored(place, "mvsnet", masks=tmp_path, require=("num_warnings<=0",))
     assert result.verdict.exit_code == 1
-    assert result.verdict.said[0].sentence.startswith("holdout-0000 has its mask on 100% of the image's border")
+    assert result.verdict.shown[0].sentence.startswith("holdout-0000 has its mask on 100% of the image's border")
     assert "num_warnings is 1, required <= 0" in result.verdict.sentence
     assert scored(place, "mvsnet", require=("num_warnings<=0",)).notes == ()
 

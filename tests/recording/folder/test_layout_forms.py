@@ -3,7 +3,6 @@
 import json
 import math
 import re
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -94,16 +93,15 @@ def described(folder: Path, name: str) -> Path:
 def test_a_layout_is_read_by_the_description_that_its_refusal_names(tmp_path: Path, name: str) -> None:
     make, unit = DESCRIBED[name]
     folder = make(tmp_path / name)
-    expect_refusal(f"write .*{name}.toml.* as `splatctrl help input`.*--root {folder}", open_source, folder)
+    expect_refusal(f"write .*{name}.toml .`splatctrl help {name}` prints it.*--root {folder}", open_source, folder)
     source = open_source(described(tmp_path, name), SourceOptions(root=folder))
     check(frames_of(source), unit)
     assert source.loss.without_pose == (name == "icl_nuim")  # image 0
 
 
-def test_the_page_shows_each_description_as_it_is_in_the_examples() -> None:
+def test_the_page_names_each_example() -> None:
     page = (DOCS / "input.md").read_text()
-    shown = [tomllib.loads(text) for text in re.findall(r"```toml\n(camera = .*?)```", page, re.DOTALL)]
-    assert shown == [tomllib.loads((DOCS / f"examples/{name}.toml").read_text()) for name in DESCRIBED]
+    assert [name for name in DESCRIBED if f"`{name}.toml`" not in page] == []
 
 
 def test_a_point_of_icl_nuim_is_where_its_negative_focal_length_says(tmp_path: Path) -> None:

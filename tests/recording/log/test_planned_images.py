@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.recording.log import ros_log
 from splatctrl_cli.recording.log.ros_log import HeldMessages, RosLogSource, planned_images
-from splatctrl_cli.recording.log.survey import paired
+from splatctrl_cli.recording.log.survey import pair_images
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from tests.recording.container.test_log_formats import assert_same
@@ -73,4 +73,4 @@ def test_pairs_are_those_of_every_pair_tried_in_turn(seed: int) -> None:
         if gap <= tolerance and i not in expected and j not in expected.values():
             expected[i] = j
     pairs = sorted(expected.items(), key=lambda pair: (color[pair[0]], pair[0]))
-    assert [(i, j) for i, j in paired(color, depth, tolerance).tolist()] == pairs
+    assert [(i, j) for i, j in pair_images(color, depth, tolerance).tolist()] == pairs
