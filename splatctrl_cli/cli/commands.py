@@ -149,6 +149,13 @@ _ROBOT_LEARN = (
 
 
 COMMANDS = {
+    "audit": Command(
+        summary="check, reconstruct and replay a recording: one verdict, one page",
+        examples=(f"audit {LOG} {ROBOT}", "audit run.mcap --robot panda -o out/audit"),
+        run="audit:run",
+        judges=True,
+        options=scene_options.AUDIT,
+    ),
     "simulate": Command(
         summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
         examples=("simulate -o out/log", "simulate --urdf fr3.urdf --packages franka_description -o out/fr3"),

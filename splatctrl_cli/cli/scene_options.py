@@ -392,3 +392,22 @@ REPLAY = (  # what people use, and in groups the rest
         option("--steps", "print a row per step as well"),
     ),
 )
+AUDIT = (
+    option("LOG", "a log, a capture, or an image folder's .toml; with joint states", Path),
+    either(
+        option("--urdf FILE", "the robot's URDF (default: the log's own)", Path),
+        option("--robot NAME", "or NAME.urdf of an installed Python package; an unknown name lists them"),
+    ),
+    option("--spheres FILE.yaml", "its spheres (default: the URDF's own, else fitted into the output)", Path),
+    either(
+        option(f"--goal {POSE}", "audit a closed loop to this pose in world as well", pose),
+        option("--goal-joints Q1,Q2,...", "or to this configuration [rad]", numbers),
+    ),
+    option("--frame LINK", "the link that a goal is of (default: the last of the URDF)"),
+    option("-o/--out PATH", "folder of the steps and report.html; steps done there are kept (default: audit)", Path),
+    option("--force", "repeat every step"),
+    option("--resume", "continue an interrupted reconstruction, to the same bytes"),
+    *CONFIG,
+    DEVICE,
+    *SOURCE,
+)
