@@ -235,6 +235,12 @@ COMMANDS = {
         judges=True,
         options=scene_options.SCORE,
     ),
+    "render": Command(
+        summary="render pictures or a video of a scene, from a recorded camera or along a path",
+        examples=("render out/scene -o view.png", "render out/scene --path path.csv --size 1280x720 -o view.mp4"),
+        run="score:run_render",
+        options=scene_options.RENDER,
+    ),
     "replay": Command(
         summary="audit logged joint states, ask the controller at each, or drive the arm in closed loop",
         examples=(

@@ -284,6 +284,33 @@ SCORE = (
 )
 
 
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    return whole(16, 8192, "px")(width), whole(16, 8192, "px")(height)
+
+
+RENDER = (
+    option("SCENE", "a folder that reconstruct wrote", Path),
+    *output("FILE.png, FILE.mp4 (pip install 'splatctrl-cli[video]'), or a folder of pictures", default="render.png"),
+    option("--camera NAME", "from this training camera (default: the first)"),
+    option("--reference LOG", "where the camera moves as in this recording (default: it stays where it began)", Path),
+    option(
+        "--path FILE",
+        "or along this path, .csv or .json: time_s, x, y, z, qx, qy, qz, qw, poses of the optical frame in world",
+        Path,
+    ),
+    option(
+        "--at SECONDS",
+        "one picture, that long after the scene's start (default: all the time; of a .png the end)",
+        real(-MAX_SECONDS, MAX_SECONDS, "s"),
+    ),
+    option("--size WxH", "in pixels (default: the camera's)", _size),
+    option("--fps HZ", "pictures a second", real(0.01, 240, "Hz"), 10.0),
+    option("--depth", "depth in colours from red (near) to blue (the farthest of the first picture)"),
+    THREADS,
+)
+
+
 MODES = ("audit", "open-loop", "closed-loop")
 STEP_LIMIT = 10.0  # [s]
 

@@ -195,7 +195,10 @@ def verdict_of(
 
 def read_verdict(command: str, document: Mapping[str, Any]) -> Verdict:
     """Verdict of what `Verdict.as_dict` returned."""
-    rows = [row | {"outcome": Outcome(row["outcome"])} for row in document["reasons"]]
+    rows = [
+        row | {"outcome": Outcome(row["outcome"]), "place": row["place"] and tuple(row["place"])}
+        for row in document["reasons"]
+    ]
     return Verdict(
         command=command,
         outcome=Outcome(document["outcome"]),

@@ -139,13 +139,14 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
         steps.make("spheres", SPHERES, partial(_fit, urdf, request.out / SPHERES))
     steps.make("check", CHECK, partial(_check, request))
     config, seed = request.config.as_dict(), request.seed
-    decides = {name: config[name] for name in config if name not in OF_REPLAYS}
+    of_map = {name: config[name] for name in config if name not in OF_REPLAYS}
     words = ["reconstruct", *_words(request, SCENE)]
-    steps.make(SCENE, f"{SCENE}/{RUN}", partial(_reconstruct, request, progress), words, config=decides, seed=seed)
+    steps.make(SCENE, f"{SCENE}/{RUN}", partial(_reconstruct, request, progress), words, config=of_map, seed=seed)
+    decides = {"config": config, "seed": seed, "map": open_run(request.out / SCENE).run.get("parts")}
     for name, each in replays.items():
         goal = _goal(each)
         words = ["replay", *_words(request, name), "--scene", str(request.out / SCENE), *goal]
-        steps.make(name, f"{name}/{RUN}", partial(replay, each, progress), words, config=config, seed=seed, goal=goal)
+        steps.make(name, f"{name}/{RUN}", partial(replay, each, progress), words, **decides, goal=goal)
     verdicts = [read_verdict("replay", open_run(each.out).verdict) for each in replays.values()]
     verdict = worst(verdicts) if verdicts else _without_motion(request)
     shown = {name: sha256(request.out / name / RUN) for name in replays or [SCENE]}

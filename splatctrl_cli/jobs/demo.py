@@ -143,7 +143,9 @@ def _draw(data: Path, out: Path, threads: int) -> None:
 
 
 def _comparison(frame: RgbdFrame, scene: SceneFolder, threads: int) -> ComparisonRow:
-    view, depth = render_with_shell(scene.splats(), scene.shell_at(None), frame, scene.background, threads)
+    view, depth = render_with_shell(
+        scene.splats(), scene.shell_at(None), frame.intrinsics, frame.T_world_camera, scene.background, threads
+    )
     figure = psnr(view.color, frame.color / 255.0, depth > 0)
     return ComparisonRow(
         title=f"{frame.camera} ({'scoring only' if frame.camera == SCORED else 'training'})",
