@@ -58,7 +58,8 @@ class Space:
 
     splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) and edge
     of never-seen cubes. surface: where a baked distance is 0. deciding: the event's sentence, time [s] and place,
-    with center and radius of the arm's sphere there [m].
+    with center and radius of the arm's sphere there [m]. cameras: name, place `eye` [m], unit vector `ahead` and
+    vertical angle `fov` [degrees] of each one.
     """
 
     splats: Mapping[float, SplatSet] = field(default_factory=dict)
@@ -66,6 +67,7 @@ class Space:
     surface: Surface | None = None
     motion: Motion | None = None
     deciding: Mapping[str, Any] | None = None
+    cameras: Sequence[Mapping[str, Any]] = ()
 
     def box(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of 90 % of splats, path and surface."""
@@ -157,6 +159,7 @@ def pack(space: Space) -> str:
             _splats(block, time_s, splats, without_robot=space.motion is not None)
             for time_s, splats in space.splats.items()
         ],
+        "cameras": list(space.cameras),
     }
     if space.unknown is not None and len(space.unknown[0]):
         header["unknown"] = {"points": _points(block, space.unknown[0]), "edge": space.unknown[1]}

@@ -41,5 +41,4 @@ document.querySelectorAll("button.open").forEach((button) => {
 document.querySelectorAll("figure").forEach((figure) => {
   figure.onclick = () => figure.classList.toggle("wide");
 });
-const first = document.querySelector(".space[data-open]");
-if (first) openScene(first);
+[...document.querySelectorAll(".space[data-open]")].slice(0, 1).forEach((first) => openScene(first));
