@@ -117,16 +117,10 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
     A log without joint states is not evaluable: its check and map stand alone. Raises UsageError for an unknown
     robot, WriteError for an unwritable page, and what the steps raise.
     """
+    source = open_source(request.log, request.options)
     if request.robot is not None:
         request = replace(request, urdf=installed_urdf(request.robot))
-    source = open_source(request.log, request.options)
-    urdf = logged_urdf([request.log]) if request.urdf is None else read_urdf(request.urdf)
-    refuse_if(
-        source.joint_names and urdf is None,
-        f"audit: {request.log} does not describe the robot",
-        remedy="give it with --urdf FILE or --robot NAME",
-        error=UsageError,
-    )
+    urdf = _read_robot(request, is_needed=bool(source.joint_names))
     digests = {**source.digests(), **_digests(request, urdf)}
     lacks_spheres = urdf is not None and request.spheres is None and not len(own_spheres(urdf).radii)
     request = replace(request, spheres=request.out / SPHERES) if lacks_spheres else request
@@ -163,6 +157,17 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
     )
     made = tuple(steps.stopwatch.seconds)
     return AuditResult(out=request.out, page=request.out / PAGE, verdict=verdict, made=made)
+
+
+def _read_robot(request: AuditRequest, *, is_needed: bool) -> UrdfFile | None:
+    urdf = logged_urdf([request.log]) if request.urdf is None else read_urdf(request.urdf)
+    refuse_if(
+        is_needed and urdf is None,
+        f"audit: {request.log} does not describe the robot",
+        remedy="give it with --urdf FILE or --robot NAME",
+        error=UsageError,
+    )
+    return urdf
 
 
 def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:

@@ -122,7 +122,8 @@ def _camera(request: RenderSceneRequest, scene: SceneFolder) -> tuple[Intrinsics
         poses = [(stamp, T) for stamp, camera, T in open_source(request.reference).poses() if camera == name]
         refuse_if(not poses, f"--reference {request.reference}: has no pose of camera {name}", error=UsageError)
     stamps, transforms = zip(*poses, strict=True)
-    return lens, _Track(times=1e-9 * (np.array(stamps, np.int64) - start_ns), poses=np.array(transforms))
+    times = np.array([1e-9 * (stamp - start_ns) for stamp in stamps])
+    return lens, _Track(times=times, poses=np.array(transforms))
 
 
 def _resize(lens: Intrinsics, width: int, height: int) -> Intrinsics:
