@@ -20,10 +20,12 @@ from splatctrl_cli.files.output import (
     write_json,
     write_run,
 )
+from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.render import render_newest
 from splatctrl_cli.jobs.replay.replay import check_request, replay
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.report.report import write_page_of_runs
@@ -32,14 +34,17 @@ from splatctrl_cli.jobs.running.device import AUTO, RunOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import deciding_versions
 from splatctrl_cli.jobs.runs.run_folder import open_run, read_object
+from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.report.page import Table
+from splatctrl_cli.report.page import Table, compared
 from splatctrl_cli.robot.link_meshes import mesh_path, read_solids
 from splatctrl_cli.robot.sphere_files import own_spheres, spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf, visual_urdf
 
+PAIR = "the last photo on the left, the map's render on the right; drag the photo's lower corner"
+WIDTH = 640  # of these [px]
 STEPS, RUN = "steps.json", "run.json"
 CHECK, SPHERES, PAGE = "check.json", "spheres.yaml", "report.html"
 SCENE, LOGGED, DRIVEN = "scene", "replay", "closed_loop"
@@ -143,8 +148,8 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
         steps.make(name, f"{name}/{RUN}", partial(replay, each, progress), words, **decides, goal=goal)
     verdicts = [read_verdict("replay", open_run(each.out).verdict) for each in replays.values()]
     verdict = worst(verdicts) if verdicts else _without_motion(request)
-    shown = {name: sha256(request.out / name / RUN) for name in replays or [SCENE]}
-    steps.make("report", PAGE, partial(_write_page, request, verdict, [*shown]), shown=shown)
+    shown = {name: sha256(request.out / name / RUN) for name in (*replays, SCENE)}
+    steps.make("report", PAGE, partial(_write_page, request, source, verdict, [*shown]), shown=shown)
     write_run(
         request.out,
         command="audit",
@@ -288,13 +293,15 @@ def _without_motion(request: AuditRequest) -> Verdict:
     return verdict_of("audit", [missing], scope=request.log.name, is_damaged=mapped["is_damaged"])
 
 
-def _write_page(request: AuditRequest, verdict: Verdict, folders: Sequence[str]) -> None:
+def _write_page(request: AuditRequest, source: FrameSource, verdict: Verdict, folders: Sequence[str]) -> None:
     page, checked = request.out / PAGE, read_object(request.out / CHECK)
     rows = [
         (tuple(found[name] for name in FINDING), "failed" if found["severity"] == "error" else "")
         for found in checked["findings"]
     ]
     recording = Table(title=checked["verdict"]["sentence"], header=FINDING, rows=rows, is_folded=True)
+    pairs = render_newest(open_scene(request.out / SCENE), source, request.threads)
+    views = [compared(frame.color, image, f"{frame.camera}: {PAIR}", WIDTH) for frame, image in pairs]
     try:
         write_page_of_runs(
             page,
@@ -302,6 +309,7 @@ def _write_page(request: AuditRequest, verdict: Verdict, folders: Sequence[str])
             verdict=verdict,
             runs={TITLES[name]: open_run(request.out / name) for name in folders},
             tables=[recording],
+            views=views,
         )
     except UsageError as error:  # all else is done
         raise WriteError(error.message, remedy=f"move {page} away, and run the same command") from None

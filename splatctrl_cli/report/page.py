@@ -8,7 +8,7 @@ import base64
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from splatctrl_cli.errors import UsageError, refuse_faults, require
 from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE
 from splatctrl_cli.libraries import trimesh
-from splatctrl_cli.records import Float32, Float64, Label, SplatSet
+from splatctrl_cli.records import Float32, Float64, Label, SplatSet, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 
 SIDES = 24  # of a cylinder or capsule as it is drawn
@@ -253,12 +253,13 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An image as data URL, with size [px] and title."""
+    """An image as data URL, with size [px] and title; over: another one, to be drawn over it up to a border."""
 
     title: str
     data: str
     width: int
     height: int
+    over: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,6 +320,16 @@ def picture(path: Path, title: str, most: int) -> Picture:
         f"{path}: is no image that can be decoded",
         remedy="make the run again",
     )
+    return _picture_of(image, title, most)
+
+
+def compared(photo: UInt8, render: UInt8, title: str, most: int) -> Picture:
+    """A render (H, W, 3), RGB, with the photo over its left half."""
+    shown, over = (_picture_of(image[:, :, ::-1], title, most) for image in (render, photo))
+    return replace(shown, over=over.data)
+
+
+def _picture_of(image: NDArray[Any], title: str, most: int) -> Picture:
     height, width = image.shape[:2]
     if width > most:
         height, width = round(height * most / width), most

@@ -46,7 +46,8 @@ def test_one_call_leads_from_a_log_to_a_verdict_and_its_page(
     page = (out / "report.html").read_text()
     said = sentence.split(" (")[0]
     assert page.index(said) < page.index("check: PASSED (log.mcap") < page.index("<h2>Logged motion</h2>")
-    assert 'id="data-replay"' in page, "the motion in 3-D"
+    assert 'id="data-replay"' in page and 'id="data-scene"' not in page, "the motion in 3-D"
+    assert page.count('<figure class="pair">') == 4, "photo and render of each camera"
     assert json.loads((out / "run.json").read_text())["verdict"] == run["verdict"]
 
 
@@ -94,6 +95,8 @@ def desk(small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     document = {"verdict": checked, "findings": []}
     monkeypatch.setattr(module, "_check", lambda request: write_json(request.out / "check.json", document))
     monkeypatch.setattr(module, "open_to_train", lambda *_: None)
+    monkeypatch.setattr(module, "open_scene", lambda *_: None)
+    monkeypatch.setattr(module, "render_newest", lambda *_: iter(()))
     monkeypatch.setattr(module, "reconstruct", lambda request, _: desk.write(request.out, "reconstruct"))
     monkeypatch.setattr(module, "replay", lambda request, _: desk.write(request.out, "replay"))
     return desk
@@ -123,7 +126,7 @@ def test_another_robot_repeats_every_step(desk: Desk) -> None:
     ("name", "made"),
     [
         ("check.json", ("check",)),
-        ("scene/run.json", ("scene",)),
+        ("scene/run.json", ("scene", "report")),
         ("replay/run.json", ("replay", "report")),
         ("report.html", ("report",)),
     ],

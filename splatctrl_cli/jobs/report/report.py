@@ -107,13 +107,26 @@ def _page_of_run(request: WriteReportRequest, run: RunFolder) -> Page:
 
 
 def write_page_of_runs(
-    file: Path, *, title: str, verdict: Verdict, runs: Mapping[str, RunFolder], tables: Sequence[Table]
+    file: Path,
+    *,
+    title: str,
+    verdict: Verdict,
+    runs: Mapping[str, RunFolder],
+    tables: Sequence[Table],
+    views: Sequence[Picture],
 ) -> None:
-    """Write a page with a verdict, tables, and runs by heading; replace an earlier one."""
+    """Write a page with a verdict, tables, and runs by heading; replace an earlier one.
+
+    views: pictures of a map. A map beside replays is not in 3-D, as they are.
+    """
     scenes, sections = dict[str, str](), list[RunSection]()
     for heading, run in runs.items():
         name = run.path.name
-        section = _add_space(section_of(run, anchor=name, title=heading), run, (), scenes, name)
+        section = section_of(run, anchor=name, title=heading)
+        if run.command == REPLAY or len(runs) == 1:
+            section = _add_space(section, run, (), scenes, name)
+        if run.command != REPLAY:
+            section = replace(section, pictures=views)
         is_said = section.sentence == verdict.sentence
         sections.append(replace(section, sentence="") if is_said else section)
     page = Page(
@@ -123,7 +136,7 @@ def write_page_of_runs(
         tables=tables,
         runs=sections,
         scenes=scenes,
-        opens=len(sections) == 1,
+        opens=len(scenes) == 1,
     )
     _write(FolderRequest(path=file, out=file, force=True), page)
 
