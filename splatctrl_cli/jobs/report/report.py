@@ -117,7 +117,7 @@ def write_page_of_runs(
 ) -> None:
     """Write a page with a verdict, tables, and runs by heading; replace an earlier one.
 
-    views: pictures of a map. A map beside replays is not in 3-D, as they are.
+    views: pictures of a map. In 3-D are replays, or a map alone.
     """
     scenes, sections = dict[str, str](), list[RunSection]()
     for heading, run in runs.items():
