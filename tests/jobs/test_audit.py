@@ -19,6 +19,7 @@ from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 from splatctrl_cli.jobs import audit as module
 from splatctrl_cli.jobs.audit import AuditRequest, AuditResult, audit
 from splatctrl_cli.jobs.robot import logged_robot
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import SphereSet
 from tests.jobs.bake.baked import Said
 from tests.recording.log.make_log import messages_of, write_raw
@@ -58,6 +59,7 @@ class Desk:
     request: AuditRequest
     outcomes: dict[str, Outcome] = field(default_factory=dict)
     num_runs: int = 0  # as a run's time, no two are alike
+    asked: dict[str, Any] = field(default_factory=dict)  # requests by folder
 
     def made(self, **changes: Any) -> tuple[str, ...]:
         return self.audit(**changes).made
@@ -65,7 +67,9 @@ class Desk:
     def audit(self, **changes: Any) -> AuditResult:
         return audit(replace(self.request, **changes))
 
-    def write(self, out: Path, command: str) -> None:
+    def write(self, request: Any, command: str) -> None:
+        out = request.out
+        self.asked[out.name] = request
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         self.num_runs += 1
@@ -97,8 +101,8 @@ def desk(small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(module, "open_to_train", lambda *_: None)
     monkeypatch.setattr(module, "open_scene", lambda *_: None)
     monkeypatch.setattr(module, "render_newest", lambda *_: iter(()))
-    monkeypatch.setattr(module, "reconstruct", lambda request, _: desk.write(request.out, "reconstruct"))
-    monkeypatch.setattr(module, "replay", lambda request, _: desk.write(request.out, "replay"))
+    monkeypatch.setattr(module, "reconstruct", lambda request, _: desk.write(request, "reconstruct"))
+    monkeypatch.setattr(module, "replay", lambda request, _: desk.write(request, "replay"))
     return desk
 
 
@@ -113,6 +117,21 @@ def test_a_second_call_makes_only_what_its_changes_decide(desk: Desk) -> None:
     assert desk.made(goal_joints=(0.4,) * 7) == ("closed_loop", "report")
     assert desk.made(seed=1) == ("scene", "replay", "report")
     assert desk.made(seed=1, force=True) == ALL
+
+
+def test_options_reach_every_step(desk: Desk) -> None:
+    options = SourceOptions(cameras=("cam1",))
+    given = {"options": options, "config": load_config(None, ["control.margin=0.03"]), "seed": 3, "threads": 2}
+    pose = (0.4, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
+    desk.made(**given, device="cpu", resume=True, goal=pose, frame="hand")
+    scene, replay, driven = (desk.asked[name] for name in ("scene", "replay", "closed_loop"))
+    for each in (scene, replay, driven):
+        assert (each.config, each.seed, each.threads, each.device) == (given["config"], 3, 2, "cpu")
+        assert (each.urdf, each.spheres) == (desk.request.urdf, desk.request.spheres)
+    assert scene.resume and replay.options == driven.options == options
+    assert replay.scene == driven.scene == desk.request.out / "scene"
+    assert (replay.mode, replay.goal, replay.frame) == ("audit", None, None)
+    assert (driven.mode, driven.goal, driven.frame, driven.start_time) == ("closed-loop", pose, "hand", "first-map")
 
 
 def test_another_robot_repeats_every_step(desk: Desk) -> None:
