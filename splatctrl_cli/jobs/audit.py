@@ -305,7 +305,7 @@ def _write_page(request: AuditRequest, source: FrameSource, verdict: Verdict, fo
     try:
         write_page_of_runs(
             page,
-            title=f"audit of {request.log.name}",
+            title=f"audit of {'/'.join(request.log.parts[-2:])}",
             verdict=verdict,
             runs={TITLES[name]: open_run(request.out / name) for name in folders},
             tables=[recording],

@@ -46,6 +46,7 @@ def test_one_call_leads_from_a_log_to_a_verdict_and_its_page(
     ], "what makes the same again, and where a page finds scene and robot"
     page = (out / "report.html").read_text()
     said = sentence.split(" (")[0]
+    assert "<h1>audit of small/log.mcap</h1>" in page
     assert page.index(said) < page.index("check: PASSED (log.mcap") < page.index("<h2>Logged motion</h2>")
     assert 'id="data-replay"' in page and 'id="data-scene"' not in page, "the motion in 3-D"
     assert page.count('<figure class="pair">') == 4, "photo and render of each camera"
