@@ -59,8 +59,8 @@ class AuditRequest(RunOptions):
 
     urdf: the robot, or robot: its name, see `installed_urdf`; without both the log's own. spheres: None for the
     URDF's, else fitted to it. goal (x, y, z, qx, qy, qz, qw in world) or goal_joints [rad] adds a closed loop that
-    drives the link `frame`. force: repeat all steps. resume: continue an
-    interrupted reconstruction. words: the options that the steps share, for their ``run.json``.
+    drives the link `frame`. force: repeat all steps. resume: continue an interrupted reconstruction. words: options
+    that the steps share, for their ``run.json``.
     """
 
     log: Path
@@ -176,7 +176,7 @@ def _read_robot(request: AuditRequest, *, is_needed: bool) -> UrdfFile | None:
 
 
 def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
-    """sha256 of the spheres given, the robot's text, and its meshes, of which a step misses what is not found."""
+    """sha256 of the spheres given, of the robot's text and meshes; a step that needs a missing mesh refuses it."""
     found = {} if request.spheres is None else {request.spheres.name: sha256(request.spheres)}
     if urdf is None:
         return found
