@@ -238,7 +238,7 @@ COMMANDS = {
     "render": Command(
         summary="render pictures or a video of a scene, from a recorded camera or along a path",
         examples=("render out/scene -o view.png", "render out/scene --path path.csv --size 1280x720 -o view.mp4"),
-        run="score:run_render",
+        run="report:run_render",
         options=scene_options.RENDER,
     ),
     "replay": Command(

@@ -1,8 +1,7 @@
-"""``splatctrl score`` and ``render``: renders compared with held-out views, pictures and videos."""
+"""``splatctrl score``: renders compared with held-out views."""
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
@@ -10,7 +9,6 @@ from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.score_report import PREFIX
 from splatctrl_cli.evaluate.verdict import counted
-from splatctrl_cli.jobs.render import RenderSceneRequest, render_scene
 from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.jobs.score.views import CloudSettings
 from splatctrl_cli.records import MILLIMETRE
@@ -44,12 +42,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
     recording = recording_of(args, first, tuple(beside))
     result = score(request_of(ScoreRequest, args, recording=recording, cloud=_cloud(args)), console)
     return console.concluded(result.verdict, result.report, lines_of(result.report))
-
-
-def run_render(args: argparse.Namespace, console: Console) -> int:
-    result = render_scene(request_of(RenderSceneRequest, args))
-    num = counted(result.num_pictures, "picture")
-    return console.result(asdict(result), [f"{result.out}: {num} of {result.width}x{result.height}"])
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:

@@ -122,7 +122,7 @@ def test_a_video_has_a_picture_for_each_time(scene: Path, capsys: pytest.Capture
     av = pytest.importorskip("av")
     out = scene.parent / "out.mp4"
     assert main(["render", str(scene), "--depth", "--fps", "4", "--size", "96x72", "-o", str(out)]) == 0
-    assert capsys.readouterr().out == f"{out}: 5 pictures of 96x72\n"
+    assert capsys.readouterr().out == f"{out}: 96x72, pictures: 5\n"
     with av.open(str(out)) as container:
         (stream,) = container.streams.video
         assert (stream.frames, stream.width, stream.height, stream.average_rate) == (5, 96, 72, 4)
