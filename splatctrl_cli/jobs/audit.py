@@ -147,7 +147,7 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
         words = ["replay", *_words(request, name), "--scene", str(request.out / SCENE), *goal]
         steps.make(name, f"{name}/{RUN}", partial(replay, each, progress), words, **decides, goal=goal)
     verdicts = [read_verdict("replay", open_run(each.out).verdict) for each in replays.values()]
-    verdict = worst(verdicts) if verdicts else _without_motion(request)
+    verdict = worst(verdicts) if verdicts else _judge_map(request)
     shown = {name: sha256(request.out / name / RUN) for name in (*replays, SCENE)}
     steps.make("report", PAGE, partial(_write_page, request, source, verdict, [*shown]), shown=shown)
     write_run(
@@ -282,7 +282,7 @@ def _reconstruct(request: AuditRequest, progress: Progress) -> None:
     )
 
 
-def _without_motion(request: AuditRequest) -> Verdict:
+def _judge_map(request: AuditRequest) -> Verdict:
     checked, mapped = read_object(request.out / CHECK)["verdict"], open_run(request.out / SCENE).verdict
     missing = lacking(
         criterion="joint states",

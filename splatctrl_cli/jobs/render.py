@@ -200,7 +200,7 @@ def _quantise(color: Float32) -> UInt8:
 
 
 def render_newest(scene: SceneFolder, source: FrameSource, threads: int = 0) -> Iterator[tuple[RgbdFrame, UInt8]]:
-    """Last frame of each training camera, and the picture (H, W, 3), RGB, of the scene as known then."""
+    """Yield each training camera's last frame, and the scene as known then (H, W, 3), RGB."""
     stored = (item for item in source.stored() if isinstance(item, StoredFrame))
     newest = {item.camera: item for item in stored if item.camera in scene.cameras}
     off, has_times = scene.run.get("metrics", {}).get("displaced_cameras") or {}, bool(_stamps(scene))
