@@ -7,6 +7,7 @@ from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.control.user_controller import ClearanceRow, Controller, ControllerInput, ControllerStart
 from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError, WriteError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
+from splatctrl_cli.jobs.audit import AuditRequest, AuditResult, audit
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
 from splatctrl_cli.jobs.compare.compare import CompareRequest, CompareResult, compare
@@ -22,6 +23,7 @@ from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.render import RenderSceneRequest, RenderSceneResult, render_scene
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.report.report import (
@@ -38,6 +40,8 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Box, Label
 
 __all__ = [
+    "AuditRequest",
+    "AuditResult",
     "BakeRequest",
     "BakeResult",
     "Box",
@@ -63,6 +67,8 @@ __all__ = [
     "ReconstructRequest",
     "ReconstructResult",
     "RecordingRequest",
+    "RenderSceneRequest",
+    "RenderSceneResult",
     "ReplayRequest",
     "ReplayResult",
     "ScoreRequest",
@@ -76,6 +82,7 @@ __all__ = [
     "WriteError",
     "WriteReportRequest",
     "WriteReportResult",
+    "audit",
     "bake",
     "compare",
     "export",
@@ -84,6 +91,7 @@ __all__ = [
     "open_to_train",
     "query",
     "reconstruct",
+    "render_scene",
     "replay",
     "score",
     "view",

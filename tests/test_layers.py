@@ -30,8 +30,8 @@ INSIDE = {  # of a room, its folders and the modules beside them, likewise
         ["score", "replay"],
         ["compare"],
         ["report"],
-        ["export"],
-        ["demo"],
+        ["export", "render"],
+        ["audit", "demo"],
     ],
     "formats": [["unpacking", "mesh"], ["arrays", "image_file", "ply"], ["splat", "grid"], ["scene"]],
     "recording": [

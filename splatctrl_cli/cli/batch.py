@@ -79,8 +79,8 @@ class OfThisProgram:
         parser, places, words = _parser_of(command), list[str](), [command]
         given = {"threads": self.threads, **options}
         known = [name for name in given if name not in OWN or f"--{name}" in parser._option_string_actions]
-        for name, action in {name: _action(parser, command, name) for name in known}.items():
-            made = _words_of(name, action, given[name], folder)
+        for name, action in {name: find_action(parser, command, name) for name in known}.items():
+            made = words_of(name, action, given[name], folder)
             places += made if not action.option_strings else []
             words += made if action.option_strings else []
         words += ["--json", *(["--", *places] if places else [])]
@@ -125,7 +125,7 @@ def _parser_of(command: str) -> Parser:
     return actions.choices[command]
 
 
-def _action(parser: Parser, command: str, name: str) -> argparse.Action:
+def find_action(parser: Parser, command: str, name: str) -> argparse.Action:
     by_name = {option.removeprefix("--"): action for option, action in parser._option_string_actions.items()} | {
         action.dest: action for action in parser._actions if not action.option_strings
     }
@@ -137,7 +137,7 @@ def _action(parser: Parser, command: str, name: str) -> argparse.Action:
     return by_name[name]
 
 
-def _words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> list[str]:
+def words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> list[str]:
     name = max(action.option_strings, key=len, default="")
     if action.nargs == 0:
         refuse_if(not isinstance(value, bool), f"{where}: expected true or false, got {value!r}", error=UsageError)

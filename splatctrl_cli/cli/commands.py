@@ -149,6 +149,13 @@ _ROBOT_LEARN = (
 
 
 COMMANDS = {
+    "audit": Command(
+        summary="check, reconstruct and replay a recording: one verdict, one page",
+        examples=(f"audit {LOG} {ROBOT}", "audit run.mcap --robot panda -o out/audit"),
+        run="audit:run",
+        judges=True,
+        options=scene_options.AUDIT,
+    ),
     "simulate": Command(
         summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
         examples=("simulate -o out/log", "simulate --urdf fr3.urdf --packages franka_description -o out/fr3"),
@@ -227,6 +234,12 @@ COMMANDS = {
         run="score:run",
         judges=True,
         options=scene_options.SCORE,
+    ),
+    "render": Command(
+        summary="render pictures or a video of a scene, from a recorded camera or along a path",
+        examples=("render out/scene -o view.png", "render out/scene --path path.csv --size 1280x720 -o view.mp4"),
+        run="report:run_render",
+        options=scene_options.RENDER,
     ),
     "replay": Command(
         summary="audit logged joint states, ask the controller at each, or drive the arm in closed loop",

@@ -1,4 +1,4 @@
-"""``splatctrl report`` and ``view``: HTML pages."""
+"""``splatctrl report``, ``view`` and ``render``: HTML pages, pictures and videos."""
 
 import argparse
 import os
@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, remarks, request_of
+from splatctrl_cli.jobs.render import RenderSceneRequest, render_scene
 from splatctrl_cli.jobs.report.report import ViewRequest, WriteReportRequest, view, write_report
 
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # one of which is set on Linux where a browser can open a window
@@ -33,6 +34,12 @@ def run_view(args: argparse.Namespace, console: Console) -> int:
     if not is_opened and not args.no_open:
         console.log(f"no browser here: open {result.file.absolute()}")
     return 0
+
+
+def run_render(args: argparse.Namespace, console: Console) -> int:
+    result = render_scene(request_of(RenderSceneRequest, args))
+    size = f"{result.width}x{result.height}"
+    return console.result(asdict(result), [f"{result.out}: {size}, pictures: {result.num_pictures}"])
 
 
 def open_page(page: Path) -> bool:

@@ -284,6 +284,33 @@ SCORE = (
 )
 
 
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    return whole(16, 8192, "px")(width), whole(16, 8192, "px")(height)
+
+
+RENDER = (
+    option("SCENE", "a folder that reconstruct wrote", Path),
+    *output("FILE.png, FILE.mp4 (pip install 'splatctrl-cli[video]'), or a folder of pictures", default="render.png"),
+    option("--camera NAME", "from this training camera (default: the first)"),
+    option("--reference LOG", "where the camera moves as in this recording (default: it stays where it began)", Path),
+    option(
+        "--path FILE",
+        "or along this path, .csv or .json: time_s, x, y, z, qx, qy, qz, qw, poses of the optical frame in world",
+        Path,
+    ),
+    option(
+        "--at SECONDS",
+        "one picture, that long after the scene's start (default: all the time; of a .png the end)",
+        real(-MAX_SECONDS, MAX_SECONDS, "s"),
+    ),
+    option("--size WxH", "in pixels (default: the camera's)", _size),
+    option("--fps HZ", "pictures a second", real(0.01, 240, "Hz"), 10.0),
+    option("--depth", "depth in colours from red (near) to blue (the farthest of the first picture)"),
+    THREADS,
+)
+
+
 MODES = ("audit", "open-loop", "closed-loop")
 STEP_LIMIT = 10.0  # [s]
 
@@ -391,4 +418,23 @@ REPLAY = (  # what people use, and in groups the rest
         option("--report-only", "exit 0 whatever the verdict; a --require still counts"),
         option("--steps", "print a row per step as well"),
     ),
+)
+AUDIT = (
+    option("LOG", "a log, a capture, or an image folder's .toml; with joint states", Path),
+    either(
+        option("--urdf FILE", "the robot's URDF (default: the log's own)", Path),
+        option("--robot NAME", "or NAME.urdf of an installed Python package; an unknown name lists them"),
+    ),
+    option("--spheres FILE.yaml", "its spheres (default: the URDF's own, else fitted into the output)", Path),
+    either(
+        option(f"--goal {POSE}", "audit a closed loop to this pose in world as well", pose),
+        option("--goal-joints Q1,Q2,...", "or to this configuration [rad]", numbers),
+    ),
+    option("--frame LINK", "the link that a goal is of (default: the last of the URDF)"),
+    option("-o/--out PATH", "folder of the steps and report.html; steps done there are kept (default: audit)", Path),
+    option("--force", "repeat every step"),
+    option("--resume", "continue an interrupted reconstruction, to the same bytes"),
+    *CONFIG,
+    DEVICE,
+    *SOURCE,
 )

@@ -193,6 +193,30 @@ def verdict_of(
     )
 
 
+def read_verdict(command: str, document: Mapping[str, Any]) -> Verdict:
+    """Verdict of what `Verdict.as_dict` returned."""
+    rows = [
+        row | {"outcome": Outcome(row["outcome"]), "place": row["place"] and tuple(row["place"])}
+        for row in document["reasons"]
+    ]
+    return Verdict(
+        command=command,
+        outcome=Outcome(document["outcome"]),
+        label=document["label"],
+        scope=document["scope"],
+        reasons=tuple(Reason(**row) for row in rows),
+        how=document["how"],
+        notes=tuple(document["notes"]),
+        is_damaged=document["is_damaged"],
+        counts=document["counts"],
+    )
+
+
+def worst(verdicts: Iterable[Verdict]) -> Verdict:
+    """The first failed verdict, else the first not evaluable one, else the first."""
+    return min(verdicts, key=lambda verdict: _WORST_FIRST.index(verdict.outcome))
+
+
 def damage_mark(sentence: str | None, exit_code: int | None) -> str:
     """The word ", damaged" for a run of a damaged recording, else nothing."""
     return ", damaged" if exit_code == DAMAGED or DAMAGE in (sentence or "") else ""

@@ -367,6 +367,17 @@ def write_run(
     write_json(folder / "run.json", run)
 
 
+@contextmanager
+def recorded_as(words: Sequence[str]) -> Iterator[None]:
+    """Let `write_run` record `words` as the command line in the block."""
+    arguments = sys.argv
+    sys.argv = [arguments[0], *words]
+    try:
+        yield
+    finally:
+        sys.argv = arguments
+
+
 def write_table(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, fieldnames=names, lineterminator="\n")

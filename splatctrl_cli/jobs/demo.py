@@ -1,9 +1,7 @@
 """The main jobs on the sample recording, with pictures."""
 
 import shlex
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +10,7 @@ import numpy as np
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.evaluate.views import psnr
-from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
+from splatctrl_cli.files.output import Stopwatch, output_path, recorded_as, sha256, write_run
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
@@ -93,7 +91,7 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
                 words = [word.format(data=data, out=folder, threads=request.threads) for word in text.split()]
                 shown = [word.replace(str(folder), str(out)) for word in words]
                 progress.log(f"\n$ splatctrl {shlex.join(shown)}")
-                with _record_label(shown):
+                with recorded_as(shown):
                     label = perform(words, folder)
                 mode = " --mode closed-loop" if "closed-loop" in words else ""
                 reasons.append(
@@ -118,16 +116,6 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
             verdict=verdict.as_dict(),
         )
     return verdict
-
-
-@contextmanager
-def _record_label(words: Sequence[str]) -> Iterator[None]:
-    arguments = sys.argv
-    sys.argv = [arguments[0], *words]
-    try:
-        yield
-    finally:
-        sys.argv = arguments
 
 
 def _draw(data: Path, out: Path, threads: int) -> None:
@@ -155,7 +143,9 @@ def _draw(data: Path, out: Path, threads: int) -> None:
 
 
 def _comparison(frame: RgbdFrame, scene: SceneFolder, threads: int) -> ComparisonRow:
-    view, depth = render_with_shell(scene.splats(), scene.shell_at(None), frame, scene.background, threads)
+    view, depth = render_with_shell(
+        scene.splats(), scene.shell_at(None), frame.intrinsics, frame.T_world_camera, scene.background, threads
+    )
     figure = psnr(view.color, frame.color / 255.0, depth > 0)
     return ComparisonRow(
         title=f"{frame.camera} ({'scoring only' if frame.camera == SCORED else 'training'})",

@@ -8,7 +8,7 @@ import base64
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from splatctrl_cli.errors import UsageError, refuse_faults, require
 from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE
 from splatctrl_cli.libraries import trimesh
-from splatctrl_cli.records import Float32, Float64, Label, SplatSet
+from splatctrl_cli.records import Float32, Float64, Label, SplatSet, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 
 SIDES = 24  # of a cylinder or capsule as it is drawn
@@ -58,7 +58,8 @@ class Space:
 
     splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) and edge
     of never-seen cubes. surface: where a baked distance is 0. deciding: the event's sentence, time [s] and place,
-    with center and radius of the arm's sphere there [m].
+    with center and radius of the arm's sphere there [m]. cameras: name, place `eye` [m], unit vector `ahead` and
+    vertical angle `fov` [degrees] of each one.
     """
 
     splats: Mapping[float, SplatSet] = field(default_factory=dict)
@@ -66,6 +67,7 @@ class Space:
     surface: Surface | None = None
     motion: Motion | None = None
     deciding: Mapping[str, Any] | None = None
+    cameras: Sequence[Mapping[str, Any]] = ()
 
     def box(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of 90 % of splats, path and surface."""
@@ -157,6 +159,7 @@ def pack(space: Space) -> str:
             _splats(block, time_s, splats, without_robot=space.motion is not None)
             for time_s, splats in space.splats.items()
         ],
+        "cameras": list(space.cameras),
     }
     if space.unknown is not None and len(space.unknown[0]):
         header["unknown"] = {"points": _points(block, space.unknown[0]), "edge": space.unknown[1]}
@@ -250,12 +253,13 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An image as data URL, with size [px] and title."""
+    """An image as data URL, with size [px] and title; over: another one, to be drawn over it up to a border."""
 
     title: str
     data: str
     width: int
     height: int
+    over: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,6 +320,16 @@ def picture(path: Path, title: str, most: int) -> Picture:
         f"{path}: is no image that can be decoded",
         remedy="make the run again",
     )
+    return _picture_of(image, title, most)
+
+
+def compared(photo: UInt8, render: UInt8, title: str, most: int) -> Picture:
+    """A render (H, W, 3), RGB, with the photo over its left half."""
+    shown, over = (_picture_of(image[:, :, ::-1], title, most) for image in (render, photo))
+    return replace(shown, over=over.data)
+
+
+def _picture_of(image: NDArray[Any], title: str, most: int) -> Picture:
     height, width = image.shape[:2]
     if width > most:
         height, width = round(height * most / width), most

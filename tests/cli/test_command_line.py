@@ -25,7 +25,7 @@ from tests.conftest import ROOT
 from tests.recording.log.make_log import LogRecipe, make_log
 
 NO_OUTPUT = (  # or one where it goes on
-    *("info", "check", "batch", "sweep", "compare", "config", "completion", "help"),
+    *("audit", "info", "check", "batch", "sweep", "compare", "config", "completion", "help"),
 )
 WRITERS = [command for command in COMMANDS if command not in NO_OUTPUT]
 HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "trimesh", "mcap", "clarabel")
@@ -65,6 +65,7 @@ class Work:
             "score": [scene, "--reference", self.log, "--cameras", "cam1", "--threads", "1"],
             "robot": ["spheres", "--urdf", urdf],
             "replay": [self.log, "--scene", scene, "--urdf", urdf, "--max-unknown", "1"],
+            "render": [scene],
             "report": [scene],
             "view": [scene, "--no-open"],
             "demo": [],
@@ -193,7 +194,10 @@ def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, comma
 
 @pytest.mark.parametrize(
     "command",
-    ["ingest", "info", "check", "calibrate", "reconstruct", "export", "sdf-bake", "query", "score", "replay", "demo"],
+    [
+        *("audit", "ingest", "info", "check", "calibrate", "reconstruct", "export", "sdf-bake", "query", "score"),
+        *("render", "replay", "demo"),
+    ],
 )
 def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command: str) -> None:
     absent = tmp_path / "absent"

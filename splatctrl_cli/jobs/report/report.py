@@ -2,11 +2,12 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatctrl_cli.errors import DAMAGE, InputError, SplatCtrlError
+from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.jobs.batch.graph import columns_of
 from splatctrl_cli.jobs.batch.ledger import Run
@@ -103,6 +104,41 @@ def _page_of_run(request: WriteReportRequest, run: RunFolder) -> Page:
         scenes=scenes,
         opens=True,
     )
+
+
+def write_page_of_runs(
+    file: Path,
+    *,
+    title: str,
+    verdict: Verdict,
+    runs: Mapping[str, RunFolder],
+    tables: Sequence[Table],
+    views: Sequence[Picture],
+) -> None:
+    """Write a page with a verdict, tables, and runs by heading; replace an earlier one.
+
+    views: pictures of a map. In 3-D are replays, or a map alone.
+    """
+    scenes, sections = dict[str, str](), list[RunSection]()
+    for heading, run in runs.items():
+        name = run.path.name
+        section = section_of(run, anchor=name, title=heading)
+        if run.command == REPLAY or len(runs) == 1:
+            section = _add_space(section, run, (), scenes, name)
+        if run.command != REPLAY:
+            section = replace(section, pictures=views)
+        is_said = section.sentence == verdict.sentence
+        sections.append(replace(section, sentence="") if is_said else section)
+    page = Page(
+        title=title,
+        state=str(verdict.outcome),
+        sentence=verdict.sentence,
+        tables=tables,
+        runs=sections,
+        scenes=scenes,
+        opens=len(scenes) == 1,
+    )
+    _write(FolderRequest(path=file, out=file, force=True), page)
 
 
 def _add_space(

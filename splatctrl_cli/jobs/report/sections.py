@@ -19,6 +19,7 @@ WIDTH = 900  # pixels of a picture at most
 PICTURES = {  # captions by start of file name
     "worst_": "a moment of least clearance: photo, and the arm's spheres as the replay had them",
     "clearance": "clearance over time",
+    "evidence": "what the cameras knew of the space within the margin of the arm",
     "commands": "what the controller commanded",
     "open_loop": "commanded less logged velocity",
     "divergence": "distance of the driven arm from the log",

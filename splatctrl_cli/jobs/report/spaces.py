@@ -57,7 +57,7 @@ def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 def space_of_scene(scene: SceneFolder) -> Space:
     if scene.is_anisotropic:
         return Space(splats={0.0: nearest_splats(scene.gaussians())})
-    return _add_unknown(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
+    return _add_seen(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
 
 
 def space_of_grid(path: Path) -> Space:
@@ -149,7 +149,7 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
     chosen = spread(times, when)
     sets = {times[i] if n else 0.0: used[i].splats() for n, i in enumerate(chosen)}
     at = max((i for i in chosen if times[i] <= when), default=None)
-    return _add_unknown(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
+    return _add_seen(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
 
 
 def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
@@ -188,12 +188,20 @@ def spread(times: list[float], when: float) -> list[int]:
     return sorted({*even, at})
 
 
-def _add_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
+def _add_seen(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
+    """Add the cameras where they began, and the space that they never saw."""
+    space = replace(space, cameras=[_camera(row) for row in scene.made_from.get("first_frames", [])])
     if grid is None:
         return space
     used: Mapping[str, Any] = scene.run.get("config", {}).get("occupancy", {})
     states = grid.states(float(used.get("free_below", 0.3)), float(used.get("occupied_above", 0.7)))
     return replace(space, unknown=coarsen(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN))
+
+
+def _camera(first_frame: Mapping[str, Any]) -> dict[str, Any]:
+    T, (_, fy, *_, height) = np.reshape(first_frame["T_world_camera"], (4, 4)), first_frame["intrinsics"]
+    fov = float(np.degrees(2 * np.arctan(height / (2 * fy))))
+    return {"name": first_frame["camera"], "eye": T[:3, 3].tolist(), "ahead": T[:3, 2].tolist(), "fov": fov}
 
 
 def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:

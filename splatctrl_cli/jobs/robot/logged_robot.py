@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import distributions
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.formats.arrays import DAMAGE, read_arrays
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.geometry import transform_from
@@ -57,6 +58,23 @@ def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
         remedy="give one of them with --urdf",
     )
     return _urdf(*found[0]) if found else None
+
+
+def installed_urdf(name: str) -> Path:
+    """File NAME.urdf of an installed Python package; downloads nothing.
+
+    Raises UsageError if there is none, or several.
+    """
+    files = [file for package in distributions() for file in package.files or () if file.suffix == ".urdf"]
+    found = sorted({Path(str(file.locate())).resolve() for file in files if file.stem == name})
+    if len(found) == 1:
+        return found[0]
+    known = ", ".join(sorted({file.stem for file in files}))
+    remedy = f"give one of: {known}" if known else "pip install example-robot-data, or give --urdf FILE"
+    raise UsageError(
+        f"--robot {name}: expected one installed URDF of that name, got {len(found) or 'none'}",
+        remedy=f"give one with --urdf: {', '.join(map(str, found))}" if found else remedy,
+    )
 
 
 def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:

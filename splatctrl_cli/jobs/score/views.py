@@ -147,7 +147,9 @@ class Scorer:
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
     ) -> tuple[dict[str, float], ComparisonRow]:
         protocol = self.reference.protocol
-        rendering, depth = render_with_shell(splats, shell, frame, self.scene.background, self.threads)
+        rendering, depth = render_with_shell(
+            splats, shell, frame.intrinsics, frame.T_world_camera, self.scene.background, self.threads
+        )
         mask = None if self.reference.mask is None else self.reference.mask(frame)
         figures = score_view(
             color=rendering.color,
@@ -178,12 +180,13 @@ def _caption(figures: Mapping[str, float]) -> str:
 def render_with_shell(
     splats: SplatSet | GaussianSet,
     shell: SplatSet | None,
-    frame: RgbdFrame,
+    intrinsics: Intrinsics,
+    T_world_camera: Float64,
     background: Color,
     threads: int,
 ) -> tuple[Rendering, Float32]:
     """Render splats before a background; their depth (H, W) [m] is without the shell."""
-    camera = frame.intrinsics, frame.T_world_camera
+    camera = intrinsics, T_world_camera
     rendering = render_splats(splats, *camera, threads)
     depth = rendering.normalised_depth()
     if isinstance(splats, SplatSet) and shell is not None:

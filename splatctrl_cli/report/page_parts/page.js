@@ -38,8 +38,7 @@ document.querySelectorAll(".timeline").forEach(watchTimeline);
 document.querySelectorAll("button.open").forEach((button) => {
   button.onclick = () => openScene(button.parentElement.querySelector(".space"));
 });
-document.querySelectorAll("figure").forEach((figure) => {
+document.querySelectorAll("figure:not(.pair)").forEach((figure) => {
   figure.onclick = () => figure.classList.toggle("wide");
 });
-const first = document.querySelector(".space[data-open]");
-if (first) openScene(first);
+[...document.querySelectorAll(".space[data-open]")].slice(0, 1).forEach((first) => openScene(first));

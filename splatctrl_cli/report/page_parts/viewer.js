@@ -202,11 +202,14 @@ class Viewer {
     const bar = add("div", this.host, {className: "bar"});
     if (this.numStates) {
       this.play = add("button", bar, {type: "button", textContent: "play", onclick: () => this.togglePlay()});
-      const range = {type: "range", min: 0, max: this.numStates - 1, step: 1, oninput: () => this.show(+this.slider.value)};
-      this.slider = add("input", bar, range);
-      this.slider.setAttribute("aria-label", "time");
+      const range = {type: "range", min: 0, max: this.numStates - 1, step: 1, ariaLabel: "time"};
+      this.slider = add("input", bar, {...range, oninput: () => this.show(+this.slider.value)});
       this.words = add("output", bar);
     }
+    const cameras = this.header.cameras, menu = add("select", bar, {ariaLabel: "camera"});
+    menu.onchange = () => this.lookFrom(cameras[menu.value]);
+    add("option", menu, {textContent: "view from", disabled: true, selected: true});
+    cameras.forEach(({name}, k) => add("option", menu, {value: k, textContent: name}));
     const ticks = add("div", this.host, {className: "ticks"});
     for (const [name, group] of Object.entries(this.parts)) {
       const label = add("label", ticks);
@@ -223,17 +226,12 @@ class Viewer {
     this.camera = new THREE.PerspectiveCamera(45, 1, 0.01, 100);
     this.camera.up.set(0, 0, 1);
     this.target = new THREE.Vector3(...(this.header.deciding?.place ?? this.header.middle));
-    this.turn = -0.8;
-    this.tilt = 0.55;
+    [this.turn, this.tilt] = [-0.8, 0.55];
     this.far = (this.header.deciding ? 0.5 : 1.1) * this.header.size;
-    let last = null;
-    this.canvas.onpointerdown = (event) => { last = event; this.canvas.setPointerCapture(event.pointerId); };
-    this.canvas.onpointerup = () => { last = null; };
-    this.canvas.onpointermove = (event) => {
-      if (!last) return;
-      const x = event.clientX - last.clientX, y = event.clientY - last.clientY;
-      last = event;
-      if (event.shiftKey || event.buttons & 6) this.pan(x, y);
+    this.canvas.onpointerdown = (event) => this.canvas.setPointerCapture(event.pointerId);
+    this.canvas.onpointermove = ({movementX: x, movementY: y, shiftKey, buttons}) => {
+      if (!buttons) return;
+      if (shiftKey || buttons & 6) this.pan(x, y);
       else {
         this.turn -= 0.007 * x;
         this.tilt = Math.min(Math.max(this.tilt + 0.007 * y, -1.5), 1.5);
@@ -246,6 +244,13 @@ class Viewer {
       this.far = Math.min(Math.max(this.far * Math.exp(0.001 * event.deltaY), 0.05), 50);
       this.draw();
     }, {passive: false});
+    this.header.cameras.slice(0, this.header.deciding ? 0 : 1).forEach((first) => this.lookFrom(first));
+    this.resize();
+  }
+
+  lookFrom({eye, ahead: [x, y, z], fov}) {  // upright, whatever the recorded camera's roll
+    [this.turn, this.tilt, this.far, this.camera.fov] = [Math.atan2(-y, -x), Math.asin(-z), this.header.size, fov];
+    this.target.set(x, y, z).multiplyScalar(this.far).add(new THREE.Vector3(...eye));
     this.resize();
   }
 
@@ -264,10 +269,8 @@ class Viewer {
   }
 
   nearest(time) {
-    if (!this.seconds) return 0;
-    let best = 0;
-    this.seconds.forEach((second, k) => { if (Math.abs(second - time) < Math.abs(this.seconds[best] - time)) best = k; });
-    return best;
+    const off = (this.seconds ?? []).map((second) => Math.abs(second - time));
+    return Math.max(off.indexOf(Math.min(...off)), 0);
   }
 
   show(state) {
@@ -281,8 +284,7 @@ class Viewer {
       this.words.textContent = `${this.seconds[state].toFixed(2)} s, ${distance} mm`;
       this.slider.value = state;
     }
-    const time = this.seconds ? this.seconds[state] : 0;
-    const known = Math.max(0, this.sets.filter((set) => set.time <= time).length - 1);
+    const known = Math.max(0, this.sets.filter((set) => set.time <= (this.seconds?.[state] ?? 0)).length - 1);
     this.sets.forEach((set, k) => set.nodes.forEach((node) => { node.visible = k === known; }));
     this.draw();
   }
@@ -351,8 +353,7 @@ async function openScene(host) {
     const data = JSON.parse(document.getElementById(host.dataset.scene).textContent);
     const buffer = await inflated(data.bytes);
     host.replaceChildren();
-    opened = new Viewer(host, data, buffer);
-    host.viewer = opened;
+    host.viewer = opened = new Viewer(host, data, buffer);
   } catch (error) {
     host.textContent = `This browser cannot show it in 3-D: ${error.message}`;
   }

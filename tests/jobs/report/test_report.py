@@ -16,13 +16,13 @@ from splatctrl_cli.cli import report as command
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import part_digests
-from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.geometry import look_at, transform_from
 from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
 from splatctrl_cli.jobs.report.report import MOST_SCENES, ViewRequest, WriteReportRequest, view, write_report
 from splatctrl_cli.jobs.report.spaces import space_of
 from splatctrl_cli.jobs.runs.run_folder import open_run
 from splatctrl_cli.robot.model import RobotModel
-from tests.jobs.stage import Runs, passing, patch_json
+from tests.jobs.stage import Runs, Stage, passing, patch_json
 from tests.refused import expect_refusal
 from tests.report.browser import found_on
 
@@ -60,6 +60,34 @@ def test_the_scene_of_a_replay_is_the_one_known_at_each_time(run: Runs, arm: Rob
     deciding = space.deciding
     gap = np.linalg.norm(np.subtract(deciding["center"], deciding["place"])) - deciding["radius"]
     assert gap == pytest.approx(0.012, abs=1e-4)
+
+
+def test_a_scene_opens_at_its_first_camera_and_has_a_menu_of_all(stage: Stage, tmp_path: Path) -> None:
+    eyes = {"front": [0.0, 0.0, 0.5], "side": [-1.0, 1.0, 1.5]}
+    frames = [
+        {
+            "camera": name,
+            "intrinsics": [40.0, 24.0, 31.5, 23.5, 64.0, 48.0],
+            "T_world_camera": look_at(eye, [-1.0, 0.0, 1.3]).ravel().tolist(),
+        }
+        for name, eye in eyes.items()
+    ]
+    metrics = {"cameras": [*eyes], "has_clock": True, "stamp_ns": 0, "first_frames": frames}
+    scene = replace(stage, run={"command": "reconstruct", "arguments": [], "metrics": metrics}).scene()
+    side = space_of(scene).cameras[1]
+    assert (side["name"], side["eye"], side["fov"]) == ("side", eyes["side"], pytest.approx(90.0))
+    np.testing.assert_allclose(side["ahead"], np.array([0.0, -1.0, -0.2]) / np.hypot(1.0, 0.2))
+    page = view(ViewRequest(path=scene, out=tmp_path / "page.html")).file
+    script = f"""{OPENED} const place = () => {{ viewer.paint(); return viewer.camera.position.toArray(); }};
+      const menu = document.querySelector("select"); found.names = [...menu.options].map((one) => one.textContent);
+      found.front = place(); menu.value = 1; menu.onchange(); found.side = place(); found.fov = viewer.camera.fov;
+      found.ahead = viewer.target.clone().sub(viewer.camera.position).normalize().toArray();"""
+    found = found_on(page, script)
+    assert found["complaints"] == []
+    assert found["names"] == ["view from", "front", "side"]
+    np.testing.assert_allclose([found["front"], found["side"]], [*eyes.values()], atol=1e-6)
+    np.testing.assert_allclose(found["ahead"], side["ahead"], atol=1e-6)
+    assert found["fov"] == pytest.approx(90.0)
 
 
 def test_the_slider_moves_the_arm_and_shows_what_was_known_then(run: Runs) -> None:

@@ -1,0 +1,276 @@
+"""An audit: one verdict and one page of a recording, and what a second call does again."""
+
+import json
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.config import load_config
+from splatctrl_cli.errors import UsageError, WriteError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, read_verdict, verdict_of
+from splatctrl_cli.files.output import Stopwatch, write_json, write_run
+from splatctrl_cli.jobs import audit as module
+from splatctrl_cli.jobs.audit import AuditRequest, AuditResult, audit
+from splatctrl_cli.jobs.robot import logged_robot
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import SphereSet
+from tests.jobs.bake.baked import Said
+from tests.recording.log.make_log import messages_of, write_raw
+from tests.refused import expect_refusal
+
+QUICK = ("scene.max_splats=800", "scene.first_iterations=10", "scene.iterations_per_step=1")
+ALL = ("check", "scene", "replay", "report")
+
+
+def test_one_call_leads_from_a_log_to_a_verdict_and_its_page(
+    small_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = ["--urdf", str(small_recording / "robot.urdf"), "--spheres", str(small_recording / "robot_spheres.yaml")]
+    settings = [word for setting in QUICK for word in ("--set", setting)]
+    log, out = str(small_recording / "log.mcap"), tmp_path / "out"
+    code = main(["audit", log, *robot, *settings, "-o", str(out)])
+    run = json.loads((out / "replay" / "run.json").read_text())
+    sentence = run["verdict"]["sentence"]
+    assert code == run["verdict"]["exit_code"] == 5
+    assert capsys.readouterr().out == f"{sentence}\n\npage: {out / 'report.html'}\n"
+    shared = [f"--set={setting}" for setting in QUICK]
+    assert run["arguments"] == [
+        *("replay", log, *robot, "-o", str(out / "replay"), *shared, "--scene", str(out / "scene"))
+    ], "what makes the same again, and where a page finds scene and robot"
+    page = (out / "report.html").read_text()
+    said = sentence.split(" (")[0]
+    assert "<h1>audit of small/log.mcap</h1>" in page
+    assert page.index(said) < page.index("check: PASSED (log.mcap") < page.index("<h2>Logged motion</h2>")
+    assert 'id="data-replay"' in page and 'id="data-scene"' not in page, "the motion in 3-D"
+    assert page.count('<figure class="pair">') == 4, "photo and render of each camera"
+    assert json.loads((out / "run.json").read_text())["verdict"] == run["verdict"]
+
+
+@dataclass(kw_only=True)
+class Desk:
+    """An audit whose steps leave only a verdict, by folder."""
+
+    request: AuditRequest
+    outcomes: dict[str, Outcome] = field(default_factory=dict)
+    num_runs: int = 0  # as a run's time, no two are alike
+    asked: dict[str, Any] = field(default_factory=dict)  # requests by folder
+
+    def made(self, **changes: Any) -> tuple[str, ...]:
+        return self.audit(**changes).made
+
+    def audit(self, **changes: Any) -> AuditResult:
+        return audit(replace(self.request, **changes))
+
+    def write(self, request: Any, command: str) -> None:
+        out = request.out
+        self.asked[out.name] = request
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        self.num_runs += 1
+        reason = Reason(
+            criterion="clearance", outcome=self.outcomes.get(out.name, Outcome.PASSED), sentence="as told"
+        )
+        verdict = verdict_of(command, [reason], scope=out.name, passed="safe").as_dict()
+        write_run(
+            out,
+            command=command,
+            config={},
+            inputs={},
+            metrics={"num": self.num_runs},
+            stopwatch=Stopwatch(),
+            verdict=verdict,
+        )
+
+
+@pytest.fixture
+def desk(small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Desk:
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text((small_recording / "robot.urdf").read_text())
+    spheres = small_recording / "robot_spheres.yaml"
+    log = small_recording / "log.mcap"
+    desk = Desk(request=AuditRequest(log=log, urdf=urdf, spheres=spheres, out=tmp_path / "out"))
+    checked = verdict_of("check", [Reason(outcome=Outcome.PASSED, sentence="")]).as_dict()
+    document = {"verdict": checked, "findings": []}
+    monkeypatch.setattr(module, "_check", lambda request: write_json(request.out / "check.json", document))
+    monkeypatch.setattr(module, "open_to_train", lambda *_: None)
+    monkeypatch.setattr(module, "open_scene", lambda *_: None)
+    monkeypatch.setattr(module, "render_newest", lambda *_: iter(()))
+    monkeypatch.setattr(module, "reconstruct", lambda request, _: desk.write(request, "reconstruct"))
+    monkeypatch.setattr(module, "replay", lambda request, _: desk.write(request, "replay"))
+    return desk
+
+
+def test_a_second_call_makes_only_what_its_changes_decide(desk: Desk) -> None:
+    assert desk.made() == ALL
+    assert desk.made() == ()
+    assert desk.made(threads=3) == ()
+    assert desk.made(config=load_config(None, ["control.margin=0.03"])) == ("replay", "report")
+    assert desk.made(config=load_config(None, ["scene.max_splats=900"])) == ("scene", "replay", "report")
+    assert desk.made() == ("scene", "replay", "report"), "the folder holds one run of each"
+    assert desk.made(goal_joints=(0.5,) * 7) == ("closed_loop", "report")
+    assert desk.made(goal_joints=(0.4,) * 7) == ("closed_loop", "report")
+    assert desk.made(seed=1) == ("scene", "replay", "report")
+    assert desk.made(seed=1, force=True) == ALL
+
+
+def test_options_reach_every_step(desk: Desk) -> None:
+    options = SourceOptions(cameras=("cam1",))
+    given = {"options": options, "config": load_config(None, ["control.margin=0.03"]), "seed": 3, "threads": 2}
+    pose = (0.4, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
+    desk.made(**given, device="cpu", resume=True, goal=pose, frame="hand")
+    scene, replay, driven = (desk.asked[name] for name in ("scene", "replay", "closed_loop"))
+    for each in (scene, replay, driven):
+        assert (each.config, each.seed, each.threads, each.device) == (given["config"], 3, 2, "cpu")
+        assert (each.urdf, each.spheres) == (desk.request.urdf, desk.request.spheres)
+    assert scene.resume and replay.options == driven.options == options
+    assert replay.scene == driven.scene == desk.request.out / "scene"
+    assert (replay.mode, replay.goal, replay.frame) == ("audit", None, None)
+    assert (driven.mode, driven.goal, driven.frame, driven.start_time) == ("closed-loop", pose, "hand", "first-map")
+
+
+def test_another_robot_repeats_every_step(desk: Desk) -> None:
+    desk.made()
+    assert desk.request.urdf is not None
+    desk.request.urdf.write_text(desk.request.urdf.read_text().replace("<robot", "<!-- again --><robot"))
+    assert desk.made() == ALL
+
+
+@pytest.mark.parametrize(
+    ("name", "made"),
+    [
+        ("check.json", ("check",)),
+        ("scene/run.json", ("scene", "report")),
+        ("replay/run.json", ("replay", "report")),
+        ("report.html", ("report",)),
+    ],
+)
+def test_a_step_whose_file_was_changed_is_made_again(desk: Desk, name: str, made: tuple[str, ...]) -> None:
+    desk.made()
+    (desk.request.out / name).write_text("{}")
+    assert desk.made() == made
+
+
+def test_the_verdict_is_the_worse_one_of_logged_and_driven_motion(desk: Desk) -> None:
+    goal = (0.5,) * 7
+    assert desk.audit(goal_joints=goal).verdict.sentence == "replay: SAFE (replay)"
+    for driven, code in ((Outcome.NOT_EVALUABLE, 5), (Outcome.FAILED, 1)):
+        desk.outcomes["closed_loop"] = driven
+        verdict = desk.audit(goal_joints=goal, force=True).verdict
+        assert (verdict.scope, verdict.exit_code) == ("closed_loop", code)
+    desk.outcomes["replay"] = Outcome.NOT_EVALUABLE
+    assert desk.audit(goal_joints=goal, force=True).verdict.outcome is Outcome.FAILED
+    page = (desk.request.out / "report.html").read_text()
+    assert page.index("replay: FAILED (closed_loop)") < page.index("Logged motion") < page.index("Driven motion")
+    words = json.loads((desk.request.out / "closed_loop" / "run.json").read_text())["arguments"]
+    assert words[-5:] == [
+        "--mode",
+        "closed-loop",
+        "--start-time",
+        "first-map",
+        f"--goal-joints={','.join(['0.5'] * 7)}",
+    ]
+
+
+def test_a_log_without_joints_has_its_map_and_check_alone(desk: Desk, tmp_path: Path) -> None:
+    messages = [each for each in messages_of(desk.request.log) if each.topic.name != "/joint_states"]
+    log = write_raw(tmp_path / "still.mcap", messages)
+    result = desk.audit(log=log, urdf=None, spheres=None)
+    assert result.verdict.exit_code == 5
+    assert result.verdict.sentence == (
+        "audit: NOT EVALUABLE (still.mcap): joint states: still.mcap has none, so no motion is judged, only the "
+        "recording (check: passed) and its map (reconstruct: safe, scene); record /joint_states"
+    )
+    assert result.made == ("check", "scene", "report")
+    assert result.verdict.sentence in result.page.read_text()
+
+
+def test_spheres_are_fitted_once_where_the_urdf_has_none(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[int]()
+
+    def fit(solids: dict[str, object], options: Any) -> SphereSet:
+        asked.append(options.max_spheres)
+        rows = [(link, (0.0, 0.0, 0.0), 0.1) for link in solids]
+        links, centers, radii = zip(*rows, strict=True)
+        return SphereSet(links=links, centers=np.array(centers), radii=np.array(radii))
+
+    monkeypatch.setattr(module, "fit_spheres", fit)
+    assert desk.made(spheres=None) == ("spheres", *ALL)
+    assert desk.made(spheres=None) == ()
+    assert asked == [64]
+    words = json.loads((desk.request.out / "replay" / "run.json").read_text())["arguments"]
+    assert words[words.index("--spheres") + 1] == str(desk.request.out / "spheres.yaml")
+
+
+def test_a_log_that_names_no_robot_is_refused_at_once(desk: Desk) -> None:
+    words = "does not describe the robot; give it with --urdf FILE or --robot NAME"
+    expect_refusal(words, desk.audit, urdf=None, error=UsageError)
+    assert not desk.request.out.exists()
+
+
+def test_a_folder_of_something_else_is_not_written_into(desk: Desk) -> None:
+    desk.request.out.mkdir()
+    (desk.request.out / "mine.txt").touch()
+    words = r"out: was not written by splatctrl audit \(no steps.json\); give another --out"
+    expect_refusal(words, desk.audit, error=UsageError)
+    (desk.request.out / "mine.txt").unlink()
+    desk.request.out.rmdir()
+    desk.request.out.touch()
+    expect_refusal("out: cannot be written: File exists", desk.audit, error=UsageError)
+
+
+def test_a_page_that_cannot_be_written_fails_last_and_says_how_to_go_on(desk: Desk) -> None:
+    page = desk.request.out / "report.html"
+    page.mkdir(parents=True)
+    (desk.request.out / "steps.json").write_text("{}")
+    said = expect_refusal("is a folder, expected a file", desk.audit, error=WriteError)
+    assert said.endswith(f"; move {page} away, and run the same command")
+    page.rmdir()
+    assert desk.made() == ("report",)
+
+
+def installed(monkeypatch: pytest.MonkeyPatch, files: Iterable[Path]) -> None:
+    found = [SimpleNamespace(suffix=path.suffix, stem=path.stem, locate=lambda path=path: path) for path in files]
+    packages = [SimpleNamespace(files=found), SimpleNamespace(files=None)]
+    monkeypatch.setattr(logged_robot, "distributions", lambda: packages)
+
+
+def test_a_robot_by_name_is_one_of_an_installed_package(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [tmp_path / name / "arm.urdf" for name in ("a", "b")]
+    installed(monkeypatch, [tmp_path / "arm.urdf", tmp_path / "arm.stl", tmp_path / "z1.urdf"])
+    assert desk.made(urdf=None, robot="arm") == ALL
+    assert desk.made() == (), "the same robot by its file"
+    words = "--robot panda: expected one installed URDF of that name, got none; give one of: arm, z1"
+    expect_refusal(words, desk.audit, robot="panda", error=UsageError)
+    installed(monkeypatch, files)
+    words = f"got 2; give one with --urdf: {files[0]}, {files[1]}"
+    expect_refusal(words, desk.audit, robot="arm", error=UsageError)
+    installed(monkeypatch, [])
+    expect_refusal("got none; pip install example-robot-data", desk.audit, robot="arm", error=UsageError)
+
+
+def test_a_verdict_is_read_as_it_was_written() -> None:
+    reason = Reason(criterion="a", outcome=Outcome.FAILED, sentence="b", place=(1.0, 2.0, 3.0), label="contact")
+    verdict = verdict_of("replay", [reason], scope="c", notes=["d"], is_damaged=True, counts={"e": 1})
+    assert read_verdict("replay", json.loads(json.dumps(verdict.as_dict()))).as_dict() == verdict.as_dict()
+
+
+def test_progress_names_each_step_by_its_command(desk: Desk) -> None:
+    heard = Said()
+    audit(desk.request, heard)
+    assert [line.split(" /")[0] for line in heard.lines] == [
+        "check",
+        "$ splatctrl reconstruct",
+        "$ splatctrl replay",
+        "report",
+    ]
+    audit(desk.request, again := Said())
+    assert again.lines[0] == f"check: as before, {desk.request.out / 'check.json'}"
