@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from splatctrl_cli.calibration.displacement import placed
+from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config.ranges import checked_pose
 from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if, require
 from splatctrl_cli.files.output import Stopwatch, output_path, write_run
@@ -20,7 +20,7 @@ from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.geometry import interpolate_transform, transform_from
 from splatctrl_cli.jobs.reconstruct.correct_views import corrected
 from splatctrl_cli.jobs.score.views import final_splats, render_with_shell
-from splatctrl_cli.libraries import of_extra
+from splatctrl_cli.libraries import import_extra
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet, UInt8
@@ -205,7 +205,7 @@ def render_newest(scene: SceneFolder, source: FrameSource, threads: int = 0) -> 
     newest = {item.camera: item for item in stored if item.camera in scene.cameras}
     off, has_times = scene.run.get("metrics", {}).get("displaced_cameras") or {}, bool(_stamps(scene))
     for item in newest.values():
-        frame = corrected(placed(item.frame, off), scene.corrections)
+        frame = corrected(correct_pose(item.frame, off), scene.corrections)
         splats, shell = _splats_at(scene, frame.stamp_ns if has_times else None)
         pose = frame.T_world_camera
         view, _ = render_with_shell(splats, shell, frame.intrinsics, pose, scene.background, threads)
@@ -223,7 +223,7 @@ def _encode(image: UInt8) -> bytes:
 
 
 def _write_video(file: Path, images: Iterator[UInt8], lens: Intrinsics, fps: float) -> None:
-    av = of_extra("av", "video", "videos")
+    av = import_extra("av", "video", "videos")
     with av.open(str(file), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": "18"})
         stream.width, stream.height, stream.pix_fmt = lens.width, lens.height, "yuv420p"

@@ -258,8 +258,8 @@ def clocks(judged: Judged) -> Iterator[Reason]:
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
-    """Every step of the closed loop is solved, and rows are relaxed only over twice their margin away; a user's
-    controller always answers validly.
+    """Every step of the closed loop is solved. Rows may be relaxed over twice their margin away. A user's controller
+    always answers validly.
     """
     outside, trace, metrics = judged.replay.outside, judged.replay.closed_loop, judged.metrics
     if outside is not None:

@@ -95,11 +95,11 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
         return
     states = sum(event.num_states for event in events)
     apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
-    link = unlearned_link(judged)
+    link, why = unlearned_link(judged) or ("", "")
     if link and worst.worst_name.startswith(f"{link}["):
         part = lacking(
             sentence=f"{worst.worst_name} {apart}, from the first state on, margin {mm(replay.margin)}; that may be "
-            f"a part of {link}, which {judged.inputs.model.self_model.unknown[link]},",
+            f"a part of {link}, which {why},",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -122,17 +122,18 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     )
 
 
-def unlearned_link(judged: Judged) -> str:
-    """Link without a learned surface beside which an object stands, which may be its part; else empty.
+def unlearned_link(judged: Judged) -> tuple[str, str] | None:
+    """Unlearned link, and why it is, near which an object may be its part.
 
     The object breaks the margin in every logged state, or as a driven motion begins.
     """
     trace, learned = judged.replay.trace, judged.inputs.model.self_model
     if learned is None or "exact" not in judged.replay.fields:
-        return ""
+        return None
     link = trace["nearest_exact"][0].rpartition("[")[0]
     distance = trace["clearance_exact"][: 1 if judged.replay.closed_loop else None]
-    return link if link in learned.unknown and distance.max() < judged.threshold else ""
+    is_beside = distance.max() < judged.threshold
+    return (link, learned.unknown[link]) if link in learned.unknown and is_beside else None
 
 
 def _locate(event: Event, reason: Reason) -> Reason:

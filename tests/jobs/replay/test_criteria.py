@@ -166,7 +166,7 @@ def test_an_object_always_beside_a_link_that_hardly_moves_may_be_its_part(
     if outcome is Outcome.NOT_EVALUABLE:
         assert "a part of fore, which moves too little (3 of 5 configurations)" in reason.sentence
     driven = judged(columns, events=(happened,), self_model=known, fields=("exact",), closed_loop=FIVE_STEPS)
-    assert unlearned_link(driven) == ("fore" if "fore" in unknown else "")
+    assert unlearned_link(driven) == (("fore", unknown["fore"]) if "fore" in unknown else None)
 
 
 def bodied(deficit: tuple[float, float], surface: float) -> Judged:
