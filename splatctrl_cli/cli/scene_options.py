@@ -377,6 +377,11 @@ REPLAY = (  # what people use, and in groups the rest
             ("judge", "occupied"),
             "judge",
         ),
+        option(
+            "--separation FILE.toml",
+            "measure the protective separation distance of ISO/TS 15066 (splatctrl help separation)",
+            Path,
+        ),
         option("--require-proof", "not evaluable (exit 5) if space near the arm was assumed to be free"),
         *DISAGREEMENT,
     ),

@@ -11,6 +11,7 @@ from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
+from splatctrl_cli.control.separation_file import DeclaredSeparation
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Reason
 from splatctrl_cli.jobs.reconstruct.verdict import LONGEST_BLIND
@@ -78,6 +79,7 @@ class ReplayRequest(RobotOptions, RunOptions):
     controller_twice: bool = False
     worst_frames: int = 3
     declare: Path | None = None
+    separation: Path | None = None
     require: tuple[str, ...] = ()
     report_only: bool = False
     seed: int = 0
@@ -100,6 +102,7 @@ class ReplayInputs:
     declared: Declarations = made_by(default_factory=Declarations)
     surfaces: SelfSurfaces | None = None
     kept: tuple[KeptMargin, ...] = ()
+    separation: DeclaredSeparation | None = None
 
     def motion(self) -> LoggedMotion:
         states = self.states
@@ -121,6 +124,25 @@ class MapError:
     bound: ConformalBound | None
     time_s: float | None = None
     place: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeparationInput:
+    """An input of the protective separation distance; source: measured, declared or assumed."""
+
+    symbol: str
+    value: float | None = None
+    unit: str
+    source: str
+    how: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Separation:
+    """Inputs of the protective separation distance, and its figures by name, None without a person."""
+
+    inputs: tuple[SeparationInput, ...]
+    figures: Mapping[str, float | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +174,7 @@ class Replay:
     events: tuple[Event, ...] = ()
     twist_figures: Mapping[str, float | None] = made_by(default_factory=dict)
     map_error: MapError | None = None
+    separation: Separation | None = None
     outside: OutsideController | None = None
 
     @property

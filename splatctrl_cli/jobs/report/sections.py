@@ -55,6 +55,7 @@ def section_of(
         lines=[str(line) for line in found],
         pictures=_pictures(run, most_pictures, width, has_timeline=states is not None),
         details=[
+            *_separation(run),
             *([replace(held, title=f"Criteria that hold ({len(held.rows)})")] if held.rows else []),
             Table(title="Figures", header=("name", "value"), rows=figures[:400]),
             _settings(run),
@@ -72,6 +73,30 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
         if (reason["outcome"] == PASSED) is holds:
             rows.append(((reason["criterion"], reason["outcome"], words), reason["outcome"]))
     return Table(header=("criterion", "outcome", "found"), rows=rows)
+
+
+def _separation(run: RunFolder) -> list[Table]:
+    """Tables of the protective separation distance and its inputs; none without ``separation.json``."""
+    found = run.json_of("separation.json")
+    if found is None:
+        return []
+    figures = [((each["meaning"], each["value"], each["unit"]), "") for each in found["figures"]]
+    inputs = [
+        ((each["symbol"], each["value"], each["unit"], each["source"], each["how"]), "") for each in found["inputs"]
+    ]
+    return [
+        Table(
+            title="Separation from people",
+            header=("figure", "value", "unit"),
+            rows=figures,
+            text=f"{found['standard']}. {found['claim']}",
+        ),
+        Table(
+            title="Inputs of the separation: measured, declared or assumed",
+            header=("input", "value", "unit", "source", "how"),
+            rows=sorted(inputs, key=lambda row: row[0][3]),  # assumed first
+        ),
+    ]
 
 
 def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:

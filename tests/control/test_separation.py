@@ -1,0 +1,119 @@
+"""The protective separation distance against the standard's formulas, and against calculations by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.control.separation import (
+    Approach,
+    ArmMotion,
+    Deceleration,
+    Stopping,
+    StopRow,
+    StopTable,
+)
+from splatctrl_cli.records import Float64
+from tests.reference import separation as reference
+
+LIMIT = np.array([2.0, 1.0])
+ROWS = [
+    [
+        StopRow(
+            axis=axis,
+            extension=extension,
+            payload=1.0,
+            speed=(0.33, 0.66, 1.0),
+            time=(0.1, 0.2 + 0.1 * extension, 0.5),
+            distance=(0.02, 0.1 * extension, 0.3),
+        )
+        for extension in (0.5, 1.0)
+    ]
+    for axis in "ab"
+]
+
+
+def motion_of(seed: int) -> ArmMotion:
+    """Five states of two joints and three spheres, below the speed limits."""
+    draw = np.random.default_rng(seed)
+    gradient = draw.normal(size=(5, 3, 3))
+    return ArmMotion(
+        joint_speed=draw.uniform(-1, 1, (5, 2)) * LIMIT,
+        velocity_limit=LIMIT,
+        jacobian=draw.normal(size=(5, 3, 3, 2)),
+        gradient=gradient / np.linalg.norm(gradient, axis=2)[:, :, None],
+        extension=draw.uniform(0.1, 1.2, 5),
+    )
+
+
+def by_reference(motion: ArmMotion, t: int, m: int, stopping: Stopping, scale: float) -> tuple[float, float, float]:
+    """S_h, S_r and S_s of a sphere, v_h = 1.6 m/s and T_r = 0.15 s."""
+    dq = scale * motion.joint_speed[t]
+    velocity = [motion.jacobian[t, k] @ dq for k in range(3)]
+    if isinstance(stopping, Deceleration):
+        fastest = max(float(np.linalg.norm(v)) for v in velocity)
+        time, stop = reference.braking(float(np.linalg.norm(velocity[m])), fastest, stopping.deceleration)
+    else:
+        time, stop = 0.0, 0.0
+        for joint, rows in enumerate(ROWS):
+            row = rows[0] if motion.extension[t] <= 0.5 else rows[1]
+            share = float(abs(dq[joint]) / LIMIT[joint])
+            stopped = reference.between(share, dict(zip(row.speed, row.distance, strict=True)))
+            lever = float(np.linalg.norm(motion.jacobian[t, m, :, joint]))
+            stop += lever * stopped
+            late = reference.between(share, dict(zip(row.speed, row.time, strict=True)))
+            time = max(time, late, row.time[0] if share > 1e-3 else 0.0)
+    toward = -float(motion.gradient[t, m] @ velocity[m])
+    return reference.person(1.6, 0.15, time), reference.reaction(toward, 0.15), stop
+
+
+@pytest.mark.parametrize("stopping", [Deceleration(deceleration=1.5), StopTable(rows=ROWS)])
+def test_the_travel_until_the_arm_stands_is_that_of_the_formulas(stopping: Stopping) -> None:
+    motion, approach = motion_of(1), Approach(person_speed=1.6, reaction_time=0.15, stopping=stopping)
+    travel = approach.travel(motion, np.full(5, 0.8))
+    for t, m in np.ndindex(5, 3):
+        parts = by_reference(motion, t, m, stopping, 0.8)
+        found = travel.person[t], travel.reaction[t, m], travel.stopping[t, m]
+        assert found == pytest.approx(parts, abs=1e-6)
+        assert travel.total[t, m] + 0.3 == pytest.approx(
+            reference.protective_distance(*parts, 0.1, 0.15, 0.05), abs=1e-6
+        )
+
+
+@pytest.mark.parametrize("stopping", [Deceleration(deceleration=1.5), StopTable(rows=ROWS)])
+def test_the_speed_scale_is_the_largest_that_keeps_every_sphere_within_its_room(stopping: Stopping) -> None:
+    motion, approach = motion_of(2), Approach(person_speed=1.6, reaction_time=0.15, stopping=stopping)
+    room = np.array([0.2, 0.6, 1.0, 1e3, np.inf])[:, None] + np.zeros((5, 3))
+    found = approach.speed_scale(motion, room)
+    for t in range(3):
+        scale = min(
+            reference.largest_scale(
+                lambda s, t=t, m=m: float(approach.travel(motion, np.full(5, s)).total[t, m]), room[t, m]
+            )
+            for m in range(3)
+        )
+        assert found[t] == pytest.approx(scale, abs=1.1e-3)
+    assert found[0] == 0.0 and 0 < found[2] < 1 and found[3:].tolist() == [1.0, 1.0]
+
+
+def test_an_arm_at_rest_stops_at_once_and_one_that_leaves_does_not_add_to_the_distance() -> None:
+    motion = replace(motion_of(3), joint_speed=np.zeros((5, 2)))
+    approach = Approach(person_speed=2.0, reaction_time=0.5, stopping=StopTable(rows=ROWS))
+    assert np.all(approach.travel(motion, np.ones(5)).total == 1.0)
+    leaving = replace(motion_of(3), gradient=motion_of(3).velocity)
+    assert not approach.travel(leaving, np.ones(5)).reaction.any()
+    assert approach.time_to_contact(motion, np.full((5, 3), 0.8)) == pytest.approx(np.full(5, 0.4))
+
+
+def test_past_the_speed_limit_a_stop_grows_with_the_speed_and_its_square() -> None:
+    row = ROWS[0][1]
+    time, distance = row.at(np.array([1.0, 1.2]))
+    assert time.tolist() == pytest.approx([0.5, 0.6]) and distance.tolist() == pytest.approx([0.3, 0.432])
+
+
+def test_a_stop_takes_the_next_larger_extension() -> None:
+    motion = replace(motion_of(4), joint_speed=np.tile(0.66 * LIMIT, (5, 1)))
+    extension: Float64 = np.array([0.2, 0.5, 0.51, 1.0, 1.3])
+    stop = StopTable(rows=ROWS).stop(replace(motion, extension=extension), np.ones(5))
+    assert stop.time.tolist() == pytest.approx([0.25, 0.25, 0.3, 0.3, 0.3])
+    assert stop.joint_travel[:, 1].tolist() == pytest.approx([0.05, 0.05, 0.1, 0.1, 0.1])
