@@ -105,10 +105,10 @@ def test_an_arm_at_rest_stops_at_once_and_one_that_leaves_does_not_add_to_the_di
     assert approach.time_to_contact(motion, np.full((5, 3), 0.8)) == pytest.approx(np.full(5, 0.4))
 
 
-def test_past_the_speed_limit_a_stop_grows_with_the_speed_and_its_square() -> None:
-    row = ROWS[0][1]
-    time, distance = row.at(np.array([1.0, 1.2]))
-    assert time.tolist() == pytest.approx([0.5, 0.6]) and distance.tolist() == pytest.approx([0.3, 0.432])
+def test_a_slow_axis_takes_the_first_time_and_one_past_its_limit_grows_with_the_speed_and_its_square() -> None:
+    time, distance = ROWS[0][1].at(np.array([0.0, 0.033, 1.0, 1.2]))
+    assert time.tolist() == pytest.approx([0.0, 0.1, 0.5, 0.6])
+    assert distance.tolist() == pytest.approx([0.0, 0.002, 0.3, 0.432])
 
 
 def test_a_stop_takes_the_next_larger_extension() -> None:
@@ -117,3 +117,56 @@ def test_a_stop_takes_the_next_larger_extension() -> None:
     stop = StopTable(rows=ROWS).stop(replace(motion, extension=extension), np.ones(5))
     assert stop.time.tolist() == pytest.approx([0.25, 0.25, 0.3, 0.3, 0.3])
     assert stop.joint_travel[:, 1].tolist() == pytest.approx([0.05, 0.05, 0.1, 0.1, 0.1])
+
+
+BY_HAND = {  # a = 2 m/s^2, C = 0.1 m, map error 0.02 m; speeds are differences of the recorded positions
+    "sample recording, 4.50 s: the hand beside the visitor": (
+        (0.0896, 0.2586, 0.2499, 0.123, 0.200, 0.100, 0.0001),
+        (1.6 * (0.200 + 0.1293), 0.0246, 0.2499 * 0.1293 / 2, 0.100 + 0.020 + 0.160 + 0.0001),  # 0.8478 in steps.csv
+        -0.7582,
+    ),
+    "sample recording, 4.90 s: the finger": (
+        (0.2668, 0.3342, 0.3231, 0.1415, 0.200, 0.100, 0.0001),
+        (1.6 * (0.200 + 0.1671), 0.0283, 0.3231 * 0.1671 / 2, 0.280 + 0.0001),  # 0.9228
+        -0.6561,
+    ),
+    "sample recording, 5.30 s: the hand": (
+        (0.4015, 0.3239, 0.3135, 0.192, 0.200, 0.100, 0.0001),
+        (1.6 * (0.200 + 0.16195), 0.0384, 0.3135 * 0.16195 / 2, 0.280 + 0.0001),  # 0.9231
+        -0.5216,
+    ),
+    "arrival by MuJoCo, 1.65 s: the arm rests": (
+        (0.4039, 0.0, 0.0, 0.0, 0.100, 0.050, 0.0021),
+        (1.6 * 0.100, 0.0, 0.0, 0.100 + 0.020 + 0.080 + 0.0021),  # 0.3621
+        0.0418,
+    ),
+    "arrival by MuJoCo, 1.85 s": (
+        (0.2817, 0.0, 0.0, 0.0, 0.100, 0.050, 0.0021),
+        (0.160, 0.0, 0.0, 0.2021),  # 0.3621
+        -0.0805,
+    ),
+    "arrival by MuJoCo, 2.25 s": (
+        (0.1059, 0.0, 0.0, 0.0, 0.100, 0.050, 0.0021),
+        (0.160, 0.0, 0.0, 0.2021),  # 0.3621
+        -0.2562,
+    ),
+}
+
+
+@pytest.mark.parametrize("state", BY_HAND)
+def test_states_of_recordings_are_as_calculated_by_hand(state: str) -> None:
+    """Of a replay: separation, fastest speed, the part's speed and approach, T_r, age, Z_r; terms; its margin."""
+    (separation, fastest, speed, toward, reaction, age, z_r), terms, replayed = BY_HAND[state]
+    aside = np.sqrt(max(speed**2 - toward**2, 0.0))
+    motion = ArmMotion(
+        joint_speed=np.ones((1, 1)),
+        velocity_limit=np.ones(1),
+        jacobian=np.array([[[[toward], [aside], [0.0]], [[0.0], [fastest], [0.0]]]]),
+        gradient=np.tile([-1.0, 0.0, 0.0], (1, 2, 1)),
+        extension=np.ones(1),
+    )
+    approach = Approach(person_speed=1.6, reaction_time=reaction, stopping=Deceleration(deceleration=2.0))
+    travel = approach.travel(motion, np.ones(1))
+    found = travel.person[0], travel.reaction[0, 0], travel.stopping[0, 0], 0.1 + 0.02 + 1.6 * age + z_r
+    assert found == pytest.approx(terms, abs=2e-4)
+    assert separation - sum(terms) == pytest.approx(replayed, abs=5e-4)
