@@ -17,7 +17,7 @@ from splatctrl_cli.control import line_process, outside
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.line_process import Fault
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
-from splatctrl_cli.control.outside import OutsideController, class_command
+from splatctrl_cli.control.outside import OutsideController, Program, class_command
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.errors import InputError
@@ -57,7 +57,13 @@ def make_controller(
     command: tuple[str, ...], *, step_limit: float = 10.0, is_twice: bool = False
 ) -> OutsideController:
     return OutsideController(
-        "it", command, ARM, CONFIG, frame="tip", home=END, step_limit=step_limit, is_twice=is_twice
+        "it",
+        lambda start: Program("it", command, start, step_limit),
+        ARM,
+        CONFIG,
+        frame="tip",
+        home=END,
+        is_twice=is_twice,
     )
 
 

@@ -52,7 +52,7 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
         goals = goal_waypoints(request, model, frame, states.position[-1])
         task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
     console.log(f"replay: asking the controller at {len(states) - first} states")
-    with commander_of(request, model, config.control, console, frame=frame, home=task.home) as commander:
+    with commander_of(request, inputs, config.control, console, frame=frame, home=task.home) as commander:
         for stamps, positions, velocities in _blocks(inputs, first):
             part = record.measured(stamps, positions, velocities)
             commanded = open_loop(
@@ -97,7 +97,7 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
     start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
     limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
-    with commander_of(request, model, config.control, console, frame=task.frame, home=task.home) as commander:
+    with commander_of(request, inputs, config.control, console, frame=task.frame, home=task.home) as commander:
         trace = closed_loop(
             model,
             config.control,

@@ -40,8 +40,8 @@ class ReplayRequest(RobotOptions, RunOptions):
     baked grid) or `lockstep` (reconstruct meanwhile, on `device`). Times are in seconds; start_time may be
     "first-map". evidence: a held-out camera, or k for each k-th frame set. require_evidence, require_proof: no pass
     without evidence, or with space assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's class
-    ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the verdict sets no exit code,
-    except by `require`.
+    ``module:Class``, a policy server's URL, or "recorded" for the log's commands; controller_command: a program
+    (docs/controllers.md). report_only: the verdict sets no exit code, except by `require`.
     """
 
     log: Path
