@@ -21,12 +21,11 @@ class Mpc:
 
     def step(self, now: ControllerInput) -> np.ndarray:
         x, costs = np.concatenate([now.q[self.order], now.dq[self.order]]), c.CostModelSum(self.state)
-        at_goal = c.ResidualModelFramePlacement(self.state, self.frame, pinocchio.SE3(now.goal))
-        costs.addCost("goal", c.CostModelResidual(self.state, at_goal), 10.0)
-        at_rest = c.ResidualModelState(self.state, np.concatenate([x[: self.model.nq], np.zeros(self.model.nv)]))
-        costs.addCost("rest", c.CostModelResidual(self.state, at_rest), 0.1)
+        residual = c.ResidualModelFramePlacement(self.state, self.frame, pinocchio.SE3(now.goal))
+        costs.addCost("goal", c.CostModelResidual(self.state, residual), 10.0)
+        costs.addCost("still", c.CostModelResidual(self.state, c.ResidualModelState(self.state, x)), 0.1)
         dynamics = c.DifferentialActionModelFreeFwdDynamics(self.state, c.ActuationModelFull(self.state), costs)
-        node = c.IntegratedActionModelEuler(dynamics, STEP)
-        solver = c.SolverFDDP(c.ShootingProblem(x, [node] * NODES, node))
+        solver = c.SolverFDDP(c.ShootingProblem(x, [c.IntegratedActionModelEuler(dynamics, STEP)] * NODES,
+                                                c.IntegratedActionModelEuler(dynamics, STEP)))  # fmt: skip
         solver.solve([x] * (NODES + 1), solver.problem.quasiStatic([x] * NODES), 5)
         return np.array(solver.xs[1][self.model.nq :])[np.argsort(self.order)]

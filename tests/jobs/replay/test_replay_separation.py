@@ -40,7 +40,7 @@ def column(stage: Stage, name: str) -> Float64:
 
 
 def test_the_separation_from_a_ball_that_comes_is_that_of_the_formulas(stage: Stage) -> None:
-    """The ball comes at 0.5 s; v_h 1.6 m/s, a map each 0.25 s, Z_d 2 cm and the map's age, Z_r 5 mm and coverage."""
+    """The ball comes at 0.5 s; v_h 1.6 m/s, a map each 0.25 s, Z_d 4 cm and the map's age, Z_r 5 mm and coverage."""
     ball = ball_beside(stage.arm, passing()[-1].position, 0.2)
     stage.states, stage.balls, stage.later = moving_on(), [FAR], [ball]
     assert stage.judged(*asked(stage))[0] == 0
@@ -55,7 +55,7 @@ def test_the_separation_from_a_ball_that_comes_is_that_of_the_formulas(stage: St
             for c in (centers, later)
         ]
         speed, toward = np.linalg.norm(later - centers, axis=1) / tick, (gaps[0] - gaps[1]) / tick
-        z_d = 0.02 + 1.6 * ((index * SECOND // 10) % QUARTER) * 1e-9
+        z_d = 0.04 + 1.6 * ((index * SECOND // 10) % QUARTER) * 1e-9
         needed = []
         for v, v_r in zip(speed.tolist(), toward.tolist(), strict=True):
             t_s, s_s = reference.braking(v, float(speed.max()), 2.0)
@@ -83,7 +83,7 @@ def test_figures_gate_and_inputs_say_where_they_are_from(stage: Stage) -> None:
         "C": (0.1, "declared"),
         "T_r": (0.25, "measured"),
         "a": (2.0, "declared"),
-        "Z_d": (0.02, "assumed"),
+        "Z_d": (0.04, "assumed"),
         "Z_r": (0.005, "assumed"),
     }
     figures = {each["name"]: each["value"] for each in document["figures"]}
