@@ -1,6 +1,7 @@
 """Policy servers in openpi's protocol: msgpack with arrays, over a WebSocket (docs/controllers.md)."""
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit, urlunsplit
@@ -129,13 +130,13 @@ class PolicyClient:
                 f"{address.url}: the recording has no camera {camera}",
                 remedy=f"its cameras: {', '.join(images.cameras) or 'none'}",
             )
+        self._opened = ExitStack()
         self._msgpack = of_extra("msgpack", "policy", WHAT)
         client = of_extra("websockets.sync.client", "policy", WHAT)
         self._errors = of_extra("websockets.exceptions", "policy", WHAT)
         try:
-            self._socket = client.connect(
-                address.url, compression=None, max_size=MAX_ANSWER, open_timeout=START_LIMIT, proxy=None
-            )
+            how = {"compression": None, "max_size": MAX_ANSWER, "open_timeout": START_LIMIT, "proxy": None}
+            self._socket = self._opened.enter_context(client.connect(address.url, **how))
         except (OSError, TimeoutError, self._errors.WebSocketException) as error:
             raise InputError(
                 f"{address.url}: cannot be reached: {error}", remedy="check host and port, and that the server runs"
@@ -165,7 +166,7 @@ class PolicyClient:
         return checked_velocity({"velocity": action.tolist()}, limits)
 
     def close(self) -> None:
-        self._socket.close()
+        self._opened.close()
 
     def _observe(self, question: Document) -> Document:
         """The observation by key; a camera without an image yet is left out."""
