@@ -47,7 +47,7 @@ class ArmMotion:
     @cached_property
     def approach(self) -> Float64:
         """v_r (T, M) [m/s]: speeds toward the person, at least 0."""
-        return np.maximum(-np.sum(self.gradient * self.velocity, axis=2), 0.0)
+        return np.asarray(np.maximum(-np.sum(self.gradient * self.velocity, axis=2), 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)

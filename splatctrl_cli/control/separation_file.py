@@ -136,7 +136,7 @@ def _stop(where: str, entry: Any) -> StopRow:
 
 def _check_table(path: Path, declared: DeclaredSeparation, axes: Sequence[str]) -> None:
     rows = {(row.axis, row.extension, row.payload) for row in declared.stops}
-    extensions, payloads = ({key[part] for key in rows} for part in (1, 2))
+    extensions, payloads = {row.extension for row in declared.stops}, {row.payload for row in declared.stops}
     unknown = sorted({row.axis for row in declared.stops} - {*axes})
     _refuse_if(unknown, f"{path}: stop: unknown axis {', '.join(unknown[:1])}", f"the robot has {', '.join(axes)}")
     gaps = [
