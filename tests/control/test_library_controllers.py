@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pinocchio
 import pytest
 
 from splatctrl_cli import ControllerInput, ControllerStart
@@ -41,6 +42,8 @@ def test_an_example_drives_the_hand_to_its_goal(
     library: str, sample_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip(library, reason=f"{library} is not installed: docs/controllers is not tried with it")
+    if library == "crocoddyl" and pinocchio.__version__ == "4.1.0":
+        pytest.skip("crocoddyl 3.2.1 crashes with pin 4.1.0")
     urdf = sample_data / "tabletop" / "robot.urdf"
     bare = re.sub(r"<(visual|collision)>.*?</\1>", "", urdf.read_text(), flags=re.DOTALL)
     (tmp_path / "robot.xml").write_text(bare.replace("</robot>", f"{COMPILER}</robot>"))
