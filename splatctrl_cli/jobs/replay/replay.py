@@ -92,8 +92,9 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         if evidence is not None:
             with stopwatch.stage("evidence"):
                 found = replace(found, map_error=map_error(evidence, inputs, found.trace, config.verdict))
-        with stopwatch.stage("separation"):
-            found = add_separation(inputs, found)
+        if inputs.separation is not None:
+            with stopwatch.stage("separation"):
+                found = add_separation(inputs.separation, inputs, found)
         metrics = metrics_of(found) | logged.metrics()
         with stopwatch.stage("verdict"):
             verdict = replay_verdict(

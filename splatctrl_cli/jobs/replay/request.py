@@ -41,7 +41,8 @@ class ReplayRequest(RobotOptions, RunOptions):
     "first-map". evidence: a held-out camera, or k for each k-th frame set. require_evidence, require_proof: no pass
     without evidence, or with space assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's class
     ``module:Class``, a policy server's URL, or "recorded" for the log's commands; controller_command: a program
-    (docs/controllers.md). report_only: the verdict sets no exit code, except by `require`.
+    (docs/controllers.md). separation: a TOML file of declared inputs (docs/separation.md). report_only: the verdict
+    sets no exit code, except by `require`.
     """
 
     log: Path

@@ -50,14 +50,11 @@ def check_separation(request: ReplayRequest) -> None:
     )
 
 
-def add_separation(inputs: ReplayInputs, replay: Replay) -> Replay:
-    """Add columns of the separation to the trace, and its inputs to the replay, if a file declares them.
+def add_separation(declared: DeclaredSeparation, inputs: ReplayInputs, replay: Replay) -> Replay:
+    """Add columns of the separation to the trace, and its inputs and figures to the replay.
 
     Raises InputError for maps without times, or without any labelled person where labels are to tell.
     """
-    declared = inputs.separation
-    if declared is None:
-        return replay
     given = (*_person_inputs(declared), *_time_inputs(declared, inputs), *_distance_inputs(declared, inputs, replay))
     judge = _SeparationPass(declared, inputs, replay, {each.symbol: each.value for each in given})
     for first, last in blocks_of(inputs.scene, inputs.model, replay.trace.stamp_ns):
@@ -249,7 +246,7 @@ class _SeparationPass:
 def _joint_speeds(inputs: ReplayInputs, replay: Replay) -> Float64:
     """Joint velocities (T, J): those of a driven arm are its commands, and 0 where it had none."""
     if replay.closed_loop is not None:
-        return np.nan_to_num(replay.trace["v"])
+        return np.asarray(np.nan_to_num(replay.trace["v"]), np.float64)
     stamps = replay.trace.stamp_ns
     first = int(np.searchsorted(inputs.states.stamp_ns, stamps[0]))
     return np.asarray(inputs.states.velocity[first : first + len(stamps)], np.float64)

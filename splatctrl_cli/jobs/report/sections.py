@@ -81,8 +81,9 @@ def _separation(run: RunFolder) -> list[Table]:
     if found is None:
         return []
     figures = [((each["meaning"], each["value"], each["unit"]), "") for each in found["figures"]]
+    assumed_first = sorted(found["inputs"], key=lambda each: str(each["source"]))
     inputs = [
-        ((each["symbol"], each["value"], each["unit"], each["source"], each["how"]), "") for each in found["inputs"]
+        ((each["symbol"], each["value"], each["unit"], each["source"], each["how"]), "") for each in assumed_first
     ]
     return [
         Table(
@@ -94,7 +95,7 @@ def _separation(run: RunFolder) -> list[Table]:
         Table(
             title="Inputs of the separation: measured, declared or assumed",
             header=("input", "value", "unit", "source", "how"),
-            rows=sorted(inputs, key=lambda row: row[0][3]),  # assumed first
+            rows=inputs,
         ),
     ]
 
