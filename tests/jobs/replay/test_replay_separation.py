@@ -174,3 +174,15 @@ def test_a_driven_arm_is_judged_by_its_commands(stage: Stage) -> None:
     rows = stage.desk.rows()
     speed = np.array([[float(row[f"v_joint{j}"] or 0) for j in range(1, 8)] for row in rows])
     assert np.any(speed) and np.all((column(stage, "S_s") > 0) == np.any(speed != 0, axis=1))
+
+
+def test_a_fast_hand_before_a_person_counts_more_than_a_slow_link_that_is_nearer(stage: Stage) -> None:
+    arm, q = stage.arm, START + 0.5 * MOVE
+    slow = int(np.flatnonzero(arm.moving_spheres)[0])
+    behind = arm.sphere_centers(q)[slow] - np.array([arm.sphere_set.radii[slow] + 0.05 + 0.15, 0.0, 0.0])
+    ahead = ball_beside(arm, START + 1.3 * MOVE, 0.05)
+    stage.states, stage.balls = moving_on(), [FAR, ((behind[0], behind[1], behind[2]), 0.05), ahead]
+    stage.judged(*asked(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")))
+    apart = column(stage, "separation") - column(stage, "clearance_exact")
+    parts = [(row["separation_part"], row["nearest_exact"]) for row in stage.desk.rows()]
+    assert apart.max() > 0.01 and any(worst != nearest for worst, nearest in parts)
