@@ -123,8 +123,8 @@ def test_every_option_that_a_page_names_is_one_that_a_command_takes(page: Path) 
 
 
 def places() -> Iterator[tuple[Path, str]]:
-    """Every (file, name) that docs/paper.md puts in code marks; the name is empty for a file alone."""
-    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    """Every (file, name) that the pages of equations put in code marks; the name is empty for a file alone."""
+    text = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("paper.md", "separation.md"))
     for code in CODE.findall(text):
         match = PLACE.fullmatch(code)
         if match:

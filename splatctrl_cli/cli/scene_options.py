@@ -337,7 +337,11 @@ REPLAY = (  # what people use, and in groups the rest
         "bound the map's error by depth kept out of it: of this camera, or (--lockstep) of every K-th frame set",
     ),
     either(
-        option("--controller MODULE:CLASS", "judge a controller of your own: this Python class"),
+        option(
+            "--controller MODULE:CLASS",
+            "judge a controller of your own: this Python class, a policy server ws://HOST:PORT, or recorded: the"
+            " log's commands",
+        ),
         option("--controller-command 'PROGRAM ARGS'", "or this program, by JSON on its stdin and stdout"),
     ),
     *output("folder to write", default="replay"),
@@ -403,6 +407,11 @@ REPLAY = (  # what people use, and in groups the rest
             "space near the arm not seen free: judge it (splatctrl help verdict), or take it for an obstacle",
             ("judge", "occupied"),
             "judge",
+        ),
+        option(
+            "--separation FILE.toml",
+            "measure the protective separation distance of ISO/TS 15066 (splatctrl help separation)",
+            Path,
         ),
         option("--require-proof", "not evaluable (exit 5) if space near the arm was assumed to be free"),
         *DISAGREEMENT,

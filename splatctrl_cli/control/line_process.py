@@ -21,6 +21,7 @@ class Fault(StrEnum):
     CRASHED = "crashed"
     ENDED = "ended"
     NOT_JSON = "not JSON"
+    NOT_MSGPACK = "not msgpack"
     ENDLESS_LINE = "endless line"
     OUT_OF_TURN = "out of turn"
     OTHER_PROTOCOL = "other protocol"

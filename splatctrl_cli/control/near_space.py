@@ -28,13 +28,14 @@ class Seen:
 
     look: points (Q, 3) [m], world -> stamps (Q,) [ns] of the last depth through or on them, -1 never, and
     `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: centre and radius of balls into which a
-    surface may extend. origin (3,), voxel [m]: of the voxels; is_free (X, Y, Z): as in `SeenVoxels`.
+    surface may extend. origin (3,), voxel [m], shape (X, Y, Z): of the voxels; is_free (X, Y, Z): as in `SeenVoxels`.
     """
 
     look: Callable[[Float64], tuple[Index, UInt8]]
     edges: Float64 = field(default_factory=lambda: np.empty((0, 4)))
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
     voxel: float = fixed.NEAR_LATTICE
+    shape: tuple[int, ...] = (0, 0, 0)
     is_free: Bool | None = None
 
 

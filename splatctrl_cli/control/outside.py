@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from splatctrl_cli.control.step import Commander, ControlStep, Moment, QpIkContr
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.control.user_controller import PROTOCOL
 from splatctrl_cli.errors import InputError, refuse_faults
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
 STEP_LIMIT = 10.0  # [s] for one answer, also on a busy machine
@@ -30,6 +30,7 @@ MAX_SPEED = 10.0  # times a joint's velocity limit; a faster command is a fault
 SERVE = "import sys; from splatctrl_cli.control.user_controller import serve; serve(sys.argv[1])"
 
 Document = dict[str, Any]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,13 +42,50 @@ class Failure:
     stamp_ns: int
 
 
+class StepClock:
+    """Time limits of a controller's answers; spent [s]: on the present step."""
+
+    def __init__(self, step_limit: float) -> None:
+        self._step_limit, self._seconds = step_limit, 0.0
+        self.spent = 0.0
+
+    def measure(self, exchange: Callable[[float], T]) -> T:
+        """Answer of `exchange`, which waits for a time [s]. Raises Misbehaved if it comes late."""
+        if self._seconds > RUN_LIMIT:
+            raise Misbehaved(Fault.OUT_OF_TIME, f"took {RUN_LIMIT:g} s for all its answers together")
+        began = time.monotonic()
+        answer = exchange(PATIENCE * self._step_limit)
+        seconds = time.monotonic() - began
+        self.spent, self._seconds = self.spent + seconds, self._seconds + seconds
+        if self.spent > self._step_limit:
+            raise Misbehaved(
+                Fault.LATE, f"answered after {self.spent:.3g} s, --controller-step-limit {self._step_limit:g}"
+            )
+        return answer
+
+
+class Connection(Protocol):
+    """A connected controller of a user's."""
+
+    clock: StepClock
+
+    def velocity(
+        self, question: Document, rows: Callable[[], list[Document]], limits: Mapping[str, float]
+    ) -> Float64: ...
+
+    def close(self) -> None: ...
+
+
+Connect = Callable[[Document], Connection]
+"""The first line (`ControllerStart`) -> a new connection. Raises InputError if it cannot start."""
+
+
 class Program(LineProcess):
     """A controller process (docs/controllers.md)."""
 
     def __init__(self, name: str, command: Sequence[str], start: Document, step_limit: float) -> None:
         """Start it with the line `start`. Raises InputError if it cannot or is no controller."""
-        self._step_limit, self._seconds, self._num = step_limit, 0.0, 0
-        self.spent = 0.0  # [s] on the last step
+        self.clock, self._num = StepClock(step_limit), 0
         with refuse_faults(
             lambda error: f"{name}: cannot be started: {getattr(error, 'strerror', None) or error}",
             OSError,
@@ -77,7 +115,7 @@ class Program(LineProcess):
         limits (J) [rad/s]: by joint.
         """
         self._num += 1
-        self.spent, has_rows = 0.0, False
+        self.clock.spent, has_rows = 0.0, False
         line = _line({"id": self._num} | question)
         while True:
             answer = self._ask(line)
@@ -85,21 +123,27 @@ class Program(LineProcess):
                 got = shown(repr(answer.get("id")))
                 raise Misbehaved(Fault.OUT_OF_TURN, f"expected the answer to id {self._num}, got one to {got}")
             if answer.get("ask") != "rows" or has_rows:
-                return _velocity(answer, limits)
+                return checked_velocity(answer, limits)
             line, has_rows = _line({"rows": rows()}), True
 
     def _ask(self, line: bytes) -> Document:
-        if self._seconds > RUN_LIMIT:
-            raise Misbehaved(Fault.OUT_OF_TIME, f"took {RUN_LIMIT:g} s for all its answers together")
-        began = time.monotonic()
-        answer = self.exchange(line, PATIENCE * self._step_limit)
-        seconds = time.monotonic() - began
-        self.spent, self._seconds = self.spent + seconds, self._seconds + seconds
-        if self.spent > self._step_limit:
-            raise Misbehaved(
-                Fault.LATE, f"answered after {self.spent:.3g} s, --controller-step-limit {self._step_limit:g}"
-            )
-        return _document(answer)
+        return _document(self.clock.measure(lambda limit: self.exchange(line, limit)))
+
+
+class RecordedCommands:
+    """A `Connection` that repeats the newest of a log's commands (T, J) [rad/s], by stamps (T,) [ns]."""
+
+    def __init__(self, stamp_ns: Stamps, commands: Float64) -> None:
+        self.clock, self._stamp_ns, self._commands = StepClock(math.inf), stamp_ns, commands
+
+    def velocity(
+        self, question: Document, rows: Callable[[], list[Document]], limits: Mapping[str, float]
+    ) -> Float64:
+        newest = max(int(np.searchsorted(self._stamp_ns, question["stamp_ns"], side="right")) - 1, 0)
+        return checked_velocity({"velocity": self._commands[newest].tolist()}, limits)
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 class OutsideController(Commander, AbstractContextManager["OutsideController"]):
@@ -111,24 +155,23 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
     def __init__(
         self,
         name: str,
-        command: Sequence[str],
+        connect: Connect,
         model: RobotModel,
         config: ControlConfig,
         *,
         frame: str,
         home: Float64 | None = None,
-        step_limit: float = STEP_LIMIT,
         is_twice: bool = False,
     ) -> None:
         """name: for messages; frame, home: as `QpIkController`. Raises InputError if it cannot start."""
         self.name, self.num_answers, self.seconds, self.slowest = name, 0, 0.0, 0.0
         self.failure: Failure | None = None
         self._model, self._frame = model, frame
-        self._programs: list[Program] = []
+        self._programs: list[Connection] = []
         start = _start(model, config, frame, model.middle if home is None else home)
         try:
             for _ in range(2 if is_twice else 1):
-                self._programs.append(Program(name, command, start, step_limit))
+                self._programs.append(connect(start))
         except BaseException:
             self.close()
             raise
@@ -155,7 +198,7 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
             self.failure = Failure(fault=error.fault, sentence=error.sentence, stamp_ns=moment.stamp_ns)
             self.close()
             return controller.take_velocity(view, None, str(error))
-        spent = max(program.spent for program in self._programs)
+        spent = max(program.clock.spent for program in self._programs)
         self.num_answers, self.seconds, self.slowest = (
             self.num_answers + 1,
             self.seconds + spent,
@@ -257,7 +300,8 @@ def _whole(digits: str) -> int | float:
     return int(digits) if len(digits) < 300 else math.inf
 
 
-def _velocity(answer: Document, limits: Mapping[str, float]) -> Float64:
+def checked_velocity(answer: Document, limits: Mapping[str, float]) -> Float64:
+    """Velocities (J,) [rad/s] of an answer; limits: by joint. Raises Misbehaved if they are no possible command."""
     values = answer.get("velocity")
     if not isinstance(values, list) or len(values) != len(limits) or any(type(v) not in (int, float) for v in values):
         got = (

@@ -16,7 +16,7 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import line_process, outside
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.line_process import Fault
-from splatctrl_cli.control.outside import OutsideController, class_command
+from splatctrl_cli.control.outside import OutsideController, Program, class_command
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import OpenLoopTask, Outcome, ReplayTask, ReplayTrace, closed_loop, open_loop
 from splatctrl_cli.errors import InputError
@@ -56,7 +56,13 @@ def make_controller(
     command: tuple[str, ...], *, step_limit: float = 10.0, is_twice: bool = False
 ) -> OutsideController:
     return OutsideController(
-        "it", command, ARM, CONFIG, frame="tip", home=END, step_limit=step_limit, is_twice=is_twice
+        "it",
+        lambda start: Program("it", command, start, step_limit),
+        ARM,
+        CONFIG,
+        frame="tip",
+        home=END,
+        is_twice=is_twice,
     )
 
 

@@ -30,7 +30,9 @@ REPLAY_FIELDS = ("exact", "barrier", "certified")
 
 @cache
 def scales() -> Mapping[str, Mapping[str, Scale]]:
-    by_mode = [metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True) for mode in MODES]
+    by_mode = [
+        metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True, has_separation=True) for mode in MODES
+    ]
     return {
         "reconstruct": reconstruct_verdict.GATED,
         "sdf-bake": SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS),

@@ -17,6 +17,7 @@ from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs
+from splatctrl_cli.jobs.replay.separation import separation_document
 from splatctrl_cli.records import FloatRows, RgbdFrame
 from splatctrl_cli.report.replay_pictures import (
     clearance_picture,
@@ -39,6 +40,8 @@ COLUMNS = (  # of the trace in steps.csv, after stamps and clearances; a column 
     *("num_rows", "residual", "position_error", "rotation_error", "dv", "velocity_difference"),
     *("barrier_margin_logged", "barrier_row_logged", "velocity_margin_logged", "velocity_row_logged"),
     *("divergence_joints", "divergence_position", "divergence_rotation_deg"),
+    *("separation", "protective_distance", "separation_margin", "separation_part", "S_h", "S_r", "S_s", "Z_d", "Z_r"),
+    *("speed_scale", "time_to_contact", "stop_clearance"),
 )
 OF_STEP = (  # columns with empty cells where the controller had no step
     *("barrier_clearance", "scale", "slack", "residual", "position_error", "rotation_error"),
@@ -84,6 +87,8 @@ def write_replay(
     """Write steps.csv, events.json, summary.json, pictures and run.json; robot: sentences by subject."""
     write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
+    if replay.separation is not None:
+        write_json(folder / "separation.json", separation_document(replay.separation))
     write_json(folder / "summary.json", summary_of(replay, metrics, verdict, robot))
     with stopwatch.stage("picture"):
         draw_replay(folder, replay)

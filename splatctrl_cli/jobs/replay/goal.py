@@ -14,14 +14,23 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.ranges import POSE, checked_pose
 from splatctrl_cli.control.goals import TwistTrack
-from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController, class_command
+from splatctrl_cli.control.outside import (
+    STEP_LIMIT,
+    Connect,
+    OutsideController,
+    Program,
+    RecordedCommands,
+    class_command,
+)
+from splatctrl_cli.control.policy import PolicyClient, RecordedImages, is_policy_server, parse_address
 from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.control.replay import Waypoint
 from splatctrl_cli.control.step import OURS, Commander
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, require
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
+from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.state.state_source import read_twists
@@ -29,6 +38,7 @@ from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
 WORLD = "world"
+RECORDED = "recorded"  # name of the controller that repeats the log's commands
 TWIST_FIGURES = {
     "twist_share": DESCRIBES,
     "twist_share_capped": BAD_SHARE,
@@ -220,13 +230,16 @@ def check_controller(request: ReplayRequest) -> None:
             "--controller, --controller-command: expected --mode open-loop or closed-loop",
             remedy="an audit does not ask a controller",
         )
-    _read_command(request)
+    if is_policy_server(request.controller or ""):
+        parse_address(request.controller or "")
+    elif request.controller != RECORDED:
+        _read_command(request)
 
 
 @contextmanager
 def commander_of(
     request: ReplayRequest,
-    model: RobotModel,
+    inputs: ReplayInputs,
     config: ControlConfig,
     console: Progress,
     *,
@@ -240,17 +253,10 @@ def commander_of(
     if request.controller is None and request.controller_command is None:
         yield OURS
         return
-    name, command = _read_command(request)
+    name, connect = _connector(request, inputs)
     console.log(f"replay: starting the controller {name}")
     with OutsideController(
-        name,
-        command,
-        model,
-        config,
-        frame=frame,
-        home=home,
-        step_limit=request.controller_step_limit,
-        is_twice=request.controller_twice,
+        name, connect, inputs.model, config, frame=frame, home=home, is_twice=request.controller_twice
     ) as outside:
         yield outside
         if outside.num_answers:
@@ -258,6 +264,24 @@ def commander_of(
             console.log(
                 f"replay: {outside.num_answers} answers, {1e3 * mean:.2g} ms each, at most {1e3 * slowest:.2g}"
             )
+
+
+def _connector(request: ReplayRequest, inputs: ReplayInputs) -> tuple[str, Connect]:
+    """Name of the user's controller, and what starts it. Raises InputError for a log without commands."""
+    limit, source, states = request.controller_step_limit, inputs.source, inputs.states
+    if request.controller == RECORDED:
+        commands = require(
+            states.commanded_velocity,
+            f"{source.name}: --controller {RECORDED}: the log has no commanded velocities",
+            remedy="name their columns in [states] of a .toml, or choose their topic with --joint-topic",
+        )
+        return RECORDED, lambda start: RecordedCommands(states.stamp_ns, np.asarray(commands, np.float64))
+    if is_policy_server(request.controller or ""):
+        address = parse_address(request.controller or "")
+        images = RecordedImages(source.cameras, frames_of(source) if source.cameras else ())
+        return address.url, lambda start: PolicyClient(address, start, limit, images)
+    name, command = _read_command(request)
+    return name, lambda start: Program(name, command, start, limit)
 
 
 def _read_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:

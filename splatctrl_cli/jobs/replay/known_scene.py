@@ -23,7 +23,7 @@ from splatctrl_cli.field.grid_cells import GridField, exact_channel
 from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import open_scene
-from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Index, Label, SplatSet, UInt8
+from splatctrl_cli.records import Bool, Box, DistanceField, DistanceGrid, Float64, Index, Label, SplatSet, UInt8
 from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, SeenVoxels, VoxelState
 
 Key = TypeVar("Key", bound=Hashable)
@@ -37,8 +37,8 @@ class KnownFields:
     """The fields of one scene: `barrier` for a controller, `distances` for an audit.
 
     obstacles: points (Q, 3) [m], world -> the nearest of each. human: people alone. splats_alone: exact distance
-    without voxels that no splat represents. balls: of the barrier; None for a grid, or with a larger margin for
-    people.
+    without voxels that no splat represents. is_person (N,): labels of the exact distance's balls, None for a grid.
+    balls: of the barrier; None for a grid, or with a larger margin for people.
     """
 
     barrier: DistanceField
@@ -47,6 +47,7 @@ class KnownFields:
     obstacles: Callable[[Float64], tuple[Obstacle, ...]]
     human: DistanceField | None = None
     splats_alone: DistanceFunction | None = None
+    is_person: Bool | None = None
     balls: BallDistance | None = None
 
 
@@ -208,7 +209,14 @@ def read_splat_scene(path: Path, config: Config, threads: int, *, latency_ns: in
 
 def seen_of(voxels: SeenVoxels) -> Seen:
     edges = np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64)
-    return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel, is_free=voxels.is_free)
+    return Seen(
+        look=voxels.look,
+        edges=edges,
+        origin=voxels.origin,
+        voxel=voxels.voxel,
+        shape=voxels.last_seen.shape,
+        is_free=voxels.is_free,
+    )
 
 
 def _grid_seen(observed: Observed, grid: DistanceGrid) -> Seen:
@@ -249,6 +257,7 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
         median_radius=float(np.median(chosen.radii)),
         obstacles=lambda points: _nearest_spheres(obstacles, exact.nearest(points), points),
         human=human,
+        is_person=people,
         splats_alone=_splats_alone(obstacles, threads),
         balls=balls if human is None or config.control.human_margin <= config.control.margin else None,
     )

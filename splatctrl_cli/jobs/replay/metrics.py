@@ -123,6 +123,7 @@ SPEED = Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02)
 SLACK = Scale(unit="m/s", better=Better.HIGHER, absolute=1e-3, relative=0.02)  # or rad/s, by the row
 AT_GOAL = Scale(unit="m", better=Better.LOWER, absolute=ControlConfig().goal_position)  # within it, it is reached
 TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_rotation)
+LATER = Scale(unit="s", better=Better.HIGHER, absolute=0.01)
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
 NEAREST = "clearance_exact"
 OF_AUDIT: Declared = (
@@ -269,6 +270,20 @@ OF_MODE: dict[str, Declared] = {
     "open-loop": (*OF_STEPS, *OF_OPEN_LOOP),
     "closed-loop": (*OF_STEPS, *OF_CLOSED_LOOP),
 }
+SEPARATION: Declared = (
+    _of("separation_margin", "separation_margin_min", LEAST, GAP, shown="separation_margin"),
+    Measure(
+        name="time_below_separation",
+        value=lambda replay: float(replay.trace["below_s"].sum()),
+        running=lambda replay: (0.0, np.cumsum(replay.trace["below_s"])),
+        scale=AGE,
+        column="separation_margin",
+        pick="least",
+    ),
+    _of("speed_scale", "speed_scale_min", LEAST, Scale(better=Better.HIGHER, absolute=0.01), shown="speed_scale"),
+    _of("time_to_contact", "time_to_contact_min", LEAST, LATER, shown="time_to_contact"),
+    _of("stop_clearance", "stop_clearance_min", LEAST, GAP, shown="stop_clearance"),
+)
 AGREEMENT = {
     **dict.fromkeys(("median", "p95", "largest", "largest_over"), ERROR),
     "share_within": GOOD_SHARE,
@@ -276,15 +291,22 @@ AGREEMENT = {
 }  # scales of clearance_agreement's figures, except its tolerance
 
 
-def _list_metrics(mode: str, of_fields: Sequence[str]) -> Declared:
-    return (*OF_AUDIT, *map(_clearance, of_fields), *OF_STATES, *OF_MODE[mode])
+def _list_metrics(mode: str, of_fields: Sequence[str], *, has_separation: bool) -> Declared:
+    separation = SEPARATION if has_separation else ()
+    return (*OF_AUDIT, *map(_clearance, of_fields), *OF_STATES, *OF_MODE[mode], *separation)
+
+
+def _metrics_of(replay: Replay) -> Declared:
+    return _list_metrics(replay.mode, replay.fields, has_separation=replay.separation is not None)
 
 
 def metric_scales(
-    mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
+    mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False, has_separation: bool = False
 ) -> dict[str, Scale]:
     """Comparison scales of `metrics_of` and of the log's own figures, by name."""
-    of_states = {metric.name: metric.scale for metric in _list_metrics(mode, of_fields)}
+    of_states = {
+        metric.name: metric.scale for metric in _list_metrics(mode, of_fields, has_separation=has_separation)
+    }
     scales = of_states | LOG_FIGURES | (TWIST_FIGURES if has_twists else {})
     if has_truth:
         scales |= {f"truth_{figure}_{name}": scale for name in of_fields for figure, scale in AGREEMENT.items()}
@@ -294,12 +316,12 @@ def metric_scales(
 
 def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Measure]:
     """Figures that a column of ``steps.csv`` shows, by name."""
-    return {metric.name: metric for metric in _list_metrics(mode, of_fields) if metric.column}
+    return {metric.name: metric for metric in _list_metrics(mode, of_fields, has_separation=True) if metric.column}
 
 
 def metrics_of(replay: Replay) -> Metrics:
     """Every printed, written and gated figure by name; None without a value."""
-    metrics: Metrics = {metric.name: metric.value(replay) for metric in _list_metrics(replay.mode, replay.fields)}
+    metrics: Metrics = {metric.name: metric.value(replay) for metric in _metrics_of(replay)}
     metrics |= replay.twist_figures
     for name, agreement in replay.agreement.items():
         metrics |= {f"truth_{figure}_{name}": agreement[figure] for figure in agreement if figure != "tolerance"}
@@ -310,7 +332,7 @@ def metrics_of(replay: Replay) -> Metrics:
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
     """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
     found = dict.fromkeys(metrics, replay.num_states)
-    found |= {metric.name: metric.count(replay) for metric in _list_metrics(replay.mode, replay.fields)}
+    found |= {metric.name: metric.count(replay) for metric in _metrics_of(replay)}
     for field, agreement in replay.agreement.items():
         compared = int(agreement["num_compared"] or 0)
         found |= {f"truth_{name}_{field}": compared for name in AGREEMENT if name != "num_compared"}
@@ -322,7 +344,7 @@ def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> f
 
     None for metrics that are not of single states.
     """
-    measure = next((of for of in _list_metrics(replay.mode, replay.fields) if of.name == metric), None)
+    measure = next((of for of in _metrics_of(replay) if of.name == metric), None)
     if measure is None or measure.running is None:
         return None
     start, values = measure.running(replay)

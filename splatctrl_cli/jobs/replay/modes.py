@@ -28,10 +28,9 @@ from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, twist_f
 from splatctrl_cli.jobs.replay.inputs import check_inside
 from splatctrl_cli.jobs.replay.known_scene import Certified, KnownScene, certified_distance
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
+from splatctrl_cli.jobs.replay.state_pass import ReplayRecord, blocks_of
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.planner.planned import planned_detours
-from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
@@ -45,7 +44,7 @@ def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, conso
 
 def _audit(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
-    for stamps, positions, velocities in _blocks(record, inputs.states, first):
+    for stamps, positions, velocities in _blocks(inputs, first):
         record.measure_block(stamps, positions, velocities)
     return _finish_logged(request, inputs, config, record, first)
 
@@ -60,8 +59,8 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
         goals = goal_waypoints(request, model, frame, states.position[-1])
         task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
     console.log(f"replay: asking the controller at {len(states) - first} states")
-    with commander_of(request, model, config.control, console, frame=frame, home=task.home) as commander:
-        for stamps, positions, velocities in _blocks(record, states, first):
+    with commander_of(request, inputs, config.control, console, frame=frame, home=task.home) as commander:
+        for stamps, positions, velocities in _blocks(inputs, first):
             part = record.measure_block(stamps, positions, velocities)
             commanded = open_loop(
                 model,
@@ -105,7 +104,7 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
     start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
     limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
-    with commander_of(request, model, config.control, console, frame=task.frame, home=task.home) as commander:
+    with commander_of(request, inputs, config.control, console, frame=task.frame, home=task.home) as commander:
         trace = closed_loop(
             model,
             config.control,
@@ -119,7 +118,7 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
             balls_at=lambda stamp: scene.at(stamp).balls,
         )
     trace = _add_next_scene(trace, scene, model)
-    for first, last in record.blocks(trace.stamp_ns):
+    for first, last in blocks_of(scene, model, trace.stamp_ns):
         stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])
         straight = np.zeros_like(positions)  # the driven arm moves straight from state to state
         record.measure_block(stamps, positions, straight)
@@ -147,8 +146,9 @@ def _record(request: ReplayRequest, inputs: ReplayInputs, config: Config) -> Rep
     )
 
 
-def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[tuple[Stamps, Float64, Float64]]:
-    for first, last in record.blocks(states.stamp_ns[start:]):
+def _blocks(inputs: ReplayInputs, start: int) -> Iterator[tuple[Stamps, Float64, Float64]]:
+    states = inputs.states
+    for first, last in blocks_of(inputs.scene, inputs.model, states.stamp_ns[start:]):
         part = slice(start + first, start + last)
         yield states.stamp_ns[part], states.position[part], states.velocity[part]
 

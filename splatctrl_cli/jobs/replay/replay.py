@@ -5,6 +5,7 @@ from pathlib import Path
 
 from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.checks.clock_offset import ImageMotion
+from splatctrl_cli.control.separation_file import read_separation
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, check_gate_names
 from splatctrl_cli.evaluate.views import frames_of
@@ -41,6 +42,7 @@ from splatctrl_cli.jobs.replay.lockstep import check_lockstep, choose_scene
 from splatctrl_cli.jobs.replay.metrics import Metrics, metric_scales, metrics_of
 from splatctrl_cli.jobs.replay.modes import replayed
 from splatctrl_cli.jobs.replay.request import MODES, Replay, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.separation import add_separation, check_separation, separation_lines
 from splatctrl_cli.jobs.replay.verdict import ASKED, replay_verdict
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
@@ -90,6 +92,9 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         if evidence is not None:
             with stopwatch.stage("evidence"):
                 found = replace(found, map_error=map_error(evidence, inputs, found.trace, config.verdict))
+        if inputs.separation is not None:
+            with stopwatch.stage("separation"):
+                found = add_separation(inputs.separation, inputs, found)
         metrics = metrics_of(found) | logged.metrics()
         with stopwatch.stage("verdict"):
             verdict = replay_verdict(
@@ -108,7 +113,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         replay=found,
         metrics=metrics,
         verdict=verdict,
-        notes=(*of_robot.values(), *unseen, *logged.lines()),
+        notes=(*of_robot.values(), *unseen, *logged.lines(), *separation_lines(found.separation)),
         is_damaged=bool(inputs.source.loss.damaged),
     )
 
@@ -117,13 +122,18 @@ def check_request(request: ReplayRequest) -> None:
     """Raise UsageError for gates on missing figures, and options of another mode."""
     fields = ("exact", "barrier", *(("certified",) if request.field is not None else ()))
     has_truth, has_twists = request.truth is not None, request.twist_topic is not None
-    names = {mode: metric_scales(mode, fields, has_truth=has_truth, has_twists=has_twists) for mode in MODES}
+    has_separation = request.separation is not None
+    names = {
+        mode: metric_scales(mode, fields, has_truth=has_truth, has_twists=has_twists, has_separation=has_separation)
+        for mode in MODES
+    }
     check_gate_names(request.require, names[request.mode], {f"--mode {mode}": names[mode] for mode in names})
     check_lockstep(request)
     check_evidence(request)
     check_twists(request)
     check_goal(request)
     check_controller(request)
+    check_separation(request)
 
 
 def _watch(request: ReplayRequest, inputs: ReplayInputs, replay: Replay) -> tuple[Replay, list[Sight | None]]:
@@ -147,6 +157,7 @@ def _read(
     model, opened = open_log(request, progress)
     if request.urdf is None:  # for who looks at the run
         (folder / ROBOT).write_text(model.urdf.text, encoding="utf-8", newline="")
+    separation = None if request.separation is None else read_separation(request.separation, model.joint_names)
     logged = read_states(opened, model)
     robot = measured_robot(request, model, request.config.control, recorded_postures(logged.states))
     model = robot.model
@@ -163,8 +174,12 @@ def _read(
         for frame in frames_of(source):
             motion.add(frame)
     scene = choose_scene(request, model, declared, folder, progress, source, observe)
-    given = (request.urdf, request.spheres, request.self_model, request.srdf, request.truth, request.declare)
-    files = [path for path in given if path not in (None, NO_SELF_MODEL)]
+    robot_files = (request.urdf, request.spheres, request.self_model, request.srdf)
+    files = [
+        path
+        for path in (*robot_files, request.truth, request.declare, request.separation)
+        if path not in (None, NO_SELF_MODEL)
+    ]
     inputs = ReplayInputs(
         source=source,
         states=logged.states,
@@ -176,6 +191,7 @@ def _read(
         declared=declared,
         surfaces=robot.surfaces,
         kept=robot.kept,
+        separation=separation,
     )
     return inputs, logged, evidence, robot
 

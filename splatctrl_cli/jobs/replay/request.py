@@ -11,6 +11,7 @@ from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
+from splatctrl_cli.control.separation_file import DeclaredSeparation
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Reason
 from splatctrl_cli.jobs.reconstruct.verdict import LONGEST_BLIND
@@ -39,8 +40,9 @@ class ReplayRequest(RobotOptions, RunOptions):
     baked grid) or `lockstep` (reconstruct meanwhile, on `device`). Times are in seconds; start_time may be
     "first-map". evidence: a held-out camera, or k for each k-th frame set. require_evidence, require_proof: no pass
     without evidence, or with space assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's class
-    ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the verdict sets no exit code,
-    except by `require`.
+    ``module:Class``, a policy server's URL, or "recorded" for the log's commands; controller_command: a program
+    (docs/controllers.md). separation: a TOML file of declared inputs (docs/separation.md). report_only: the verdict
+    sets no exit code, except by `require`.
     """
 
     log: Path
@@ -78,6 +80,7 @@ class ReplayRequest(RobotOptions, RunOptions):
     controller_twice: bool = False
     worst_frames: int = 3
     declare: Path | None = None
+    separation: Path | None = None
     require: tuple[str, ...] = ()
     report_only: bool = False
     seed: int = 0
@@ -100,6 +103,7 @@ class ReplayInputs:
     declared: Declarations = made_by(default_factory=Declarations)
     surfaces: SelfSurfaces | None = None
     kept: tuple[KeptMargin, ...] = ()
+    separation: DeclaredSeparation | None = None
 
     def motion(self) -> LoggedMotion:
         states = self.states
@@ -121,6 +125,25 @@ class MapError:
     bound: ConformalBound | None
     time_s: float | None = None
     place: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeparationInput:
+    """An input of the protective separation distance; source: measured, declared or assumed."""
+
+    symbol: str
+    value: float | None = None
+    unit: str
+    source: str
+    how: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Separation:
+    """Inputs of the protective separation distance, and its figures by name, None without a person."""
+
+    inputs: tuple[SeparationInput, ...]
+    figures: Mapping[str, float | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +175,7 @@ class Replay:
     events: tuple[Event, ...] = ()
     twist_figures: Mapping[str, float | None] = made_by(default_factory=dict)
     map_error: MapError | None = None
+    separation: Separation | None = None
     outside: OutsideController | None = None
 
     @property

@@ -51,6 +51,19 @@ NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # columns of evidence about the
 }
 
 
+def blocks_of(scene: KnownScene, robot: RobotModel, stamps: Stamps) -> Iterator[tuple[int, int]]:
+    """Ranges of at most BLOCK of stamps (T,), with one scene and robot surface each."""
+    first = 0
+    while first < len(stamps):
+        known, last = scene.at(int(stamps[first])), first + 1
+        changes = [stamp for stamp in robot.changes if stamp > stamps[first]]
+        end = min(first + BLOCK, len(stamps), *np.searchsorted(stamps, changes).tolist())
+        while last < end and scene.at(int(stamps[last])) is known:
+            last += 1
+        yield first, last
+        first = last
+
+
 class ReplayRecord:
     """Audit of T states in the scenes known at their times, with what happened.
 
@@ -106,18 +119,6 @@ class ReplayRecord:
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
         self._was_free: Bool | None = None  # voxels (X, Y, Z), in any scene before
-
-    def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
-        """Ranges of at most BLOCK of stamps (T,), with one scene and robot surface each."""
-        first = 0
-        while first < len(stamps):
-            scene, last = self._scene.at(int(stamps[first])), first + 1
-            changes = [stamp for stamp in self._robot.changes if stamp > stamps[first]]
-            end = min(first + BLOCK, len(stamps), *np.searchsorted(stamps, changes).tolist())
-            while last < end and self._scene.at(int(stamps[last])) is scene:
-                last += 1
-            yield first, last
-            first = last
 
     def measure_block(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
         """Audit and store the next block of states (T, J), which see one scene."""

@@ -56,6 +56,7 @@ def section_of(
         lines=[str(line) for line in found],
         pictures=_pictures(run, most_pictures, width, has_timeline=states is not None),
         details=[
+            *_separation(run),
             *([replace(held, title=f"Criteria that hold ({len(held.rows)})")] if held.rows else []),
             Table(title="Figures", header=("name", "value"), rows=figures[:400]),
             _settings(run),
@@ -73,6 +74,31 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
         if (reason["outcome"] == PASSED) is holds:
             rows.append(((reason["criterion"], reason["outcome"], words), reason["outcome"]))
     return Table(header=("criterion", "outcome", "found"), rows=rows)
+
+
+def _separation(run: RunFolder) -> list[Table]:
+    """Tables of the protective separation distance and its inputs; none without ``separation.json``."""
+    found = run.json_of("separation.json")
+    if found is None:
+        return []
+    figures = [((each["meaning"], each["value"], each["unit"]), "") for each in found["figures"]]
+    assumed_first = sorted(found["inputs"], key=lambda each: str(each["source"]))
+    inputs = [
+        ((each["symbol"], each["value"], each["unit"], each["source"], each["how"]), "") for each in assumed_first
+    ]
+    return [
+        Table(
+            title="Separation from people",
+            header=("figure", "value", "unit"),
+            rows=figures,
+            text=f"{found['standard']}. {found['claim']}",
+        ),
+        Table(
+            title="Inputs of the separation: measured, declared or assumed",
+            header=("input", "value", "unit", "source", "how"),
+            rows=inputs,
+        ),
+    ]
 
 
 def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:

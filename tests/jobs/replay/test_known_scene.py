@@ -17,7 +17,7 @@ from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space, splat_fields
-from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
+from splatctrl_cli.jobs.replay.state_pass import ReplayRecord, blocks_of
 from splatctrl_cli.records import Float64, Index, UInt8
 from splatctrl_cli.robot.self_model import ALWAYS
 from splatctrl_cli.scene.posture import posture_of
@@ -168,8 +168,8 @@ def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> Non
     known = KnownScene(at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={})
     stamps = np.arange(8) * SECOND // 10
     record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
-    assert [*record.blocks(stamps)] == [(0, 3), (3, 6), (6, 8)]
-    for first, last in record.blocks(stamps):
+    assert [*blocks_of(known, model, stamps)] == [(0, 3), (3, 6), (6, 8)]
+    for first, last in blocks_of(known, model, stamps):
         record.measure_block(stamps[first:last], np.tile(q, (last - first, 1)), np.zeros((last - first, 7)))
     robots = (base, model.at(SECOND // 2))
     alone, holding = (robot.surface_gaps(q[None], scene.centers, scene.radii)[link][0] for robot in robots)

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,23 @@ def test_the_recorded_commands_of_ours_make_the_same_steps(stage: Stage, mode: s
     )
     assert metrics["min_clearance"] == pytest.approx(desk.metrics("ours")["min_clearance"], abs=1e-6)
     assert metrics["intervention_share"] is None and metrics["num_solved"] == 0
+
+
+@pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
+def test_the_commands_of_the_log_are_judged_as_a_controllers(
+    stage: Stage, mode: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    commands = [k / 10 * MOVE for k in range(11)]
+    stage.states = [replace(state, commanded_velocity=v) for state, v in zip(passing(), commands, strict=True)]
+    run = ("--controller", "recorded", "--set", "control.max_time=0.5")
+    _, verdict = stage.judged(*run, mode=mode)
+    assert ", controller recorded" in verdict["scope"]
+    for row in stage.desk.rows()[:40]:
+        newest = min(int(float(row["time_s"]) * 10 + 1e-6), 10)
+        assert float(row["v_joint1"]) == pytest.approx(commands[newest][0])
+    stage.states = passing()
+    assert stage.judged(*run, mode=mode, scene=stage.desk.folder / "scene")[0] == 4
+    assert "the log has no commanded velocities; name their columns" in capsys.readouterr().err
 
 
 def alike(a: str, b: str) -> bool:

@@ -380,3 +380,13 @@ def test_the_command_line_of_a_program_around_it_is_replaced_by_the_batchs(run: 
     patch_json(folder / "run.json", lambda found: found | {"arguments": ["batch", "suite.toml"]})
     assert replace(open_run(folder), words=words).option("--scene") == "scene"
     assert open_run(folder).option("--scene") is None
+
+
+def test_a_report_has_the_separation_with_its_inputs_and_without_a_claim(run: Runs, tmp_path: Path) -> None:
+    cell = tmp_path / "cell.toml"
+    cell.write_text("[robot]\ndeceleration = 2\n[distance]\nintrusion = 0\n")
+    page = reported(run("audit", "audit", "--separation", str(cell)))
+    words = ("5.5.4.2.3", "No compliance", "Power and force limiting is not assessed", "time below S_p")
+    assert all(word in page for word in words)
+    inputs = page[page.index("Inputs of the separation") :]
+    assert inputs.index("assumed</td>") < inputs.index("declared</td>") < inputs.index("measured</td>")
