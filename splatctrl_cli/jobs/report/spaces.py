@@ -212,13 +212,12 @@ def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
     bodies = robot_bodies(robot)
     end = run.option("--frame") or robot.frame_names[-1]
     postures = [position_of(states, robot, state) for state in which]
-    least = np.fmin.reduce(list(states.clearance.values())) if states.clearance else np.full(count, np.nan)
     return Motion(
         seconds=states.seconds[which],
         bodies=bodies,
         poses=np.array([[robot.frame_pose(q, link) for link in bodies] for q in postures]),
         path=np.array([robot.frame_pose(q, end)[:3, 3] for q in postures]),
-        clearance=least[which],
+        clearance=states.judged[which],
         margin=float((run.json_of("summary.json") or {}).get("about", {}).get("margin", 0.0)),
     )
 
@@ -239,9 +238,8 @@ def _deciding(run: RunFolder, states: States, robot: RobotModel) -> dict[str, An
     worst = states.worst()
     if worst is None or not states.obstacles or not (place := PLACE.search(states.obstacles[worst])):
         return None
-    least = float(np.fmin.reduce([values[worst] for values in states.clearance.values()]))
     time_s = float(states.seconds[worst])
-    words = f"least clearance {1e3 * least:.1f} mm at {time_s:.2f} s, near {states.obstacles[worst]}"
+    words = f"least clearance {1e3 * states.judged[worst]:.1f} mm at {time_s:.2f} s, near {states.obstacles[worst]}"
     return _find_deciding(states, robot, words, time_s, [float(part) for part in place.groups()], "")
 
 

@@ -35,12 +35,15 @@ class States:
     rungs: tuple[str, ...]
     obstacles: tuple[str, ...]
 
+    @property
+    def judged(self) -> Float64:
+        """Clearance (T,) [m] to the splats, else the least of any measure."""
+        found = [self.clearance["exact"]] if "exact" in self.clearance else list(self.clearance.values())
+        return np.asarray(np.fmin.reduce([np.full(len(self.seconds), np.nan), *found]))
+
     def worst(self) -> int | None:
-        """State of least clearance by any measure, None without values."""
-        if not self.clearance or not len(self.seconds):
-            return None
-        least = np.fmin.reduce(list(self.clearance.values()))
-        return int(np.nanargmin(least)) if np.isfinite(least).any() else None
+        """State of least judged clearance, None without values."""
+        return int(np.nanargmin(self.judged)) if np.isfinite(self.judged).any() else None
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from splatctrl_cli.geometry import look_at, transform_from
 from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
 from splatctrl_cli.jobs.report.report import MOST_SCENES, ViewRequest, WriteReportRequest, view, write_report
 from splatctrl_cli.jobs.report.spaces import space_of
-from splatctrl_cli.jobs.runs.run_folder import open_run
+from splatctrl_cli.jobs.runs.run_folder import States, open_run
 from splatctrl_cli.robot.model import RobotModel
 from tests.jobs.stage import Runs, Stage, passing, patch_json
 from tests.refused import expect_refusal
@@ -390,3 +390,14 @@ def test_a_report_has_the_separation_with_its_inputs_and_without_a_claim(run: Ru
     assert all(word in page for word in words)
     inputs = page[page.index("Inputs of the separation") :]
     assert inputs.index("assumed</td>") < inputs.index("declared</td>") < inputs.index("measured</td>")
+
+
+def test_the_moment_shown_is_of_the_clearance_that_the_verdict_judges() -> None:
+    measures = {"barrier": np.array([0.03, 0.04]), "exact": np.array([0.06, 0.05])}
+    states = States(
+        stamps_ns=np.arange(2), seconds=np.arange(2.0), joints={}, clearance=measures, rungs=(), obstacles=()
+    )
+    assert states.worst() == 1
+    np.testing.assert_array_equal(states.judged, measures["exact"])
+    assert replace(states, clearance={"barrier": measures["barrier"]}).worst() == 0
+    assert replace(states, clearance={}).worst() is None
