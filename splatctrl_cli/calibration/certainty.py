@@ -9,6 +9,7 @@ from splatctrl_cli.calibration.adjustment import Adjustment, Widths
 from splatctrl_cli.calibration.evidence import POSE, Estimate, Unknowns
 from splatctrl_cli.calibration.views import DepthView
 from splatctrl_cli.config import fixed
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.records import Float64
 
 AXES = ("x", "y", "z")
@@ -59,9 +60,16 @@ def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> 
 
     ``A^-1 M A^-T`` (the sandwich of White, 1980): M sums products of clusters' gradients, to count correlated errors;
     A is the gradient's derivative. Noise tilts normals of flat surfaces, which the normal equations mistake for
-    shape. Between views, A therefore uses differences with points projected anew, where that cancels.
+    shape. Between views, A therefore uses differences with points projected anew, where that cancels. Raises
+    NotEvaluableError where no view measures a surface that another view or the robot has.
     """
     whole = adjustment.normal(estimate, widths)
+    refuse_if(
+        not len(whole.scores),
+        "calibrate: the cameras measure no surface in common, and none of the robot's",
+        remedy="record a scene or a robot that they see at a finer resolution, or begin nearer (--camera-pose)",
+        error=NotEvaluableError,
+    )
     between = adjustment.normal(estimate, widths, with_robot=False)
     reach = _reach(adjustment, estimate)
     back = np.linalg.inv(reach)

@@ -369,6 +369,15 @@ def test_a_robot_of_which_one_link_is_seen_does_not_say_all(tmp_path: Path, plai
         calibrated(OneLink(2), tmp_path, options=options, **robot_in(plain_arm))
 
 
+def test_a_link_of_which_too_few_pixels_are_seen_ties_no_camera(
+    tmp_path: Path, plain_arm: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"{__name__}.SMALL", replace(SMALL, width=120, height=90))
+    options = SourceOptions(cameras=("cam0",))
+    with pytest.raises(NotEvaluableError, match="measure no surface in common, and none of the robot's"):
+        calibrated(OneLink(2), tmp_path, options=options, **robot_in(plain_arm))
+
+
 def test_a_camera_that_sees_neither_what_the_others_see_nor_the_robot_is_named(
     tmp_path: Path, plain_arm: Path
 ) -> None:
