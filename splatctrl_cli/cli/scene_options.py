@@ -337,11 +337,7 @@ REPLAY = (  # what people use, and in groups the rest
         "bound the map's error by depth kept out of it: of this camera, or (--lockstep) of every K-th frame set",
     ),
     either(
-        option(
-            "--controller MODULE:CLASS",
-            "judge a controller of your own: this Python class, a policy server ws://HOST:PORT, or recorded: the"
-            " log's commands",
-        ),
+        option("--controller MODULE:CLASS", "judge this class, a policy at ws://HOST:PORT, or the one recorded"),
         option("--controller-command 'PROGRAM ARGS'", "or this program, by JSON on its stdin and stdout"),
     ),
     *output("folder to write", default="replay"),
