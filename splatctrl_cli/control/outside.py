@@ -143,7 +143,7 @@ class RecordedCommands:
         return checked_velocity({"velocity": self._commands[newest].tolist()}, limits)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing; the commands are in memory."""
 
 
 class OutsideController(Commander, AbstractContextManager["OutsideController"]):

@@ -144,7 +144,11 @@ def _resize(lens: Intrinsics, width: int, height: int) -> Intrinsics:
 
 def _read_path(file: Path) -> _Track:
     faults, remedy = (OSError, ValueError, KeyError, TypeError), f"expected rows of time_s, {', '.join(POSE)}"
-    with refuse_faults(f"{file}: no path of a camera", *faults, remedy=remedy):
+    with refuse_faults(
+        lambda error: f"{file}: {getattr(error, 'strerror', None) or f'no path of a camera: {error}'}",
+        *faults,
+        remedy=remedy,
+    ):
         text = file.read_text(encoding="utf-8")
         rows = json.loads(text) if file.suffix == ".json" else list(csv.DictReader(text.splitlines()))
         times = np.array([float(row["time_s"]) for row in rows])
@@ -171,6 +175,11 @@ def _times(request: RenderSceneRequest, scene: SceneFolder, track: _Track) -> li
     first, last = (0.0, 1e-9 * (stamps[-1] - stamps[0])) if stamps else (0.0, 0.0)
     if request.path is not None:
         first, last = float(track.times[0]), float(track.times[-1])
+    refuse_if(
+        request.at is not None and not first <= request.at <= last,
+        f"--at {request.at}: expected {first:g} to {last:g} s of the {'path' if request.path else 'scene'}",
+        error=UsageError,
+    )
     if request.at is not None or request.out.suffix == PNG:
         return [last if request.at is None else request.at]
     return [first + number / request.fps for number in range(int((last - first) * request.fps + 1e-6) + 1)]

@@ -21,7 +21,7 @@ BENT = np.array([0.0, -0.4, 0.0, -2.2, 0.0, 1.9, 0.78])
 LIBRARIES = {"pink": "pink_ik:PinkIk", "mink": "mink_ik:MinkIk", "crocoddyl": "crocoddyl_mpc:Mpc"}
 
 
-def asked(arm: RobotModel, q: Float64, dq: Float64, goal: Float64) -> ControllerInput:
+def controller_input(arm: RobotModel, q: Float64, dq: Float64, goal: Float64) -> ControllerInput:
     return ControllerInput(
         stamp_ns=0,
         q=q,
@@ -69,7 +69,9 @@ def test_an_example_drives_the_hand_to_its_goal(
     q, dq = BENT.copy(), np.zeros(7)
     away = np.linalg.norm(goal[:3, 3] - arm.frame_pose(q, FRAME)[:3, 3])
     for _ in range(200):
-        dq = np.clip(np.asarray(controller.step(asked(arm, q, dq, goal))), -arm.velocity_limit, arm.velocity_limit)
+        dq = np.clip(
+            np.asarray(controller.step(controller_input(arm, q, dq, goal))), -arm.velocity_limit, arm.velocity_limit
+        )
         q = q + PERIOD * dq
     assert np.linalg.norm(goal[:3, 3] - arm.frame_pose(q, FRAME)[:3, 3]) < 0.1 * away
 

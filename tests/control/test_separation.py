@@ -170,7 +170,7 @@ BY_HAND = {  # a = 2 m/s^2, C = 0.1 m, map error 0.02 m; speeds are differences 
 
 @pytest.mark.parametrize("state", BY_HAND)
 def test_states_of_recordings_are_as_calculated_by_hand(state: str) -> None:
-    """Of a replay: separation, fastest speed, the part's speed and approach, T_r, age, Z_r; terms; its margin."""
+    """A state's separation, fastest speed, the part's speed and approach, T_r, age and Z_r give terms and margin."""
     (separation, fastest, speed, toward, reaction, age, z_r), terms, replayed = BY_HAND[state]
     aside = np.sqrt(max(speed**2 - toward**2, 0.0))
     motion = ArmMotion(

@@ -173,7 +173,7 @@ def test_coinciding_splats_share_their_weight() -> None:
 def test_voxel_weights_follow_the_splats_and_their_scale_and_not_their_order(
     kind: type[GpdfField] | type[SeField],
 ) -> None:
-    """As `test_symmetry` asks of row sums and of the full process."""
+    """`test_symmetry` has the same for row sums and for the full process."""
     centers, radii = cloud(400)
     points, config = queries(100), FieldConfig(length_scale=LENGTH, noise=1e-2, weights="voxel")
     distance = kind(Spheres.of(centers, radii), config).query(points)[0]

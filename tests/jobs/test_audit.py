@@ -60,9 +60,10 @@ class Desk:
     request: AuditRequest
     outcomes: dict[str, Outcome] = field(default_factory=dict)
     num_runs: int = 0  # as a run's time, no two are alike
-    asked: dict[str, Any] = field(default_factory=dict)  # requests by folder
+    requests: dict[str, Any] = field(default_factory=dict)  # by folder
 
-    def made(self, **changes: Any) -> tuple[str, ...]:
+    def steps_made(self, **changes: Any) -> tuple[str, ...]:
+        """Steps that a call with changes makes."""
         return self.audit(**changes).made
 
     def audit(self, **changes: Any) -> AuditResult:
@@ -70,7 +71,7 @@ class Desk:
 
     def write(self, request: Any, command: str) -> None:
         out = request.out
-        self.asked[out.name] = request
+        self.requests[out.name] = request
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         self.num_runs += 1
@@ -108,24 +109,24 @@ def desk(small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_second_call_makes_only_what_its_changes_decide(desk: Desk) -> None:
-    assert desk.made() == ALL
-    assert desk.made() == ()
-    assert desk.made(threads=3) == ()
-    assert desk.made(config=load_config(None, ["control.margin=0.03"])) == ("replay", "report")
-    assert desk.made(config=load_config(None, ["scene.max_splats=900"])) == ("scene", "replay", "report")
-    assert desk.made() == ("scene", "replay", "report"), "the folder holds one run of each"
-    assert desk.made(goal_joints=(0.5,) * 7) == ("closed_loop", "report")
-    assert desk.made(goal_joints=(0.4,) * 7) == ("closed_loop", "report")
-    assert desk.made(seed=1) == ("scene", "replay", "report")
-    assert desk.made(seed=1, force=True) == ALL
+    assert desk.steps_made() == ALL
+    assert desk.steps_made() == ()
+    assert desk.steps_made(threads=3) == ()
+    assert desk.steps_made(config=load_config(None, ["control.margin=0.03"])) == ("replay", "report")
+    assert desk.steps_made(config=load_config(None, ["scene.max_splats=900"])) == ("scene", "replay", "report")
+    assert desk.steps_made() == ("scene", "replay", "report"), "the folder holds one run of each"
+    assert desk.steps_made(goal_joints=(0.5,) * 7) == ("closed_loop", "report")
+    assert desk.steps_made(goal_joints=(0.4,) * 7) == ("closed_loop", "report")
+    assert desk.steps_made(seed=1) == ("scene", "replay", "report")
+    assert desk.steps_made(seed=1, force=True) == ALL
 
 
 def test_options_reach_every_step(desk: Desk) -> None:
     options = SourceOptions(cameras=("cam1",))
     given = {"options": options, "config": load_config(None, ["control.margin=0.03"]), "seed": 3, "threads": 2}
     pose = (0.4, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
-    desk.made(**given, device="cpu", resume=True, goal=pose, frame="hand")
-    scene, replay, driven = (desk.asked[name] for name in ("scene", "replay", "closed_loop"))
+    desk.steps_made(**given, device="cpu", resume=True, goal=pose, frame="hand")
+    scene, replay, driven = (desk.requests[name] for name in ("scene", "replay", "closed_loop"))
     for each in (scene, replay, driven):
         assert (each.config, each.seed, each.threads, each.device) == (given["config"], 3, 2, "cpu")
         assert (each.urdf, each.spheres) == (desk.request.urdf, desk.request.spheres)
@@ -136,10 +137,10 @@ def test_options_reach_every_step(desk: Desk) -> None:
 
 
 def test_another_robot_repeats_every_step(desk: Desk) -> None:
-    desk.made()
+    desk.steps_made()
     assert desk.request.urdf is not None
     desk.request.urdf.write_text(desk.request.urdf.read_text().replace("<robot", "<!-- again --><robot"))
-    assert desk.made() == ALL
+    assert desk.steps_made() == ALL
 
 
 @pytest.mark.parametrize(
@@ -152,9 +153,9 @@ def test_another_robot_repeats_every_step(desk: Desk) -> None:
     ],
 )
 def test_a_step_whose_file_was_changed_is_made_again(desk: Desk, name: str, made: tuple[str, ...]) -> None:
-    desk.made()
+    desk.steps_made()
     (desk.request.out / name).write_text("{}")
-    assert desk.made() == made
+    assert desk.steps_made() == made
 
 
 def test_the_verdict_is_the_worse_one_of_logged_and_driven_motion(desk: Desk) -> None:
@@ -201,8 +202,8 @@ def test_spheres_are_fitted_once_where_the_urdf_has_none(desk: Desk, monkeypatch
         return SphereSet(links=links, centers=np.array(centers), radii=np.array(radii))
 
     monkeypatch.setattr(module, "fit_spheres", fit)
-    assert desk.made(spheres=None) == ("spheres", *ALL)
-    assert desk.made(spheres=None) == ()
+    assert desk.steps_made(spheres=None) == ("spheres", *ALL)
+    assert desk.steps_made(spheres=None) == ()
     assert asked == [64]
     words = json.loads((desk.request.out / "replay" / "run.json").read_text())["arguments"]
     assert words[words.index("--spheres") + 1] == str(desk.request.out / "spheres.yaml")
@@ -232,7 +233,7 @@ def test_a_page_that_cannot_be_written_fails_last_and_says_how_to_go_on(desk: De
     said = expect_refusal("is a folder, expected a file", desk.audit, error=WriteError)
     assert said.endswith(f"; move {page} away, and run the same command")
     page.rmdir()
-    assert desk.made() == ("report",)
+    assert desk.steps_made() == ("report",)
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, files: Iterable[Path]) -> None:
@@ -246,8 +247,8 @@ def test_a_robot_by_name_is_one_of_an_installed_package(
 ) -> None:
     files = [tmp_path / name / "arm.urdf" for name in ("a", "b")]
     installed(monkeypatch, [tmp_path / "arm.urdf", tmp_path / "arm.stl", tmp_path / "z1.urdf"])
-    assert desk.made(urdf=None, robot="arm") == ALL
-    assert desk.made() == (), "the same robot by its file"
+    assert desk.steps_made(urdf=None, robot="arm") == ALL
+    assert desk.steps_made() == (), "the same robot by its file"
     words = "--robot panda: expected one installed URDF of that name, got none; give one of: arm, z1"
     expect_refusal(words, desk.audit, robot="panda", error=UsageError)
     installed(monkeypatch, files)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import look_at, quat_from_rotation
 from splatctrl_cli.jobs import render as module
 from splatctrl_cli.jobs.render import RenderSceneRequest, RenderSceneResult, render_scene
@@ -69,7 +69,7 @@ def test_a_camera_sees_the_scene_as_it_was_known_then(scene: Path) -> None:
     assert 27 <= early[0] < early[-1] <= 36
     assert last[0] == early[0] and last[-1] > 42
     assert columns(picture(scene, camera="cam1")) == []
-    assert columns(picture(scene, at=99.0)) == last
+    expect_refusal(r"--at 99.0: expected 0 to .* s of the scene", render, scene, at=99.0, error=UsageError)
 
 
 def test_another_size_keeps_the_middle_and_the_vertical_view(scene: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_scene_without_times_has_one_picture(scene: Path) -> None:
 def test_what_cannot_be_rendered_is_refused(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expect_refusal("--camera cam7: expected one of: cam0, cam1", render, scene, camera="cam7", error=UsageError)
     expect_refusal(r"out.gif: expected a name that ends in .png or .mp4", render, scene, "out.gif", error=UsageError)
-    expect_refusal("no snapshot at or before", render, scene, at=-0.5, error=NotEvaluableError)
+    expect_refusal("--at -0.5: expected 0 to 1 s of the scene", render, scene, at=-0.5, error=UsageError)
     words = "expected an even width and height of a video, got 65x48; give --size 64x48"
     expect_refusal(words, render, scene, "out.mp4", size=(65, 48), error=UsageError)
     monkeypatch.setitem(sys.modules, "av", None)

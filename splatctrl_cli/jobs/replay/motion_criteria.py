@@ -98,8 +98,8 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     link, why = unlearned_link(judged) or ("", "")
     if link and worst.worst_name.startswith(f"{link}["):
         part = lacking(
-            sentence=f"{worst.worst_name} {apart}, from the first state on, margin {mm(replay.margin)}; that may be "
-            f"a part of {link}, which {why},",
+            sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}; the object is within it from the "
+            f"first state on and may be a part of {link}, which {why},",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -357,7 +357,8 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
         name="clearance",
         find=clearance,
         broken=f"{BROKEN}; {UNKNOWN} where only voxels that are occupied and have no splat break it (a starved map: "
-        "raise `--max-splats`), or where it is by an object that may be a part of its link, beside it in every state",
+        "raise `--max-splats`), or an object is near from the first state on and may be a part of a link that hardly "
+        "moves",
     ),
     Criterion(
         name="certified clearance",

@@ -24,7 +24,7 @@ intrusion = 0.1
 """
 
 
-def asked(stage: Stage, text: str = CELL) -> list[str]:
+def separation_option(stage: Stage, text: str = CELL) -> list[str]:
     path = stage.desk.folder / "cell.toml"
     path.write_text(text)
     return ["--separation", str(path)]
@@ -43,7 +43,7 @@ def test_the_separation_from_a_ball_that_comes_is_that_of_the_formulas(stage: St
     """The ball comes at 0.5 s; v_h 1.6 m/s, a map each 0.25 s, Z_d 4 cm and the map's age, Z_r 5 mm and coverage."""
     ball = ball_beside(stage.arm, passing()[-1].position, 0.2)
     stage.states, stage.balls, stage.later = moving_on(), [FAR], [ball]
-    assert stage.judged(*asked(stage))[0] == 0
+    assert stage.judged(*separation_option(stage))[0] == 0
     rows, arm = stage.desk.rows(), stage.arm
     moving, tick = np.flatnonzero(arm.moving_spheres), 1e-6
     assert not any(row["separation"] for row in rows[:5])
@@ -71,7 +71,7 @@ def test_the_separation_from_a_ball_that_comes_is_that_of_the_formulas(stage: St
 def test_figures_gate_and_inputs_say_where_they_are_from(stage: Stage) -> None:
     stage.balls, stage.later = [FAR], [ball_beside(stage.arm, passing()[-1].position, 0.2)]
     gates = ("--require", "separation_margin_min>=0", "--require", "time_below_separation<=0.3")
-    code, verdict = stage.judged(*asked(stage), *gates)
+    code, verdict = stage.judged(*separation_option(stage), *gates)
     said = [reason["sentence"] for reason in verdict["reasons"] if reason["criterion"].startswith("--require")]
     assert code == 1 and "first at 0.500 s" in said[0] and "time_below_separation is 0.5, required <= 0.3" in said[1]
     document = stage.desk.json("separation.json")
@@ -106,20 +106,20 @@ def test_people_are_those_with_a_label_and_the_rest_is_static(stage: Stage) -> N
     near, far = (ball_beside(stage.arm, START, gap) for gap in (0.1, 0.4))
     stage.states, stage.balls, stage.people = resting(), [near], [far]
     labelled = CELL.replace('"newcomer"\nempty_at = 0.0', '"labelled"')
-    assert stage.judged(*asked(stage, labelled))[0] == 0
+    assert stage.judged(*separation_option(stage, labelled))[0] == 0
     assert column(stage, "separation").min() > 0.35
     assert column(stage, "stop_clearance") == pytest.approx(np.full(11, 0.1), abs=1e-3)
     scene = stage.desk.folder / "scene"
     anything = CELL.replace('who = "newcomer"\nempty_at = 0.0', 'unseen = "ignored"')
-    stage.judged(*asked(stage, anything), scene=scene)
+    stage.judged(*separation_option(stage, anything), scene=scene)
     assert column(stage, "separation") == pytest.approx(np.full(11, 0.1), abs=1e-3)
 
 
 def test_the_stopping_volume_reaches_where_the_arm_would_stop(stage: Stage) -> None:
-    """In T_r the arm goes on by a quarter of MOVE, and stops after; the ball is 0.15 s past the last state."""
+    """The arm covers a quarter of MOVE in T_r before it stops; the ball stands 0.15 of MOVE past the last state."""
     stage.states = moving_on()
     stage.balls = [FAR, ball_beside(stage.arm, START + 1.15 * MOVE, 0.03)]
-    stage.judged(*asked(stage))
+    stage.judged(*separation_option(stage))
     way, last = column(stage, "clearance_exact")[-1], column(stage, "stop_clearance")[-1]
     assert way > 0.04 and last < 0.03
 
@@ -130,7 +130,7 @@ def test_space_never_seen_counts_as_a_person_on_request(stage: Stage) -> None:
     for unseen, reach in (("ignored", np.inf), ("person", 0.6)):
         text = CELL.replace("[person]", f'[person]\nunseen = "{unseen}"')
         scene = stage.scene(unseen)
-        stage.judged(*asked(stage, text), scene=scene)
+        stage.judged(*separation_option(stage, text), scene=scene)
         assert np.all((column(stage, "separation") < reach) == (unseen == "person"))
 
 
@@ -155,13 +155,13 @@ def test_unseen_cells_are_the_border_of_space_that_no_camera_saw() -> None:
 def test_what_the_recording_or_the_file_lacks_is_refused(
     stage: Stage, capsys: pytest.CaptureFixture[str], text: str, code: int, words: str
 ) -> None:
-    assert stage.judged(*asked(stage, text))[0] == code
+    assert stage.judged(*separation_option(stage, text))[0] == code
     (said,) = capsys.readouterr().err.splitlines()
     assert words in said
 
 
 def test_a_baked_field_and_a_single_map_are_refused(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
-    given = asked(stage)
+    given = separation_option(stage)
     assert stage.replayed("--field", "field.npz", *given)[0] == 2
     stage.map_stamps = [0]
     assert stage.judged(*given)[0] == 4
@@ -170,7 +170,7 @@ def test_a_baked_field_and_a_single_map_are_refused(stage: Stage, capsys: pytest
 
 def test_a_driven_arm_is_judged_by_its_commands(stage: Stage) -> None:
     stage.balls = [FAR, ball_beside(stage.arm, START, 0.5)]
-    stage.judged(*asked(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")), mode="closed-loop")
+    stage.judged(*separation_option(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")), mode="closed-loop")
     rows = stage.desk.rows()
     speed = np.array([[float(row[f"v_joint{j}"] or 0) for j in range(1, 8)] for row in rows])
     assert np.any(speed) and np.all((column(stage, "S_s") > 0) == np.any(speed != 0, axis=1))
@@ -182,7 +182,7 @@ def test_a_fast_hand_before_a_person_counts_more_than_a_slow_link_that_is_nearer
     behind = arm.sphere_centers(q)[slow] - np.array([arm.sphere_set.radii[slow] + 0.05 + 0.15, 0.0, 0.0])
     ahead = ball_beside(arm, START + 1.3 * MOVE, 0.05)
     stage.states, stage.balls = moving_on(), [FAR, ((behind[0], behind[1], behind[2]), 0.05), ahead]
-    stage.judged(*asked(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")))
+    stage.judged(*separation_option(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")))
     apart = column(stage, "separation") - column(stage, "clearance_exact")
     parts = [(row["separation_part"], row["nearest_exact"]) for row in stage.desk.rows()]
     assert apart.max() > 0.01 and any(worst != nearest for worst, nearest in parts)

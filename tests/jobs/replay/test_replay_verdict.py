@@ -110,6 +110,19 @@ def test_what_a_displaced_camera_shows_beside_the_arm_may_be_the_arm_itself_and_
     assert (code, verdict["label"], verdict["reasons"][0]["criterion"]) == (1, "contact", "true clearance")
 
 
+def test_an_object_that_may_be_a_part_of_the_arm_does_not_fail_a_driven_motion(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_contact(stage)
+    scene = stage.scene()
+    assert stage.judged(scene=scene, mode="closed-loop")[0] == 1
+    found = ("fore", "moves too little (3 of 5 configurations)")
+    monkeypatch.setattr("splatctrl_cli.jobs.replay.verdict.unlearned_link", lambda judged: found)
+    assert stage.judged(scene=scene, mode="closed-loop")[0] == 5
+    code, verdict = stage.judged(scene=scene)
+    assert (code, verdict["label"]) == (1, "contact"), "of the logged motion only its own link's distance is in doubt"
+
+
 def test_a_field_knows_that_a_camera_of_its_scene_was_displaced(stage: Stage) -> None:
     displaced_camera(stage)
     stage.balls = [FAR, ball_beside(stage.arm, START, -0.01)]
