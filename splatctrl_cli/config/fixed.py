@@ -116,6 +116,7 @@ ASKED_REACH = 0.15  # [m] from the robot's spheres, within which unseen space is
 VOTE_SHARE = 0.15  # of the robot's pixels in a voxel, fewer of an object are none: a 6 mm rod has 0.4
 MASK_SIGMAS = 2.0  # of the sensor's error that the robot's surface may explain
 MASK_FAR_OFF = 0.10  # [m] a residual beyond it is something else, before or behind the robot
+MASK_OCCLUDED = 0.1  # of a link's pixels in an image: a shelf before the hand is 7 cm away here, and 13 cm there
 MASK_PIXELS = 100  # of a link, fewer say nothing of its residual
 MOUNTED_MIN_VIEWS = 6  # of a camera that moves with the robot, to find what it sees of the robot in each
 MOUNTED_APART = 0.02  # [m] from each other, the places of these views

@@ -131,6 +131,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     is_told = is_core & has_depth & (np.abs(offset) <= fixed.MASK_FAR_OFF)
     is_told &= link < len(surface.links) - surface.num_carried
     is_told &= rendered - nearest < fixed.MASK_STEP  # stereo may give it the depth of a nearer part next to it
+    is_told &= ~is_occluded(offset, np.where(is_robot & has_depth, link, np.int16(-1)))
     is_inside = is_core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,
@@ -141,6 +142,18 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
             for name, found in _group_by_link(inside[is_inside], inside[is_inside], surface.links).items()
         },
     )
+
+
+def is_occluded(offset: Float32, link: Int16) -> Bool:
+    """True for pixels (H, W) of an object before a link (-1: none).
+
+    offset: measured less rendered depth [m]. An object occludes a link if over `MASK_OCCLUDED` of the link's pixels
+    are more than `MASK_FAR_OFF` before it. Then all pixels more than `MASK_STEP` before the link show that object.
+    """
+    number = link.astype(np.int64) + 1
+    num_before = np.bincount(number.ravel(), (offset < -fixed.MASK_FAR_OFF).ravel())
+    has_occluder = num_before > fixed.MASK_OCCLUDED * np.bincount(number.ravel())
+    return np.asarray(has_occluder[number] & (offset < -fixed.MASK_STEP))
 
 
 def is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, fx: float) -> Bool:

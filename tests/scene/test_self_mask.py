@@ -380,3 +380,17 @@ def test_beside_a_nearer_link_depth_that_has_grown_over_a_link_is_not_its_residu
     depth[:, left : left + 2] = np.where(exact[:, left : left + 2] > 0, 0.795, depth[:, left : left + 2])
     found = masked(depth, posture).residuals
     assert len(found["far"]) > 20 and np.abs(found["far"]).max() < 1e-3
+
+
+def test_a_board_before_a_link_is_not_its_residual_and_a_displaced_link_is() -> None:
+    """The board is 4 to 14 cm before the ball; the displaced ball is 7 cm nearer than its joints say."""
+    ball, before = ball_depth(), np.broadcast_to(np.linspace(0.14, 0.04, 36), (120, 36))
+    board = ball.copy()
+    board[:, 62:98] = np.where(SHOWN[:, 62:98], ball[:, 62:98] - before, FLOOR)
+    assert not len(masked(board).residuals.get("arm", ()))
+    half = np.where(np.arange(160) < 80, board, ball)
+    assert len(masked(half).residuals["arm"]) > 100 and np.abs(masked(half).residuals["arm"]).max() < 1e-3
+    displaced = masked(np.where(SHOWN, ball - 0.07, FLOOR)).residuals["arm"]
+    assert np.median(displaced) == pytest.approx(-0.07, abs=1e-3)
+    corner = np.where((np.arange(160) < 66) & SHOWN, ball - 0.2, np.where(SHOWN, ball - 0.07, FLOOR))
+    assert np.median(masked(corner).residuals["arm"]) == pytest.approx(-0.07, abs=1e-3)  # few pixels occlude little
