@@ -17,12 +17,11 @@ from splatctrl_cli.control.preconditions import (
     check_goal,
     check_within_limits,
     checked_posture,
-    sphere_clearance,
     static_violations,
 )
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController, VelocityMargin
 from splatctrl_cli.files.spilled_rows import ObjectFile
-from splatctrl_cli.records import Bool, DistanceField, Float64, FloatRows, Stamps
+from splatctrl_cli.records import Bool, Float64, FloatRows, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
 
@@ -74,20 +73,6 @@ class ReplayTask:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneChange:
-    """A newer scene: least clearance [m] of the unmoved arm before and after."""
-
-    stamp_ns: int
-    before: float
-    after: float
-
-    @property
-    def is_hit(self) -> bool:
-        """True if the arm is in collision in the newer scene only."""
-        return self.after < 0 <= self.before
-
-
-@dataclass(frozen=True, kw_only=True)
 class ReplayTrace:
     """T steps with stamp_ns (T,) and position (T, J) [rad] before each.
 
@@ -100,7 +85,6 @@ class ReplayTrace:
     steps: Sequence[ControlStep]
     outcome: Outcome
     static_violations: tuple[StaticViolation, ...]
-    scene_changes: tuple[SceneChange, ...]
     anchored: tuple[int, ...] = ()
     num_reached: int = 0
     detours: tuple[int, ...] = ()
@@ -138,7 +122,7 @@ def closed_loop(
     by_surface: tuple[str, ...] = ()
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
-    stamps, positions, changes, anchored = [], [], [], []
+    stamps, positions, anchored = [], [], []
     steps: list[ControlStep] | ObjectFile[ControlStep] = [] if record is None else record
     outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
@@ -148,7 +132,6 @@ def closed_loop(
             q, last_velocity = logged
             anchored.append(index)
         if field_at(stamp) is not field:
-            changes.append(scene_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
             controller = controller.replace_field(field, balls_at(stamp))
         rate = rate_of(config, model, scene_step_at, stamp, q)
@@ -178,7 +161,6 @@ def closed_loop(
         steps=steps,
         outcome=outcome,
         static_violations=statics,
-        scene_changes=tuple(changes),
         anchored=tuple(anchored),
         num_reached=course.num_reached,
         detours=tuple(course.detours),
@@ -293,15 +275,6 @@ def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:
     """True if a pose error (6,) is within the goal's tolerances."""
     position, rotation = np.linalg.norm(pose_error[:3]), np.linalg.norm(pose_error[3:])
     return bool(position <= config.goal_position and rotation <= config.goal_rotation)
-
-
-def scene_change(
-    model: RobotModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField
-) -> SceneChange:
-    """Return how a newer scene changes the clearance at q (J,)."""
-    moving = np.asarray(model.moving_spheres)
-    least = [float(np.min(sphere_clearance(model, field, q, moving)[1])) for field in (before, after)]
-    return SceneChange(stamp_ns=stamp_ns, before=least[0], after=least[1])
 
 
 def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:

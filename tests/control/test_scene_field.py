@@ -11,7 +11,7 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.control.barriers import PeopleGrown, SceneStep, distance_rate, guard_people
 from splatctrl_cli.control.preconditions import FixedParts, check_free, static_violations
-from splatctrl_cli.control.replay import ReplayTask, SceneChange, closed_loop
+from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, Float64, SphereSet
@@ -134,14 +134,6 @@ def test_a_start_is_free_where_the_links_own_surface_is() -> None:
     with pytest.raises(NotEvaluableError, match=r"sphere fore\[1\] 0\.0100 m deep"):
         check_free(ThinArm(), Balls(centers, radii), Q, scene_of(centers, radii))
     check_free(ThinArm(), Balls(centers, [0.07]), Q, scene_of(centers, [0.07]))
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "is_hit"),
-    [(0.1, -0.01, True), (0.0, -1e-6, True), (-0.01, -0.02, False), (0.1, 0.0, False), (-0.02, 0.01, False)],
-)
-def test_only_a_scene_that_newly_comes_into_the_arm_is_a_hit(before: float, after: float, is_hit: bool) -> None:
-    assert SceneChange(stamp_ns=0, before=before, after=after).is_hit == is_hit
 
 
 @pytest.mark.parametrize(

@@ -302,17 +302,13 @@ def controller(judged: Judged) -> Iterator[Reason]:
 
 def scene_hits(judged: Judged) -> Iterator[Reason]:
     """Nothing appears inside the arm; judged in closed loop."""
-    trace = judged.replay.closed_loop
-    if trace is None:
-        return
-    if hits := judged.metrics["num_scene_hits"] or 0:
-        change = next(change for change in trace.scene_changes if change.is_hit)
+    if hits := [change for change in judged.replay.scene_changes if change.is_hit]:
         yield failed(
-            sentence=f"obstacles appeared inside the arm {int(hits)} times, first",
-            value=float(hits),
+            sentence=f"obstacles appeared inside the arm {len(hits)} times, first",
+            value=float(len(hits)),
             threshold=0.0,
-            time_s=float(change.stamp_ns - judged.replay.trace.stamp_ns[0]) * 1e-9,
-            count=len(trace.scene_changes),
+            time_s=float(hits[0].stamp_ns - judged.replay.trace.stamp_ns[0]) * 1e-9,
+            count=len(judged.replay.scene_changes),
             label=CONTACT,
         )
 

@@ -118,7 +118,6 @@ def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mappin
 
 
 def events_document(replay: Replay) -> dict[str, Any]:
-    changes = () if replay.closed_loop is None else replay.closed_loop.scene_changes
     numbers = ("worst", "worst_s", "start_s", "end_s")
     return {
         "events": [
@@ -128,7 +127,7 @@ def events_document(replay: Replay) -> dict[str, Any]:
         "static_violations": [asdict(violation) for violation in replay.static_violations],
         "scene_changes": [
             asdict(change) | {"is_hit": change.is_hit}
-            for change in changes
+            for change in replay.scene_changes
             if abs(change.after - change.before) > 0.01
         ],
         "anchored": [] if replay.closed_loop is None else list(replay.closed_loop.anchored),

@@ -252,7 +252,7 @@ OF_CLOSED_LOOP: Declared = (
     _trace("num_steps", lambda trace: len(trace.steps)),
     _of("position_error", "position_error", LAST, AT_GOAL),
     _of("rotation_error", "rotation_error", LAST, TURNED),
-    _trace("num_scene_hits", lambda trace: sum(change.is_hit for change in trace.scene_changes), FAULTS),
+    Measure(name="num_scene_hits", value=lambda r: sum(change.is_hit for change in r.scene_changes), scale=FAULTS),
     _trace("num_anchors", lambda trace: len(trace.anchored)),
     _trace("num_detours", lambda trace: len(trace.detours)),
     *(

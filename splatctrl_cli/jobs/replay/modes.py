@@ -14,11 +14,9 @@ from splatctrl_cli.control.preconditions import StaticViolation, check_within_li
 from splatctrl_cli.control.replay import (
     OpenLoopTask,
     ReplayTask,
-    ReplayTrace,
     closed_loop,
     divergence,
     open_loop,
-    scene_change,
 )
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, NotEvaluableError
@@ -27,12 +25,11 @@ from splatctrl_cli.jobs.recordings.provenance import times_apart
 from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, twist_figures, twist_track
 from splatctrl_cli.jobs.replay.inputs import check_inside
 from splatctrl_cli.jobs.replay.known_scene import Certified, KnownScene, certified_distance
-from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, SceneChange
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord, blocks_of
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.planner.planned import planned_detours
 from splatctrl_cli.records import Float64, Stamps
-from splatctrl_cli.robot.model import RobotModel
 
 
 def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
@@ -80,15 +77,13 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
     )
 
 
-def _add_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -> ReplayTrace:
-    """Add the change to the first scene after the motion."""
-    last_ns = int(trace.stamp_ns[-1])
-    next_ns = scene.next_ns(last_ns)
-    if next_ns is None:
-        return trace
-    before, after = scene.at(last_ns).barrier, scene.at(next_ns).barrier
-    change = scene_change(model, next_ns, np.asarray(trace.position[-1]), before, after)
-    return replace(trace, scene_changes=(*trace.scene_changes, change))
+def _measure_change(
+    scene: KnownScene, record: ReplayRecord, before_ns: int, stamp_ns: int, position: Float64
+) -> Iterator[SceneChange]:
+    """The change between scenes of two stamps for the arm at position (1, J); none for one scene."""
+    if scene.at(before_ns) is not scene.at(stamp_ns):
+        before, after = (record.clearance_in(ns, np.array([stamp_ns]), position)[0] for ns in (before_ns, stamp_ns))
+        yield SceneChange(stamp_ns=stamp_ns, before=float(before), after=float(after))
 
 
 def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
@@ -117,16 +112,21 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
             distance_to=scene.at(task.stamp_ns).distances["exact"],
             balls_at=lambda stamp: scene.at(stamp).balls,
         )
-    trace = _add_next_scene(trace, scene, model)
+    changes = list[SceneChange]()
     for first, last in blocks_of(scene, model, trace.stamp_ns):
         stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])
         straight = np.zeros_like(positions)  # the driven arm moves straight from state to state
         record.measure_block(stamps, positions, straight)
         apart = divergence(model, task.frame, stamps, positions, motion)
         record.trace.append({**step_columns(trace.steps[first:last], model.num_joints), **apart})
+        before_ns = int(trace.stamp_ns[max(first - 1, 0)])
+        changes += _measure_change(scene, record, before_ns, int(stamps[0]), positions[:1])
+    if (next_ns := scene.next_ns(last_ns := int(stamps[-1]))) is not None:
+        changes += _measure_change(scene, record, last_ns, next_ns, positions[-1:])
     return replace(
         _finish(request, inputs, config, record, trace.static_violations, radius_of=0),
         closed_loop=trace,
+        scene_changes=tuple(changes),
         twist_figures=twist_figures(model, config.control, task.frame, task.twists, record.trace),
         outside=commander if isinstance(commander, OutsideController) else None,
     )

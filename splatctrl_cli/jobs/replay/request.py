@@ -147,6 +147,20 @@ class Separation:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SceneChange:
+    """A newer scene: least clearance [m] of the unmoved arm's surface before and after."""
+
+    stamp_ns: int
+    before: float
+    after: float
+
+    @property
+    def is_hit(self) -> bool:
+        """True if the arm is in collision in the newer scene only."""
+        return self.after < 0 <= self.before
+
+
+@dataclass(frozen=True, kw_only=True)
 class Replay:
     """A finished replay of T states in one of MODES; fields: names of distances.
 
@@ -171,6 +185,7 @@ class Replay:
     statics: Mapping[str, tuple[float, float]]
     closest: Mapping[KeptMargin, tuple[float, int]]
     closed_loop: ReplayTrace | None = None
+    scene_changes: tuple[SceneChange, ...] = ()
     agreement: Mapping[str, Mapping[str, float | None]] = made_by(default_factory=dict)
     events: tuple[Event, ...] = ()
     twist_figures: Mapping[str, float | None] = made_by(default_factory=dict)

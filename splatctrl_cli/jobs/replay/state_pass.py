@@ -114,8 +114,8 @@ class ReplayRecord:
         )
         self._near = NearSpace(model, config.control.margin, max_map_age)
         self._posture_before: Float64 | None = None  # at the end of the last block
-        self.hindsight = Hindsight(scene, self._near, config.control.margin, self._clearance_in)
-        self.newer_depth = NewerDepth(scene, config.control.margin - fixed.SLIGHTLY_UNDER, self._clearance_in)
+        self.hindsight = Hindsight(scene, self._near, config.control.margin, self.clearance_in)
+        self.newer_depth = NewerDepth(scene, config.control.margin - fixed.SLIGHTLY_UNDER, self.clearance_in)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
         self._was_free: Bool | None = None  # voxels (X, Y, Z), in any scene before
@@ -185,7 +185,8 @@ class ReplayRecord:
                 kept[state, column] = np.inf
         return kept
 
-    def _clearance_in(self, scene_ns: int, stamps: Stamps, positions: Float64) -> Float64:
+    def clearance_in(self, scene_ns: int, stamps: Stamps, positions: Float64) -> Float64:
+        """Return clearances (T,) [m] of states (T, J) in the scene known at `scene_ns`, without declared contact."""
         known, found = self._scene.at(scene_ns), []
         for its in np.split(np.arange(len(stamps)), np.searchsorted(stamps, self._robot.changes)):
             if len(its):

@@ -25,7 +25,7 @@ from splatctrl_cli.jobs.replay.files import columns_of
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.motion_criteria import clearance, surface_clearance, unlearned_link
-from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest, SceneChange
 from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
 from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.recording.log.state_columns import StateColumns
@@ -41,7 +41,6 @@ FIVE_STEPS = ReplayTrace(
     steps=[cast("ControlStep", None)] * 5,
     outcome=LoopOutcome.TIMEOUT,
     static_violations=(),
-    scene_changes=(),
 )
 CONTROLLER = dict.fromkeys(("num_relaxed", "num_minimum_violation", "num_hold"), 0)
 
@@ -315,3 +314,11 @@ def test_cells_of_a_state_without_a_step_are_empty() -> None:
     cells = columns_of(judged(never | step_columns([None] * NUM, 0), model=SimpleNamespace(joint_names=())).replay)
     assert {name for name, values in cells.items() if values == [""] * NUM} >= {"rung", "scale", "num_rows", "slack"}
     assert "" not in cells["limit_margin"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "is_hit"),
+    [(0.1, -0.01, True), (0.0, -1e-6, True), (-0.01, -0.02, False), (0.1, 0.0, False), (-0.02, 0.01, False)],
+)
+def test_only_a_scene_that_newly_comes_into_the_arm_is_a_hit(before: float, after: float, is_hit: bool) -> None:
+    assert SceneChange(stamp_ns=0, before=before, after=after).is_hit == is_hit
