@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ from splatctrl_cli.simulate.recording import (
 from splatctrl_cli.simulate.render import Renderer
 
 PLAIN = ROOT / "tests" / "data" / "tabletop"  # the arm of primitive shapes
-ARM = {"urdf": PLAIN / "robot.urdf", "spheres": PLAIN / "robot_spheres.yaml"}
+ARM: dict[str, Any] = {"urdf": PLAIN / "robot.urdf", "spheres": PLAIN / "robot_spheres.yaml"}
 OPTIONS = RecordingOptions(duration_s=6.0, fps=5.0, color_rays=0)
 OFF = (np.radians(1.5), 0.02)  # [rad], [m]: standard deviations of recorded poses, about and along each axis
 CLOCK = 0.06  # [s] at most
@@ -167,7 +168,7 @@ class Error:
 
 def errors(kind: str, setup: SetUp, result: CalibrateResult) -> Iterator[Error]:
     """Of each unknown: along and about the axes that the file states its sigmas for."""
-    named = {"kind": kind, "seed": setup.options.seed}
+    named: dict[str, Any] = {"kind": kind, "seed": setup.options.seed}
     cameras = {camera.name: camera.T_world_camera for camera in setup.cameras}
     for name, found in result.calibration.cameras.items():
         truth = invert_transform(setup.off[name]) if found.moves else cameras[name]
@@ -183,11 +184,11 @@ def errors(kind: str, setup: SetUp, result: CalibrateResult) -> Iterator[Error]:
                         **named, camera=name, unknown=unknown, axis=axis, error=float(error[axis]), sigma=sigma[axis]
                     )
         if "depth scale" not in found.held:
-            error = found.scale - (setup.scale if name == setup.names[0] else 1.0)
-            yield Error(**named, camera=name, unknown="depth scale", axis=0, error=error, sigma=found.sigma_depth[0])
+            apart = found.scale - (setup.scale if name == setup.names[0] else 1.0)
+            yield Error(**named, camera=name, unknown="depth scale", axis=0, error=apart, sigma=found.sigma_depth[0])
     if result.calibration.clock is not None:
-        error, sigma = result.calibration.clock - setup.clock, result.calibration.sigma_clock
-        yield Error(**named, camera="", unknown="clock", axis=0, error=error, sigma=sigma)
+        late = result.calibration.clock - setup.clock
+        yield Error(**named, camera="", unknown="clock", axis=0, error=late, sigma=result.calibration.sigma_clock)
 
 
 def errors_of_open3d(setup: SetUp, log: Path) -> Iterator[Error]:
@@ -219,7 +220,7 @@ def trial(kind: str, seed: int, folder: Path) -> list[Error]:
     write_log(setup, log)
     if kind == OPEN3D:
         return list(errors_of_open3d(setup, log))
-    robot = {} if kind == ALONE else ARM
+    robot: dict[str, Any] = {} if kind == ALONE else ARM
     result = calibrate(CalibrateRequest(paths=(log,), out=folder / "calibration.toml", force=True, **robot))
     return list(errors(kind, setup, result))
 

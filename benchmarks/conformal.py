@@ -29,11 +29,11 @@ from splatctrl_cli.jobs.replay.evidence import misses_of
 from splatctrl_cli.jobs.replay.inputs import open_log, read_states
 from splatctrl_cli.jobs.replay.lockstep import reconstruct_scene
 from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
+from splatctrl_cli.jobs.replay.state_pass import ReplayRecord, blocks_of
 from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.recording.container.mcap_writer import mcap_log
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import Float64, JointState
+from splatctrl_cli.records import Float64, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep
 from splatctrl_cli.simulate.arm import Motion, arm_spheres_yaml, arm_urdf
@@ -151,9 +151,9 @@ def recorded(seed: int, folder: Path) -> Recording:
     recording = Recording(options, robot, random_scene(options, robot))
     with mcap_log(folder / "log.mcap") as log:
         log.add_transforms(recording.start_ns, recording.static_transforms(), is_static=True)
-        states = list(recording.joint_states())
-        frames = [frame for step in frame_sets(recording, TRAINING) for frame in step.frames]
-        for record in sorted([*states, *frames], key=lambda record: record.stamp_ns):
+        records: list[JointState | RgbdFrame] = list(recording.joint_states())
+        records += [frame for step in frame_sets(recording, TRAINING) for frame in step.frames]
+        for record in sorted(records, key=lambda record: record.stamp_ns):
             if isinstance(record, JointState):
                 log.add_joint_state(record, recording.robot.joint_names)
             else:
@@ -194,9 +194,9 @@ def audited(inputs: ReplayInputs, recording: Recording, config: Config) -> tuple
     moving = np.flatnonzero(model.moving_spheres)
     radii, over = model.sphere_set.radii[moving], []
     stamps = states.stamp_ns[first:]
-    for begin, end in record.blocks(stamps):
+    for begin, end in blocks_of(scene, model, stamps):
         q = np.asarray(states.position[first + begin : first + end])
-        part = record.measured(stamps[begin:end], q, np.zeros_like(q))
+        part = record.measure_block(stamps[begin:end], q, np.zeros_like(q))
         centers = model.sphere_centers_batch(q)[:, moving]
         for index, stamp in enumerate(stamps[begin:end].tolist()):
             true = float((distance_to(recording.primitives, centers[index], stamp) - radii).min())

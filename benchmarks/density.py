@@ -3,6 +3,8 @@
 A wavy sheet of 1 m x 1 m, l = 2 cm, one core; the distance at 300 points 1 to 20 cm above it, by both weights.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from benchmarks.measure import Options, Result, rms, seconds
@@ -14,7 +16,8 @@ from splatctrl_cli.records import Float64
 
 SIZES = (5_000, 50_000, 500_000)
 NUM_QUICK = 2  # sizes of a quick run: the third takes minutes
-LENGTH = FieldConfig.length_scale
+CONFIG = FieldConfig()
+LENGTH = CONFIG.length_scale
 KINDS = {
     "Matern": (Kernel(length=LENGTH, is_matern=True), GpdfField),
     "Gaussian": (Kernel(length=LENGTH, is_matern=False), SeField),
@@ -51,7 +54,10 @@ def measured(num: int, name: str) -> list[str]:
     voxel_seconds = min(seconds(voxel), seconds(voxel))
     density = found["voxel"] / found["exact"] - 1.0
     radii = np.full(num, 0.005)
-    by_weights = [kind(centers, radii, LENGTH, weights=name).query(points)[0] for name in ("rowsum", "voxel")]
+    by_weights = [
+        kind(Spheres.of(centers, radii), replace(CONFIG, weights=name)).query(points)[0]
+        for name in ("rowsum", "voxel")
+    ]
     distance = by_weights[1] - by_weights[0]
     return [
         *(str(num), name, f"{rms(density):.4f}", f"{np.abs(density).max():.4f}"),

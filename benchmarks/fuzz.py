@@ -253,7 +253,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "samples").mkdir()
-        samples = make_samples(folder / "samples", COMMANDS)
+        samples = make_samples(folder / "samples", tuple(COMMANDS))
         samples = [s for s in samples if args.kinds is None or s.name in args.kinds]
         warm_up(samples, folder)
         start = time.monotonic()

@@ -46,7 +46,7 @@ class Row:
 
 def layout_folders(folder: Path) -> dict[str, tuple[Path, Commands]]:
     """A folder of each dataset layout, and what reads it."""
-    made = {}
+    made: dict[str, tuple[Path, Commands]] = {}
     for name, (leaf, make) in LAYOUTS.items():
         path = folder / name / leaf
         path.mkdir(parents=True)

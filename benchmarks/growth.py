@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def views_on_a_circle(num_views: int) -> list[RgbdFrame]:
         eye = (0.5 + 0.9 * np.cos(angle), 0.9 * np.sin(angle), 0.8)
         camera = replace(cameras(320, 240)[0], T_world_camera=look_at(eye, (0.5, 0.0, 0.0)))
         color, depth = Renderer(camera, [*furniture(), *things()], color_rays=0).image([])
-        place = {"stamp_ns": index, "camera": f"{index:03d}", "color": color}
+        place: dict[str, Any] = {"stamp_ns": index, "camera": f"{index:03d}", "color": color}
         frames.append(plain_frame(depth, camera.intrinsics, camera.T_world_camera, **place))
     return frames
 

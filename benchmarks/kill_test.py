@@ -116,7 +116,7 @@ def kill(
         target = box / task.out
         is_forced = number % 2 == 1
         if is_forced:
-            (shutil.copytree if out.is_dir() else shutil.copy)(out, target)  # type: ignore[operator]
+            (shutil.copytree if out.is_dir() else shutil.copy)(out, target)
         force = ["--force"] if is_forced else []
         moment = moments.uniform(0.0, 1.05 * seconds)
         ended += _wait(_start([*task.arguments, "-o", str(target), *force]), moment)

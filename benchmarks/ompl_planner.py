@@ -73,7 +73,7 @@ def solved(problem: Problem, room: Clearance, *, by_edges: bool) -> Answer | Non
         calls[0] += 1
         return bool(check_edges(room, start[None], end[None], contact=contact).is_free[0])
 
-    class Edges(base.MotionValidator):  # type: ignore[misc]
+    class Edges(base.MotionValidator):
         def checkMotion(self, a: Any, b: Any, last: Any = None) -> bool:
             return is_free(_posture(a, J), _posture(b, J))
 

@@ -40,7 +40,7 @@ from tests.recording.container.test_foxglove import descriptor_set
 from tests.recording.container.test_log_formats import as_ros1_bag, as_ros2_folder
 from tests.recording.folder.make_layout import make_nerfstudio, make_redwood, make_tum
 from tests.recording.log.make_log import LogRecipe, make_log
-from tests.recording.log.test_decoder import encoded_rvl
+from tests.recording.log.make_rvl import encoded_rvl
 
 Read = Callable[[bytes], object]
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8) * 700

@@ -118,7 +118,7 @@ def sample_robot() -> RobotModel:
 def sample_states() -> tuple[JointState, ...]:
     """Its logged joint states, in the model's order."""
     source, model = open_source(SAMPLE / "log.mcap"), sample_robot()
-    order = model.joint_order(source.joint_names)
+    order = [source.joint_names.index(name) for name in model.joint_names]
     return tuple(
         JointState(stamp_ns=r.stamp_ns, position=r.position[order], velocity=r.velocity[order])
         for r in source.records()

@@ -122,7 +122,7 @@ def own_cell(radii: Float64, length: float) -> Cell:
     )
 
 
-def cell_of(length: float, found: Array, truth: Float64) -> Cell:
+def cell_of(length: float, found: Array, truth: Array) -> Cell:
     """What is finite, of where there is a distance at all (a full process may have none)."""
     asked = np.isfinite(truth)
     is_finite = np.isfinite(found)
