@@ -18,6 +18,7 @@ from splatctrl_cli.evaluate.verdict import Outcome, Reason, read_verdict, verdic
 from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 from splatctrl_cli.jobs import audit as module
 from splatctrl_cli.jobs.audit import AuditRequest, AuditResult, audit
+from splatctrl_cli.jobs.compare.judged_runs import read_judged
 from splatctrl_cli.jobs.robot import logged_robot
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import SphereSet
@@ -51,6 +52,12 @@ def test_one_call_leads_from_a_log_to_a_verdict_and_its_page(
     assert 'id="data-replay"' in page and 'id="data-scene"' not in page, "the motion in 3-D"
     assert page.count('<figure class="pair">') == 4, "photo and render of each camera"
     assert json.loads((out / "run.json").read_text())["verdict"] == run["verdict"]
+    assert main(["compare", str(out), str(out)]) == 0
+    compared = read_judged(out).runs
+    assert [*compared] == ["replay", "scene"] and compared["replay"].metrics["min_clearance"] is not None
+    shutil.rmtree(out / "replay")
+    (out / "scene" / "run.json").unlink()
+    expect_refusal("a run of audit, which judges nothing", read_judged, out)
 
 
 @dataclass(kw_only=True)

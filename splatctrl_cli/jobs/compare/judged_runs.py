@@ -26,6 +26,7 @@ from splatctrl_cli.jobs.robot import robot
 from splatctrl_cli.jobs.runs.run_folder import BatchFolder, is_batch, open_batch, open_run, read_columns, read_object
 
 REPLAY_FIELDS = ("exact", "barrier", "certified")
+AUDIT = "audit"
 
 
 @cache
@@ -84,7 +85,7 @@ class Judged:
 
 
 def read_judged(path: Path) -> Judged:
-    """Read the folder of a judging command or a batch. Raises InputError for others."""
+    """Read the folder of a judging command, an audit's steps, or a batch. Raises InputError for others."""
     has_batch, has_run = is_batch(path), (path / "run.json").is_file()
     is_begun = not has_batch and not has_run and path.with_name(path.name + PARTIAL).exists()
     refuse_if(
@@ -97,16 +98,22 @@ def read_judged(path: Path) -> Judged:
     what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
     refuse_if(not has_run, f"{path}: expected the output folder of a command or a batch, got {what}")
     run = open_run(path)
-    command = run.command
+    parts = {run.command: run}
+    if run.command == AUDIT:
+        parts = {file.parent.name: open_run(file.parent) for file in sorted(path.glob("*/run.json"))}
+    judging = {job: part for job, part in parts.items() if part.verdict and part.command in (*scales(), "demo")}
     refuse_if(
-        not run.verdict or command not in (*scales(), "demo"),
-        f"{path}: a run of {command}, which judges nothing",
-        remedy=f"give one of {', '.join(scales())}",
+        not judging,
+        f"{path}: a run of {run.command}, which judges nothing",
+        remedy=f"give one of {', '.join(scales())}, {AUDIT}",
     )
+    recording = path.absolute().name
     return Judged(
         path=path,
         kind="run",
-        runs={command: _read_run(command, path.absolute().name, command, command, run.run, path)},
+        runs={
+            job: _read_run(job, recording, job, part.command, part.run, part.path) for job, part in judging.items()
+        },
     )
 
 
