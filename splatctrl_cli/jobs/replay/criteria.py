@@ -301,7 +301,7 @@ def controller(judged: Judged) -> Iterator[Reason]:
 
 
 def scene_hits(judged: Judged) -> Iterator[Reason]:
-    """Nothing appears inside the arm; judged in closed loop."""
+    """No obstacle appears inside the arm's surface; judged in closed loop."""
     if hits := [change for change in judged.replay.scene_changes if change.is_hit]:
         yield failed(
             sentence=f"obstacles appeared inside the arm {len(hits)} times, first",

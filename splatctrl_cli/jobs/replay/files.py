@@ -110,7 +110,7 @@ def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mappin
         "margin": replay.margin,
         **robot,
         "units": "m, rad, s",
-        "min_clearance": "the smallest exact distance from a moving sphere's surface to the splats",
+        "min_clearance": "the least distance from the surface of a moving link to the splats",
     }
     if replay.outside is not None:
         words["controller"] = replay.outside.name

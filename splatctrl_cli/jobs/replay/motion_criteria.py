@@ -30,7 +30,7 @@ from splatctrl_cli.robot.self_margins import least_gap
 
 
 def clearance(judged: Judged) -> Iterator[Reason]:
-    """The exact distance of every moving sphere to the splats keeps the margin."""
+    """Every moving link's surface (its spheres without meshes) keeps the margin from the splats."""
     represented = lowest(judged.replay.trace["clearance_splats"])
     is_starved = represented is not None and represented >= judged.threshold
     yield from _check_source(judged, "exact", represented if is_starved else None)
@@ -374,7 +374,7 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
     Criterion(name="velocity limits", find=velocity_limits, broken=BROKEN),
     Criterion(name="acceleration limits", find=acceleration_limits, broken=BROKEN),
     Criterion(name="controller", find=controller, broken=BROKEN),
-    Criterion(name="scene hits", find=scene_hits, broken=f"{BROKEN} (contact, margin broken)"),
+    Criterion(name="scene hits", find=scene_hits, broken=f"{BROKEN} (contact)"),
     Criterion(name="goal", find=goal, broken=BROKEN),
     Criterion(name="surface clearance", find=surface_clearance, broken=UNKNOWN),
     Criterion(name="clearance between states", find=clearance_between_states, broken=UNKNOWN),
