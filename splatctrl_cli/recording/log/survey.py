@@ -224,11 +224,9 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
         if entry.calibration is not None and entry.calibration.cut and entry.calibration.is_possible:
             result.damage.remark(f"{message.topic.name}: says {entry.calibration.cut}: K is moved and scaled to that")
     elif kind in STATE_TYPES and (message.topic.definition or kind in STANDARD_TYPES):
-        decoded = decoder.decode(message)
-        states = read_states(decoded, kind, message.log_time_ns)
+        states = read_states(decoder.decode(message), kind, message.log_time_ns)
         if result.by_log_time:
-            late_ns = message.log_time_ns - stamp_ns(decoded.header)
-            states = [replace(state, stamp_ns=state.stamp_ns + late_ns) for state in states]
+            states = [replace(state, stamp_ns=state.log_time_ns) for state in states]
         entry.joints.extend(states)
     elif kind in {TRANSFORM, OPTION} and message.topic.name.startswith("/device_"):
         result.realsense.add(message.topic.name, decoder.decode(message))

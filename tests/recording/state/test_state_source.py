@@ -231,8 +231,10 @@ def test_a_planned_trajectory_alone_is_taken_as_motion(tmp_path: Path) -> None:
         for i, row in enumerate(ramp(20))
     ]
     content = built(kind, header=header(STORE, 0), joint_names=AB, points=points)
-    found = states(opened(write_mcap(tmp_path / "x.mcap", sent("/plan", kind, [content]))))
+    log = write_mcap(tmp_path / "x.mcap", sent("/plan", kind, [content]))
+    found = states(opened(log))
     assert [s.stamp_ns for s in found] == [START_NS + i * STEP_NS for i in range(20)]
+    assert [s.stamp_ns for s in states(opened(log, stamps="log"))] == [s.stamp_ns for s in found]
     assert found[3].position == pytest.approx(ramp(20)[3])
 
 
