@@ -105,7 +105,7 @@ def _better(a: Solution, b: Solution) -> Solution:
         apart = 1e3 * _apart(a, b.estimate)
         raise NotEvaluableError(
             f"calibrate: two solutions that place what is seen {apart:.0f} mm apart fit alike",
-            remedy="put things of other shapes in view of all cameras, or give a start nearer to the truth"
+            remedy="put objects of other shapes in view of all cameras, or give a start nearer to the truth"
             " (--camera-pose)",
         )
     return a if cost_a < cost_b else b

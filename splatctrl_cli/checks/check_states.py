@@ -138,7 +138,7 @@ def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> 
 def _unit_remedy(names: Sequence[str]) -> str:
     if all(name.endswith(".pos") for name in names):
         return (
-            "LeRobot's numbers are -100 to 100 of a calibrated range, or degrees where it was told so (use_degrees):"
+            "LeRobot's numbers are -100 to 100 of a calibrated range, or degrees with use_degrees:"
             " convert them to radians with the arm's calibration file"
         )
     return 'record radians (REP 103), or give them as CSV or NPZ with unit = "deg" (splatctrl help replay, Logs)'

@@ -147,7 +147,7 @@ def _check_outputs(args: argparse.Namespace) -> None:
             refuse_if(
                 out is not None and _places(out) & {*_places(report), *report.absolute().parents},
                 f"--junit {report}: is in --out, which appears whole",
-                remedy="put it beside that",
+                remedy="put it next to that folder",
                 error=UsageError,
             )
     except UsageError:

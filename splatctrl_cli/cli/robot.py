@@ -119,8 +119,8 @@ def _learned_row(part: LearnedLink) -> tuple[object, ...]:
 def _conclude(console: Console, result: CoverageResult) -> int:
     report = result.report
     unclosed = (
-        f"not closed: {', '.join(report.open_links)}: what is said of the surface holds; an inside there is not, "
-        "so spheres stick out of its convex hull"
+        f"not closed: {', '.join(report.open_links)}: distances to the surface are right; without an inside, "
+        "spheres protrude from its convex hull"
     )
     lines = [
         *table(

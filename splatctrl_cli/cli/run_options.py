@@ -23,7 +23,7 @@ def _shard(text: str) -> tuple[int, int]:
 
 REPORT = (
     option("PATH", "the folder of a run, or of a batch", Path),
-    *output("HTML file to write", default="PATH.html, beside PATH"),
+    *output("HTML file to write", default="PATH.html, next to PATH"),
     option(
         "--against BEFORE",
         "say what changed since an earlier run or batch, or a baseline of compare --update-baseline",
@@ -34,7 +34,7 @@ REPORT = (
 )
 VIEW = (
     option("PATH", "a run, scene or field folder, a field.npz, or a splat file", Path),
-    *output("HTML file to write", default="PATH.html, beside PATH"),
+    *output("HTML file to write", default="PATH.html, next to PATH"),
     option("--no-open", "do not open it in a browser"),
     option("--root DIR ...", ROOT, Path, fields={"roots": tuple}),
 )
@@ -117,7 +117,7 @@ SIMULATE = (
     option(
         "--dtu",
         "write PATH/dtu and PATH/idr too: a DTU scan of a static scene, in MVSNet's layout and in IDR's, with masks"
-        " of its things",
+        " of its objects",
     ),
     option("--width PX", "image width", whole(16, 4096, "px"), 320),
     option("--height PX", "image height", whole(16, 4096, "px"), 240),

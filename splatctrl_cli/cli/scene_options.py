@@ -94,7 +94,7 @@ EXPORT = (
         fields={"scene": Path, "path": Path},
     ),
     *output(
-        f"the file to write; its suffix is the format: {', '.join(SPLAT_FORMATS)}", default="SCENE.ply, beside SCENE"
+        f"the file to write; its suffix is the format: {', '.join(SPLAT_FORMATS)}", default="SCENE.ply, next to SCENE"
     ),
     option("--mcap", "write an MCAP for Foxglove, over time (default of --out: SCENE.mcap; splatctrl help report)"),
     option(
@@ -148,7 +148,7 @@ SDF_BAKE = (
         option("--spheres FILE.yaml", "spheres of --urdf (default: the URDF's own)", Path),
         option(
             "--channels NAME,...",
-            f"what is baked beside sdf, of {', '.join(CHANNELS)} (default: {','.join(CHANNELS[:4])})",
+            f"channels to bake besides sdf, of {', '.join(CHANNELS)} (default: {','.join(CHANNELS[:4])})",
             fields={"channels": partial(names_of, "--channels", CHANNELS)},
         ),
         option(
@@ -334,7 +334,7 @@ REPLAY = (  # what people use, and in groups the rest
     option("--truth FILE", "truth.json of a simulated log", Path),
     option(
         "--evidence CAMERA|K",
-        "bound the map's error by depth kept out of it: of this camera, or (--lockstep) of every K-th frame set",
+        "bound the map's error by held-out depth: of this camera, or (--lockstep) of every K-th frame set",
     ),
     either(
         option("--controller MODULE:CLASS", "judge this class, a policy at ws://HOST:PORT, or the one recorded"),

@@ -116,7 +116,7 @@ class SceneConfig(Section, section="scene"):
     refine_depth: Annotated[float, Within(0, 1000, "", "factor on lambda_depth at the end of refining")] = 2.0
     final_rate: Annotated[float, Within(1e-6, 1, "", "share of the learning rates left at the end of refining")] = 0.1
     noise: Annotated[float, Within(0, 1e9, "", "lambda_noise of 3DGS-MCMC; a step is at most half a radius")] = 5e5
-    window: Annotated[int, Within(0, 1000, "", "keyframes kept beside the newest frames; 1000 take 3 GB")] = 12
+    window: Annotated[int, Within(0, 1000, "", "keyframes besides the newest frames; 1000 take 3 GB")] = 12
     keyframe_distance: Annotated[float, Within(0, 100, "m", "a camera that moved farther makes a keyframe")] = 0.05
     keyframe_angle: Annotated[float, Within(0, 180, "deg", "a camera that turned farther makes a keyframe")] = 5.0
     snapshot_every: Annotated[
@@ -263,7 +263,7 @@ class ControlConfig(Section, section="control"):
         float, Within(1e-4, 20, "m/s", "cap of the end effector's speed, usual near people")
     ] = 0.25
     max_angular_speed: Annotated[float, Within(1e-4, 50, "rad/s", "cap of its rotation")] = 1.0
-    twist_timeout: Annotated[float, Within(1e-3, 60, "s", "how long a logged twist holds; then stand still")] = 0.5
+    twist_timeout: Annotated[float, Within(1e-3, 60, "s", "how long a logged twist lasts; then the arm stops")] = 0.5
     max_acceleration: Annotated[
         float | tuple[float, ...],
         Within(0.01, 1000, "rad/s^2", "of every joint, or one number for each; 0: no limit", or_zero=True),

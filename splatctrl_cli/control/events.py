@@ -47,7 +47,7 @@ INTERVENTIONS = frozenset(
         *(EventKind.MINIMUM_VIOLATION, EventKind.HOLD, EventKind.SCALED_BACK),
     }
 )
-"""Kinds in which the controller did something else than it was asked for."""
+"""Kinds in which the controller did not follow its goal."""
 
 SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures with shown events, and their label
 

@@ -215,7 +215,8 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
                 joint = int(differs[0])
                 name, values = self._model.joint_names[joint], (float(velocity[joint]), float(other[joint]))
                 raise Misbehaved(
-                    Fault.DIFFERS, f"two of it, asked the same, differ: {name} {values[0]} and {values[1]} rad/s"
+                    Fault.DIFFERS,
+                    f"two instances answer one input differently: {name} {values[0]} and {values[1]} rad/s",
                 )
         return velocity
 

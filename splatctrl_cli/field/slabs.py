@@ -55,7 +55,7 @@ def _warnings(
         )
     if "gpdf" in kernels and zero_level - radius > length:
         yield (
-            f"the surface of gpdf stands {zero_level * 1e3:.1f} mm before a dense plane of splats, "
+            f"the surface of gpdf lies {zero_level * 1e3:.1f} mm before a dense plane of splats, "
             f"{(zero_level - radius) * 1e3:.1f} mm beyond their radius; a smaller length scale brings it closer"
         )
 
@@ -63,7 +63,7 @@ def _warnings(
 def _set_warnings(centers: Floats, radii: Floats, length: float, *, has_kernel: bool) -> Iterable[str]:
     extent = float(np.ptp(centers.astype(np.float64), axis=0).max())
     if len(centers) > 1 and extent == 0.0:
-        yield f"all {len(centers)} splats stand at one place: the field is that of the largest; check the file"
+        yield f"all {len(centers)} splats have one centre: the field is that of the largest; check the file"
     elif has_kernel and len(centers) > 1 and length > extent:
         yield (
             f"the length scale {length:g} m exceeds the extent of the splats, {extent:.3g} m: "
@@ -75,7 +75,7 @@ def _set_warnings(centers: Floats, radii: Floats, length: float, *, has_kernel: 
     if len(thick) and thick.max() > fixed.MAX_RADIUS_SPREAD * thick.min():
         yield (
             f"radii from {thick.min() * 1e3:.3g} to {thick.max() * 1e3:.3g} mm in one set: "
-            "the median radius and its ratios stand for neither end; check the splats' unit, metres"
+            "the median radius describes neither end; check the splats' unit, metres"
         )
 
 

@@ -269,7 +269,7 @@ def _find_unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
 def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotEvaluableError:
     told = "; ".join(f"{', '.join(names)} of {camera}" for camera, names in unknown.items() if names)
     remedy = (
-        "put things of different shapes where all cameras see them"
+        "put objects of different shapes where all cameras see them"
         + (", turn the moving camera about two axes" if evidence.moving else "")
         + (", or give --urdf of a robot in view" if evidence.arm is None else "")
     )

@@ -75,7 +75,7 @@ class SourceOptions:
             )
 
 
-still_note = "camera {}: stands still where --camera-pose puts it, not where the recording may say".format
+still_note = "camera {}: is fixed where --camera-pose puts it, not where the recording may say".format
 
 
 def refuse_unknown_cameras(where: Path, asked: Iterable[str], known: Collection[str]) -> None:

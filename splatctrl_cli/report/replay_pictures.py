@@ -117,7 +117,7 @@ def evidence_picture(path: Path, seconds: Float64, shares: Float64) -> None:
             linewidth=0,
         )
         axes.set(ylabel="space within the margin [%]", ylim=(0, 100), xlabel="time [s]")
-        axes.set_title("What cameras knew of the space beside the arm", pad=44)
+        axes.set_title("What cameras knew of the space near the arm", pad=44)
         axes.legend(
             frameon=False, loc="lower left", bbox_to_anchor=(-0.01, 0.99), ncols=4, fontsize=10, borderaxespad=0.2
         )

@@ -219,7 +219,7 @@ class RobotModel:
         """Warnings about these spheres, in sentences."""
         name, bare, lost = self.urdf.path.name, ", ".join(self.bare_links), ", ".join(self.left_out)
         sentences = (
-            (bare, f"{name}: no sphere stands for {bare}; nothing is said of the clearance of these links"),
+            (bare, f"{name}: no sphere covers {bare}; the clearance of these links is unknown"),
             (lost, f"spheres of {lost} are left out: {name} has no such link"),
             (self.are_links_renamed, RENAMED),
             (self.held, self.held_words),

@@ -50,8 +50,8 @@ class LearnedLink:
         until = f" until {end} s" if self.end_ns != ALWAYS[1] else ""
         if self.start_ns != ALWAYS[0]:
             until = f" from {start} to {end} s" if until else f" from {start} s on"
-        what = "has a part" if self.is_always else "holds a thing"
-        return f"{self.link} {what}{until} that stands out by {1e3 * self.outside_most:.0f} mm"
+        what = "has a part" if self.is_always else "holds an object"
+        return f"{self.link} {what}{until} that protrudes by {1e3 * self.outside_most:.0f} mm"
 
     @property
     def is_always(self) -> bool:

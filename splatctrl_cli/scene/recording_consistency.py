@@ -41,9 +41,7 @@ class Agreement:
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 
 
-CAUSES = (
-    "poses are off, or so little depth is left (a short range, a clip, holes) that each sees other sides of things"
-)
+CAUSES = "poses are off, or too little depth is left (short range, clip, holes) to see the same sides of objects"
 """Of views that disagree: the depths alone do not tell one from the other."""
 
 

@@ -175,7 +175,7 @@ def test_a_camera_that_sees_a_wall_elsewhere_is_an_error(tmp_path: Path, capsys:
     result = json.loads(printed)
     finding = result["findings"][0]
     assert (code, finding["code"], finding["where"]) == (1, "agreement", "cameras cam0 and cam1")
-    assert "poses are off, or so little depth is left" in finding["remedy"]
+    assert "poses are off, or too little depth is left" in finding["remedy"]
     assert finding["value"] == pytest.approx(100)
     assert "agreement" in result["commands"]["reconstruct"][0] and result["commands"]["ingest"] == []
 

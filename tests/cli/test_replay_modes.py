@@ -199,7 +199,7 @@ def test_a_closed_loop_that_outlasts_the_log_says_so_and_how_to_end_it_sooner(
     assert re.search(r"^driven motion from 0\.00 s of the log to \d\.\d\d s past its end, ", verdict["scope"])
     (reason,) = [each for each in verdict["reasons"] if each["criterion"] == "map age"]
     assert re.match(
-        r"the motion goes on \d\.\d\d s past the end of the log, and the map is up to", reason["sentence"]
+        r"the motion continues \d\.\d\d s past the end of the log, and the map is up to", reason["sentence"]
     )
     assert reason["remedy"].startswith("end it with the log (--set control.max_time=1), start earlier (--start-time)")
     assert "check the cameras" not in capsys.readouterr().out

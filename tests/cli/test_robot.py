@@ -50,7 +50,7 @@ def test_the_table_names_links_and_what_sticks_out(capsys: pytest.CaptureFixture
     assert lines[0].startswith("robot check: PASSED (1 spheres on 2 links)")
     assert (lines[2].split()[:2], lines[4].split()[0]) == (["link", "spheres"], "base")
     assert "no sphere" in lines[4] and "10.0" in lines[5]
-    assert "1 spheres: 100.0 % of the surface outside" in out and "no sphere stands for base" in out
+    assert "1 spheres: 100.0 % of the surface outside" in out and "no sphere covers base" in out
 
 
 def test_gates_hold_a_set_to_its_figures(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:
@@ -75,7 +75,7 @@ def test_an_open_mesh_says_what_guarantee_remains(capsys: pytest.CaptureFixture[
     code, out, _ = run(capsys, "spheres", "--urdf", urdf, "--max-spheres", 3, "-o", tmp_path / "s.yaml", "-q")
     assert code == 0
     assert "cover all of the collision surface (proven)" in out
-    assert "not closed: base: what is said of the surface holds; an inside there is not" in out
+    assert "not closed: base: distances to the surface are right; without an inside" in out
 
 
 def test_spheres_that_are_off_or_of_other_links_are_counted(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:

@@ -310,4 +310,4 @@ def test_two_of_it_must_agree_and_may_talk_much_on_stderr() -> None:
     assert same.failure is None and same.num_answers == 50
     _, other = driven(at_third("answer['velocity'][0] = 0.5 + 1e-9 * os.getpid()"), is_twice=True)
     assert other.failure.fault is Fault.DIFFERS
-    assert other.failure.sentence.startswith("two of it, asked the same, differ: shoulder 0.")
+    assert other.failure.sentence.startswith("two instances answer one input differently: shoulder 0.")

@@ -34,7 +34,7 @@ FINE = square_lattice(0.01)
         (square_lattice(5.0), np.full(100, 5.0), 9.9, ()),
         (FINE, np.r_[0.0, np.full(99, 0.01)], 0.02, ()),
         (FINE, np.r_[0.0, 0.00033, np.full(98, 0.01)], 0.02, ("radii from 0.33 to 10 mm in one set",)),
-        (np.ones((5, 3)), np.full(5, 0.01), 0.02, ("all 5 splats stand at one place",)),
+        (np.ones((5, 3)), np.full(5, 0.01), 0.02, ("all 5 splats have one centre",)),
         (np.ones((1, 3)), np.full(1, 0.01), 0.02, ()),
     ],
 )

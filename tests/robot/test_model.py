@@ -158,7 +158,7 @@ def test_links_without_a_sphere_are_said(plain_arm: Path, real_data: Path, tmp_p
     model = RobotModel.from_urdf(urdf, few)
     assert "link3" not in model.bare_links
     assert {"link0", "link7", "hand"} <= set(model.bare_links)
-    assert "no sphere stands for link0" in model.doubts[0]
+    assert "no sphere covers link0" in model.doubts[0]
     assert "gripper" in model.doubts[1]
     foreign = real_data / "robot_spheres/curobo/curobo/content/configs/robot/franka.yml"
     assert any("same robot" in doubt for doubt in RobotModel.from_urdf(urdf, foreign).doubts)

@@ -149,7 +149,7 @@ def _array(archive: zipfile.ZipFile, name: str) -> Values:
     with archive.open(f"{name}.npy") as stream:
         array = np.lib.format.read_array(stream, allow_pickle=False)
         refuse_if(
-            stream.read(1), f"{name}.npy goes on after its array", error=ValueError
+            stream.read(1), f"{name}.npy has data after its array", error=ValueError
         )  # reading to the end is what checks the sum
     return np.asarray(array, order="C")
 

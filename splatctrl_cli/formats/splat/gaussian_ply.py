@@ -254,7 +254,7 @@ def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
     places = f"{ply.path}: centres up to {largest:.0f} m"
     refuse_if(
         moved > CENTER_SHARE * size,
-        f"{places}: float32, which splats are kept in, has steps of {step:g} m there and would move them by"
+        f"{places}: float32, in which splats are stored, has steps of {step:g} m there and would move them by"
         f" {moved:.3g} m",
         remedy=f"'splatctrl export {ply.path} -o OUT.ply' takes an origin off and names it; give OUT.ply",
         error=RoundedError,

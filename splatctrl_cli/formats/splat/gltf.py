@@ -206,7 +206,7 @@ def _gaussians(path: Path, attributes: Mapping[str, int], table: Callable[[int, 
         where = np.flatnonzero((scales < 0).any(axis=1))[0]
         raise InputError(
             f"{path}: splat {where}: {SCALE}: expected no negative sigma, got {scales[where]}",
-            remedy="drafts of the extension held logarithms there: write it again with a newer tool",
+            remedy="drafts of the extension stored logarithms there: write it again with a newer tool",
         )
     labels = table(attributes["_LABEL"], 1)[:, 0] if "_LABEL" in attributes else np.zeros(len(centers))
     refuse(str(path), "_LABEL", labels, (labels < 0) | (labels > 255) | (labels % 1 != 0), "a whole number 0 to 255")

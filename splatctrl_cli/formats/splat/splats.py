@@ -42,7 +42,7 @@ DTYPE = np.dtype([*((name, "<f4") for name in NAMES), ("label", "u1"), ("density
 REQUIRED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0")
 METRES = ("m", "metre", "metres", "meter", "meters")
 ORIGIN = "origin"  # [m] that was taken off every centre
-SHELL = {"shell": "beyond the robot's reach, rendered only: no surface that distances are kept to"}
+SHELL = {"shell": "beyond the robot's reach, for rendering only: distances ignore it"}
 HEADER_COMMENTS = {
     "frame": "world",
     "units": "metre",

@@ -168,7 +168,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         return None
     refuse_if(
         guess := guessed_unit(request.source),
-        f"{request.source.name}: {guess}; a robot needs lengths in metres that nobody guessed",
+        f"{request.source.name}: {guess}; with a robot, lengths must be measured, in metres",
         remedy="write poses and depth in metres, or leave the robot out",
     )
     try:

@@ -236,7 +236,7 @@ class Reconstruction:
             return False
         budget = min(1000 * math.ceil((1.25 * (least + row.unmet + row.evicted)) / 1000), fixed.MOST_GROWTH * least)
         self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
-        console.log(f"the first frames show more than {least} splats can stand for: takes {budget}")
+        console.log(f"the first frames show more than {least} splats can represent: uses {budget}")
         return True
 
     def _refine(self, fitter: SceneFitter, console: Progress) -> None:

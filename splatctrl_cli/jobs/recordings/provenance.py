@@ -162,7 +162,7 @@ def made_from_mismatches(
         )
     if robot := _robot_difference(made_from, model):
         yield lacking(
-            sentence=f"{path} was told apart from another robot, {robot}",
+            sentence=f"{path} was segmented with another robot, {robot}",
             remedy="reconstruct with this --urdf, or give the one that it was made with",
         )
 
@@ -184,10 +184,10 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
         return f"with joints {', '.join(joints)}"
     theirs, ours = made_from.get("robot_links"), model.extents()
     if theirs is None:
-        return "of which an earlier version kept the joints alone"
+        return "of which an earlier version stored the joints alone"
     for link, (*corners, area) in theirs.items():
         if link not in ours:
-            return f"with link {link}, which this one lacks: nothing else stands for it"
+            return f"with link {link}, which this one does not have"
         off = np.abs(np.subtract(corners, ours[link][:-1])).max()
         if off > fixed.SAME_LINK:
             return f"whose link {link} reaches {1e3 * off:.1f} mm farther, or less far"

@@ -119,7 +119,7 @@ def _end_words(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""
     remedy = f"end it with the log (--set control.max_time={max(lasts, 0.01):.3g}), start earlier (--start-time), or"
-    return f"the motion goes on {judged.past_end_s:.2f} s past the end of the log, and ", f"{remedy} record longer"
+    return f"the motion continues {judged.past_end_s:.2f} s past the end of the log, and ", f"{remedy} record longer"
 
 
 def map_age(judged: Judged) -> Iterator[Reason]:
@@ -289,7 +289,7 @@ def controller(judged: Judged) -> Iterator[Reason]:
     first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)
     found = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
     yield failed(
-        sentence=f"its rows could not be kept at {found} of {len(trace.steps)} steps, first",
+        sentence=f"its rows could not be satisfied at {found} of {len(trace.steps)} steps, first",
         value=float(sum(bad.values())),
         threshold=0.0,
         time_s=first.start_s,

@@ -70,7 +70,7 @@ def choose_scene(
     if request.field is not None:
         if request.config.control.human_margin > request.config.control.margin:
             raise UsageError(
-                "control.human_margin: a baked field does not tell people from things", remedy="give --scene"
+                "control.human_margin: a baked field does not tell people from objects", remedy="give --scene"
             )
         return read_grid_scene(request.field)
     if request.scene is not None:

@@ -239,7 +239,7 @@ def coverage_summary(report: CoverageReport) -> str:
 
 def bare_links(report: CoverageReport) -> str:
     bare = ", ".join(report.bare_links)
-    return f"no sphere stands for {bare}: these links are not judged" if bare else ""
+    return f"no sphere covers {bare}: these links are not judged" if bare else ""
 
 
 def _verdict(

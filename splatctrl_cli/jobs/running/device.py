@@ -153,7 +153,7 @@ def explain_faults(device: Device | FitDevice | None, checkpoint: Path | None = 
         what = "device" if used is None else describe_device(used.as_dict())
         remedy = "start over, with --device cpu if it fails again"
         if checkpoint is not None and checkpoint.is_file():
-            remedy = f"{checkpoint.parent.parent} is kept: go on with --resume, and --device cpu if it fails again"
+            remedy = f"{checkpoint.parent.parent} is kept: continue with --resume, and --device cpu if it fails again"
         kind = DeviceFull if isinstance(error, OutOfMemory) else DeviceFault
         raise kind(f"{what}: {error}", remedy=f"{error.remedy}; {remedy}" if error.remedy else remedy) from error
 

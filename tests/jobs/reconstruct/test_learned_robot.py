@@ -123,12 +123,12 @@ def test_a_hand_may_touch_what_it_takes_and_leaves_at_its_place_and_no_other_lin
     first_ns = int(states.stamp_ns[0])
     found = holding(bare)
     part = replace(found.learned[0], start_ns=first_ns + HELD[0], end_ns=first_ns + HELD[1])
-    assert part.words(first_ns) == "panda_hand holds a thing from 1.00 to 2.00 s that stands out by 50 mm"
-    assert replace(part, end_ns=ALWAYS[1]).words(first_ns).startswith("panda_hand holds a thing from 1.00 s on that")
-    assert replace(part, start_ns=ALWAYS[0]).words(first_ns).startswith("panda_hand holds a thing until 2.00 s that")
+    assert part.words(first_ns) == "panda_hand holds an object from 1.00 to 2.00 s that protrudes by 50 mm"
+    assert replace(part, end_ns=ALWAYS[1]).words(first_ns).startswith("panda_hand holds an object from 1.00 s on")
+    assert replace(part, start_ns=ALWAYS[0]).words(first_ns).startswith("panda_hand holds an object until 2.00 s")
     assert (
         replace(part, start_ns=ALWAYS[0], end_ns=ALWAYS[1]).words(0)
-        == "panda_hand has a part that stands out by 50 mm"
+        == "panda_hand has a part that protrudes by 50 mm"
     )
     model = bare.join_self_model(replace(found, learned=(part,)))
     contacts = [*grasp_contacts(model, states)]

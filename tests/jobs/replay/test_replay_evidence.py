@@ -88,13 +88,13 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "a table among the robot's links": (
         lambda s: of_run(s, metrics={"robot_joints": JOINTS, "robot_links": {"cell": [0, 0, 0, 1, 1, 1, 6]}}),
-        "another robot, with link cell, which this one lacks",
+        "another robot, with link cell, which this one does not have",
     ),
     "depth that no sensor measured": (
         lambda s: of_run(s, metrics={"depth_bend": 0.02}),
         "depth corrected by up to 2.0 %",
     ),
-    "robot of an earlier version": (lambda s: of_run(s, metrics={"robot_joints": JOINTS}), "kept the joints alone"),
+    "robot of an earlier version": (lambda s: of_run(s, metrics={"robot_joints": JOINTS}), "stored the joints alone"),
     "with a calibration": (
         lambda s: of_run(s, inputs={"--calibration cell.toml": "1" * 64}),
         "was made with cell.toml, this log is read without one",
@@ -175,7 +175,7 @@ def test_a_field_knows_the_robot_that_its_scene_was_told_apart_from(
     of_run(scene, metrics={"robot_joints": JOINTS, "robot_links": links})
     _, verdict = stage.replayed("--field", str(baked(stage, scene)))
     said = [reason["sentence"] for reason in verdict["reasons"] if reason["criterion"] == "evidence"]
-    assert ["another robot, with link cell, which this one lacks" in text for text in said] == [True] * len(links)
+    assert ["another robot, with link cell, which this one does not have" in text for text in said] == [True] * len(links)
 
 
 def test_an_altered_field_is_refused(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:

@@ -141,7 +141,7 @@ def test_a_card_that_is_lost_ends_the_run_by_name_and_it_goes_on_elsewhere(
     assert reconstruct(views, tmp_path / "scene", "--device", "cuda", "-q") == 70
     (line,) = capsys.readouterr().err.splitlines()
     assert "cuda:0 (Card, driver 580.1): CUDA_ERROR_ILLEGAL_ADDRESS; " in line
-    assert f"{tmp_path}/scene.partial is kept: go on with --resume" in line
+    assert f"{tmp_path}/scene.partial is kept: continue with --resume" in line
     assert not (tmp_path / "scene").exists()
     assert reconstruct(views, tmp_path / "scene", "--device", "cpu", "--resume", "-q") == 0
     assert [each["device"] for each in run_of(tmp_path / "scene")["metrics"]["devices"]] == ["cuda:0", "cpu"]

@@ -131,7 +131,7 @@ def test_a_bop_scene_without_poses_needs_a_camera_that_stands_still(tmp_path: Pa
     expect_refusal("scene_camera.json has no pose for any image.*give --camera-pose", open_source, folder)
     still = open_source(folder, SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)}))
     assert [frame.T_world_camera[:3, 3].tolist() for frame in frames_of(still)] == [[1.0, 2.0, 3.0]] * 3
-    assert "camera camera: stands still where --camera-pose puts it" in still.loss.notes[0]
+    assert "camera camera: is fixed where --camera-pose puts it" in still.loss.notes[0]
 
 
 def test_frames_with_a_lens_of_their_own_become_a_camera_that_a_capture_keeps_apart(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_depth_is_registered_by_the_extrinsics_and_counted_in_its_own_unit(tmp_p
     near = np.flatnonzero(depth[24] == depth[depth > 0].min())
     assert (near[0], near[-1]) == (30 + shift / 0.6, 33 + shift / 0.6)
     assert frames[0].T_world_camera.tolist() == np.eye(4).tolist()
-    said = "camera device_0: stands still where --camera-pose puts it, not where the recording may say"
+    said = "camera device_0: is fixed where --camera-pose puts it, not where the recording may say"
     assert (source.loss.damaged, source.loss.notes) == (0, [said])
     scaled = frames_of(path, replace(STILL, depth_scale=1e-3))
     assert scaled[0].depth.max() == pytest.approx(2 * DEPTH_M), "what a person gives comes first"
