@@ -175,7 +175,8 @@ def test_a_field_knows_the_robot_that_its_scene_was_told_apart_from(
     of_run(scene, metrics={"robot_joints": JOINTS, "robot_links": links})
     _, verdict = stage.replayed("--field", str(baked(stage, scene)))
     said = [reason["sentence"] for reason in verdict["reasons"] if reason["criterion"] == "evidence"]
-    assert ["another robot, with link cell, which this one does not have" in text for text in said] == [True] * len(links)
+    words = "another robot, with link cell, which this one does not have"
+    assert [words in text for text in said] == [True] * len(links)
 
 
 def test_an_altered_field_is_refused(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
