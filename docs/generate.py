@@ -14,7 +14,7 @@ from splatctrl_cli.formats.splat.gaussian_ply import SplatFormat
 from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.jobs.compare.judged_runs import scales
 from splatctrl_cli.jobs.replay.criteria import Judged
-from splatctrl_cli.jobs.replay.evidence_criteria import ALONE, LIMITS, PROOF, Limit
+from splatctrl_cli.jobs.replay.evidence_criteria import BY_FEW, LIMITS, PROOF, Limit
 from splatctrl_cli.jobs.replay.verdict import CRITERIA
 from splatctrl_cli.recording.folder.image_folder import LAYOUTS
 from splatctrl_cli.recording.folder.layout import Layout
@@ -77,7 +77,7 @@ Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Limit | 
 Registry = tuple[tuple[str, ...], Iterable[Entry]]
 LISTS: dict[str, Registry] = {  # with the words before what follows an entry's first sentence
     "criteria": (("**else**",), CRITERIA),
-    "limits": (("since",), (LIMITS[0], ALONE, *LIMITS[1:], PROOF)),
+    "limits": (("since",), (LIMITS[0], BY_FEW, *LIMITS[1:], PROOF)),
     "metrics": (("",), [*documented()]),
     "splat_formats": (("rounding", "without"), SPLAT_FORMATS.values()),
     "grid_formats": (("for",), GRID_FORMATS.values()),

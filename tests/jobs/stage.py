@@ -94,7 +94,7 @@ class Stage:
             writer.snapshot(stamp_ns, self._splats(stamp_ns), voxels, states)
         last = self.map_stamps[-1]
         writer.finish(last, self._splats(last), self._voxels(last))
-        metrics = {"cameras": ["cam0", "cam1"], "has_clock": True, "stamp_ns": last}
+        metrics = {"cameras": ["cam0", "cam1", "cam2"], "has_clock": True, "stamp_ns": last}
         write_json(folder / "run.json", {"metrics": metrics, "parts": part_digests(folder)} | self.run)
         return folder
 

@@ -14,7 +14,7 @@ from splatctrl_cli.config.fixed import (
     HIDDEN,
     MISPLACED,
     UNSEEN,
-    UNSEEN_ALONE,
+    UNSEEN_BY_FEW,
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.metrics import lowest
@@ -136,11 +136,11 @@ LIMITS = (
         remedy="reconstruct with a larger --box",
     ),
 )
-ALONE = replace(
+BY_FEW = replace(
     LIMITS[0],
-    asked="never seen by a lone camera, of all points within the margin",
-    why="it never sees the far side of the arm, which may hide a whole object",
-    most=UNSEEN_ALONE,
+    asked="never seen by one or two cameras, of all points within the margin",
+    why="the far side of the arm may hide a whole object from them",
+    most=UNSEEN_BY_FEW,
 )
 PROOF = Limit(
     asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
@@ -156,7 +156,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
     """Every class of evidence within the margin of the arm keeps its limit (listed below); at most `--max-unknown`
     of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
-    first = ALONE if len(judged.inputs.scene.cameras or ()) == 1 else LIMITS[0]
+    first = BY_FEW if len(judged.inputs.scene.cameras or ()) in (1, 2) else LIMITS[0]
     for limit in (first, *LIMITS[1:]):
         yield from _check_limit(judged, limit)
     if judged.request.unseen == OCCUPIED:
