@@ -11,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
-from splatctrl_cli.kernels import points
+from splatctrl_cli.kernels import native, points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame, UInt16
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -142,38 +142,29 @@ def find_shadows(depth: Float32, focal: float) -> Bool:
     behind it, always on the same side. The image gives side and baseline (`_baseline`), and z_behind (`_behind`).
     """
     is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / fixed.MASK_EDGE, 1.0)
-    for turn in (1, -1):  # the nearer object is right of its shadow, then left
-        image = np.ascontiguousarray(depth[:, ::turn])
-        column = np.arange(image.shape[1], dtype=np.int32)
-        following = np.where(image > 0, column, np.int32(len(column)))  # column of the next pixel with depth
-        following = np.minimum.accumulate(following[:, ::-1], axis=1)[:, ::-1]
-        baseline = _baseline(image, following, focal)
+    depth = np.ascontiguousarray(depth)
+    for is_turned in (False, True):  # the nearer object is right of its shadow, then left
+        baseline = _baseline(depth, focal, is_turned=is_turned)
         if baseline:
-            rows, columns = np.nonzero((image <= 0) & (following < len(column)))
-            nearer = following[rows, columns]
-            inverse = 1.0 / image[rows, nearer] - 1.0 / _behind(image)[rows, columns]
-            is_beside = nearer - columns <= baseline * focal * inverse + fattened
-            is_shadow[:, ::turn][rows[is_beside], columns[is_beside]] = True
+            native.mark_shadows(
+                depth, _behind(depth), is_turned, baseline * focal, fattened, is_shadow.view(np.uint8)
+            )
     return is_shadow
 
 
-def _baseline(depth: Float32, following: Index, focal: float) -> float:
-    """Baseline [m] of shadows left of nearer objects; 0 without any.
+def _baseline(depth: Float32, focal: float, *, is_turned: bool) -> float:
+    """Baseline [m] of shadows left (is_turned: right) of nearer objects; 0 without any.
 
-    following (H, W): column of the next depth, W = none. Each step nearer by `SHADOW_STEP` gives a baseline by its
-    lost pixels. The median is over the higher half of the steps, weighted by height.
+    Each step nearer by `SHADOW_STEP` gives a baseline by its lost pixels. The median is over the higher half of the
+    steps, weighted by height.
     """
-    following = following[:, 1:]
-    before = depth[:, :-1]
-    after = np.take_along_axis(depth, np.minimum(following, depth.shape[1] - 1), axis=1)
-    is_step = (before > 0) & (after > 0) & (fixed.SHADOW_STEP * before * after <= focal * (before - after))
-    columns = np.nonzero(is_step)[1]
-    if not len(columns):
+    height, lost = np.empty(depth.size, np.float32), np.empty(depth.size, np.int32)
+    num = native.shadow_steps(depth, is_turned, focal, fixed.SHADOW_STEP, height, lost)
+    if not num:
         return 0.0
-    height = focal * (1.0 / after[is_step] - 1.0 / before[is_step])
-    baselines = (following[is_step] - 1 - columns) / height
+    height, lost = height[:num], lost[:num]
     higher = height >= _median(height, height)
-    return min(_median(baselines[higher], height[higher]), fixed.SHADOW_BASELINE)
+    return min(_median(lost[higher] / height[higher], height[higher]), fixed.SHADOW_BASELINE)
 
 
 def _median(values: Float64, weights: Float64) -> float:

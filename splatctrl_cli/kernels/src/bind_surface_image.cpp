@@ -3,6 +3,7 @@
 #include <vector>
 
 #include "bind.h"
+#include "depth_shadows.h"
 #include "points.h"
 #include "surface_image.h"
 #include "surface_pieces.h"
@@ -93,6 +94,30 @@ void bind_surface(nb::module_& m) {
       nb::arg("depth").noconvert(), nb::arg("tolerance").noconvert(), nb::arg("support").noconvert(),
       nb::arg("asked").noconvert(), nb::arg("reach"), nb::arg("variance"), nb::arg("residual"),
       nb::arg("steps").noconvert());
+  m.def(
+      "shadow_steps",
+      [](const Array<const float, nb::ndim<2>>& depth, bool is_turned, float focal, float step,
+         const Array<float>& height, const Array<std::int32_t>& lost) {
+        expect(height.size() == depth.size() && lost.size() == depth.size(), "expected height and lost (H W,)");
+        const ShadowImage image{depth.data(), static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1)),
+                                is_turned};
+        const nb::gil_scoped_release release;
+        return shadow_steps(image, focal, step, height.data(), lost.data());
+      },
+      nb::arg("depth").noconvert(), nb::arg("is_turned"), nb::arg("focal"), nb::arg("step"),
+      nb::arg("height").noconvert(), nb::arg("lost").noconvert());
+  m.def(
+      "mark_shadows",
+      [](const Array<const float, nb::ndim<2>>& depth, const Array<const float>& behind, bool is_turned,
+         float focal_baseline, float fattened, const Array<std::uint8_t>& is_shadow) {
+        expect(behind.size() == depth.size() && is_shadow.size() == depth.size(), "expected images (H, W)");
+        const ShadowImage image{depth.data(), static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1)),
+                                is_turned};
+        const nb::gil_scoped_release release;
+        mark_shadows(image, behind.data(), focal_baseline, fattened, is_shadow.data());
+      },
+      nb::arg("depth").noconvert(), nb::arg("behind").noconvert(), nb::arg("is_turned"), nb::arg("focal_baseline"),
+      nb::arg("fattened"), nb::arg("is_shadow").noconvert());
   m.def(
       "piece_areas",
       [](const Array<const float, nb::ndim<2>>& depth, const Array<const float>& steps, const Array<const double>& area,
