@@ -34,7 +34,7 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
     shown, reach = mask.robot_depth, pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
     chosen &= frame.depth > nearest_within(shown, is_robot, reach) - fixed.CONTACT_REACH  # a quick superset
     chosen &= frame.depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS
-    chosen[chosen] = robot.distance_to_moving(world_points(frame, chosen)) < fixed.CONTACT_REACH
+    chosen[chosen] = robot.is_within(world_points(frame, chosen), fixed.CONTACT_REACH, to_moving=True)
     return chosen
 
 
@@ -95,7 +95,7 @@ def lasts_at_fixed_links(
     Stereo gives pixels outside a link's outline the link's depth in some frames.
     """
     distance = robot.distance(points)
-    is_kept = (distance > fixed.ROBOT_REACH) | (distance >= robot.distance_to_moving(points))
+    is_kept = (distance > fixed.ROBOT_REACH) | (distance >= robot.distance(points, to_moving=True))
     for frame, pixels in zip(frames, lasting, strict=True):
         pixel, z = pixels_at(frame, points)
         depth = frame.depth.ravel()[pixel]
@@ -111,5 +111,5 @@ def hidden_objects(buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, 
     if robot is None:
         return np.zeros(0, np.intp)
     slots = np.flatnonzero(buffer.is_alive & (buffer.labels != Label.ROBOT))
-    slots = slots[robot.distance(buffer.centers[slots]) < fixed.ROBOT_REACH]
+    slots = slots[robot.is_within(buffer.centers[slots], fixed.ROBOT_REACH)]
     return np.asarray(slots[shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT], np.intp)

@@ -164,7 +164,7 @@ def take_in_evidence(
     if robot is not None:
         pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
         occupancy.label_robot(robot.centers, robot.radii, pixels)
-        occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
+        occupancy.forget_hidden(robot.centers, robot.radii, robot.is_within)
         explain_unseen(occupancy, seen, robot)
 
 

@@ -114,7 +114,7 @@ def lost_edges(
         edges = _edges_of(frame, mask, config)
         edges = edges.select(~points.seen_through(edges.centers, cameras, surely, config.see_through))
         if robot is not None and len(edges.radii):
-            edges = edges.select(robot.distance(edges.centers) > config.see_through)
+            edges = edges.select(~robot.is_within(edges.centers, config.see_through))
         found[frame.camera] = edges
     return found
 
@@ -194,7 +194,7 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> 
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
     for frame, mask in seen:
         np.maximum(reasons, _explain_points(points, frame, mask), out=reasons)
-    reasons[robot.distance(points) <= 0] = Unseen.SWEPT
+    reasons[robot.is_within(points, 0.0)] = Unseen.SWEPT
     occupancy.last_seen.reshape(-1)[voxels] = reasons
 
 

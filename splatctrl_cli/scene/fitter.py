@@ -390,7 +390,7 @@ class SceneFitter:
             return Filled()
         radius, is_object = 0.5 * self.config.contact_radius, self._standing_for(Label.OBJECT)
         slots = np.flatnonzero(is_object)
-        is_near = robot.distance_to_moving(self.buffer.centers[slots]) < fixed.CONTACT_REACH
+        is_near = robot.is_within(self.buffer.centers[slots], fixed.CONTACT_REACH, to_moving=True)
         self.buffer.set_radius(slots[is_near], radius)
         splats = self.buffer.splats(self.num_threads, is_object)
         mappable = [view.mappable & pixels for view, pixels in zip(views, steady, strict=True)]
@@ -410,7 +410,7 @@ class SceneFitter:
             return
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
-        slots = slots[robot.distance(self.buffer.centers[slots]) < fixed.ROBOT_REACH]
+        slots = slots[robot.is_within(self.buffer.centers[slots], fixed.ROBOT_REACH)]
         self.buffer.centers[slots] = move_to_surface(self.buffer.centers[slots], views, config.see_through)
         error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
         radii = shrink_radii(

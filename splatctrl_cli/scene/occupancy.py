@@ -150,10 +150,10 @@ class OccupancyMap:
         is_old = (last > 0) & (last <= len(self.step_stamps_ns) - num_steps)
         self.last_seen[i[is_old], j[is_old], k[is_old]] = Unseen.HIDDEN_BY_THING
 
-    def forget_hidden(self, centers: Float64, radii: Float64, distance: Callable[[Float32], Float64]) -> None:
+    def forget_hidden(self, centers: Float64, radii: Float64, is_within: Callable[[Float32, float], Bool]) -> None:
         """Clear solid voxels within the robot that connect to none outside.
 
-        Spheres (S, 3), (S,) [m] contain the robot; distance: points (Q, 3) -> signed distance (Q,) [m].
+        Spheres (S, 3), (S,) [m] contain the robot; is_within: `RobotPosture.is_within`.
         """
         reach = radii.max() + 2.0 * self.config.voxel
         low, high = ((f - self.origin) / self.config.voxel for f in (centers.min(axis=0), centers.max(axis=0)))
@@ -164,7 +164,7 @@ class OccupancyMap:
         is_solid = crop & SOLID > 0
         cells = np.argwhere(is_solid)
         points = (self.origin + self.config.voxel * (start + cells)).astype(np.float32)
-        is_met = distance(points) < 0.5 * np.sqrt(3.0) * self.config.voxel
+        is_met = is_within(points, 0.5 * np.sqrt(3.0) * self.config.voxel)
         groups = label(is_solid, np.ones((3, 3, 3)))[0][is_solid]
         is_forgotten = is_met & ~np.isin(groups, groups[~is_met])
         crop[tuple(cells[is_forgotten].T)] &= np.uint8(~SOLID & 0xFF)

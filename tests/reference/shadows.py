@@ -1,9 +1,11 @@
 """Stereo shadows in NumPy, pixel by pixel of each row; `scene.depth_holes.find_shadows` gives the same bytes."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.records import Bool, Float32
+from splatctrl_cli.records import Bool, Float32, Floats
 
 
 def find_shadows(depth: Float32, focal: float, behind: Float32) -> Bool:
@@ -26,7 +28,7 @@ def _baseline(depth: Float32, focal: np.float32) -> float:
     heights, baselines = [], []
     for row in depth:
         seen = np.flatnonzero(row > 0)
-        for u, following in zip(seen[:-1], seen[1:], strict=True):
+        for u, following in pairwise(seen):
             before, after = row[u], row[following]
             if np.float32(fixed.SHADOW_STEP) * before * after <= focal * (before - after):
                 heights.append(focal * (np.float32(1) / after - np.float32(1) / before))
@@ -38,7 +40,7 @@ def _baseline(depth: Float32, focal: np.float32) -> float:
     return min(_median(np.array(baselines)[higher], height[higher]), fixed.SHADOW_BASELINE)
 
 
-def _median(values: np.ndarray, weights: np.ndarray) -> float:
+def _median(values: Floats, weights: Floats) -> float:
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
