@@ -28,14 +28,18 @@ NO_SEEDS = Seeds(
 )
 
 
+def camera_in_world(frame: RgbdFrame) -> Float64:
+    """Camera (18,) as `back_projected` takes it."""
+    k = frame.intrinsics
+    return pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
+
+
 def world_points(frame: RgbdFrame, mask: Bool | None = None, num_threads: int = 1) -> Float64:
     """Back-projected points [m], world: (K, 3) of a mask (H, W), else (H, W, 3).
 
     The latter are meaningless where depth is 0.
     """
-    k = frame.intrinsics
-    camera = pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
-    points = back_projected(camera, frame.depth, mask, num_threads)
+    points = back_projected(camera_in_world(frame), frame.depth, mask, num_threads)
     return points.reshape(*frame.depth.shape, 3) if mask is None else points
 
 

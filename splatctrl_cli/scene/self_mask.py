@@ -15,6 +15,7 @@ from splatctrl_cli.kernels import Int16, native
 from splatctrl_cli.records import Array, Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.seeding import camera_in_world
 from splatctrl_cli.scene.surface_depth import surface_steps
 from splatctrl_cli.scene.time_steps import AuditRow
 
@@ -208,28 +209,15 @@ def outvote_objects(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64,
     Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
     object pixels become mixed.
     """
-    parts = []
-    for number, (frame, mask) in enumerate(seen):
-        is_robot, is_object = mask.kinds == PixelKind.ROBOT, mask.kinds == PixelKind.OBJECT
-        beside = cv2.dilate(is_robot.view(np.uint8), _window(pixels_of(voxel, frame, mask.robot_depth)))
-        v, u = np.nonzero(is_robot | (is_object & (beside > 0)))
-        points = back_project_pixels(frame.intrinsics, u, v, frame.depth[v, u])
-        cells = np.floor((transform_points(frame.T_world_camera, points) - origin) / voxel + 0.5).astype(np.int64)
-        parts.append(np.column_stack([cells, np.full(len(u), number), v, u, is_object[v, u]]))
-    rows = np.concatenate(parts)
-    of_robot = rows[rows[:, 6] == 0, :3]
-    if not len(of_robot):
-        return [mask for _, mask in seen]
-    low, high = of_robot.min(axis=0), of_robot.max(axis=0)
-    rows = rows[np.all((rows[:, :3] >= low) & (rows[:, :3] <= high), axis=1)]
-    cell = np.ravel_multi_index(tuple((rows[:, :3] - low).T), tuple(high - low + 1))
-    num_robot, num_object = (np.bincount(cell, weights=rows[:, 6] == own) for own in (0, 1))
-    lost = rows[(rows[:, 6] == 1) & (num_object < fixed.VOTE_SHARE * num_robot)[cell]]
-    found = []
-    for number, (_, mask) in enumerate(seen):
-        kinds = mask.kinds.copy()
-        kinds[tuple(lost[lost[:, 3] == number, 4:6].T)] = PixelKind.MIXED
-        found.append(replace(mask, kinds=kinds))
+    beside, found = [], [replace(mask, kinds=mask.kinds.copy()) for _, mask in seen]
+    for frame, mask in seen:
+        reach = pixels_of(voxel, frame, mask.robot_depth)
+        beside.append(cv2.dilate((mask.kinds == PixelKind.ROBOT).view(np.uint8), _window(reach)))
+    native.outvote(
+        [camera_in_world(frame) for frame, _ in seen], [np.ascontiguousarray(frame.depth) for frame, _ in seen],
+        beside, [mask.kinds for mask in found], origin, voxel, fixed.VOTE_SHARE,
+        PixelKind.ROBOT, PixelKind.OBJECT, PixelKind.MIXED,
+    )  # fmt: skip
     return found
 
 

@@ -1,5 +1,7 @@
 """What is asked of many points at once, in NumPy; `kernels.points` gives the same bytes."""
 
+from collections import defaultdict
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -69,3 +71,25 @@ def solid_distance(kind: float, size: Float64, points: Float64) -> Float64:
             return np.asarray(np.hypot(across, np.maximum(along, 0.0)) - size[0])
         beyond = np.stack([across - size[0], along], axis=1)
     return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
+
+
+def outvoted(
+    frames: Sequence[RgbdFrame],
+    robots: Sequence[Bool],
+    objects: Sequence[Bool],
+    origin: Float64,
+    voxel: float,
+    share: float,
+) -> list[Bool]:
+    """Object pixels (H, W) in voxels where all frames count fewer of them than `share` times the robot's pixels."""
+    cells = [np.floor((world_points(frame) - origin) / voxel + 0.5) for frame in frames]
+    votes: dict[tuple[float, ...], list[int]] = defaultdict(lambda: [0, 0])
+    for number, of_kind in enumerate((robots, objects)):
+        for each, pixels in zip(cells, of_kind, strict=True):
+            for cell in each[pixels]:
+                votes[tuple(cell)][number] += 1
+    few = {cell for cell, (num_robot, num_object) in votes.items() if num_object < share * num_robot}
+    return [
+        pixels & np.array([[tuple(cell) in few for cell in row] for row in each])
+        for each, pixels in zip(cells, objects, strict=True)
+    ]

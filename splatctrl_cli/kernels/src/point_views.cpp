@@ -46,10 +46,7 @@ void back_project(const ChosenDepth& image, double* points, int num_threads) {
     double* out = points + 3 * first[chunk];
     for (std::size_t pixel = begin_of(chunk); pixel < begin_of(chunk + 1); ++pixel) {
       if (image.chosen && !image.chosen[pixel]) continue;
-      const double u = static_cast<double>(pixel % image.width), v = static_cast<double>(pixel / image.width);
-      const double z = image.depth[pixel];
-      const double p[3] = {(u - image.cx) / image.fx * z, (v - image.cy) / image.fy * z, z};
-      moved(image.rotation, image.translation, p, out);
+      back_project_pixel(image, pixel, out);
       out += 3;
     }
   });

@@ -34,6 +34,14 @@ struct ChosenDepth {
   const std::uint8_t* chosen;
 };
 
+// The point (3) [m], world, of a pixel.
+inline void back_project_pixel(const ChosenDepth& image, std::size_t pixel, double* point) {
+  const double u = static_cast<double>(pixel % image.width), v = static_cast<double>(pixel / image.width);
+  const double z = image.depth[pixel];
+  const double p[3] = {(u - image.cx) / image.fx * z, (v - image.cy) / image.fy * z, z};
+  moved(image.rotation, image.translation, p, point);
+}
+
 // The points (K, 3) [m], world, of the chosen pixels, row after row.
 void back_project(const ChosenDepth& image, double* points, int num_threads);
 
