@@ -77,8 +77,7 @@ class Contradicted:
         return points_on_rays(frame, self.side * v + middle, self.side * u + middle, end[v, u], config)
 
     def _spread(self, blocks: Bool, shape: tuple[int, ...]) -> Bool:
-        out = np.zeros(shape, bool)
-        pixels = np.kron(blocks, np.ones((self.side, self.side), bool))
+        out, pixels = np.zeros(shape, bool), blocks.repeat(self.side, axis=0).repeat(self.side, axis=1)
         out[: pixels.shape[0], : pixels.shape[1]] = pixels
         return out
 

@@ -52,12 +52,14 @@ def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return np.zeros_like(is_blank)
-    is_shadow = is_blank & find_shadows(frame.depth, frame.intrinsics.fx)
+    is_shadow = find_shadows(frame.depth, frame.intrinsics.fx)
     is_blank &= ~is_shadow
     is_end = _add_shadow(cv2.dilate(is_robot.view(np.uint8), BESIDE_ROBOT) > 0, is_shadow) | ~frame.is_in_view
-    _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
-    open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
-    return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
+    num, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
+    is_closed = np.arange(num) > 0
+    for some in (groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]):
+        is_closed[some] = False
+    return np.asarray(is_closed[groups])
 
 
 def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:

@@ -22,8 +22,8 @@ def nearest_depth(frame: RgbdFrame, reach: float = fixed.NEAREST_REACH, is_robot
 
     `reach` is at the median depth. Robot pixels count only for themselves and neighbours.
     """
-    depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
-    valid = frame.depth[frame.depth > 0]
+    is_valid = frame.depth > 0
+    depth, valid = np.where(is_valid, frame.depth, np.float32(np.inf)), frame.depth[is_valid]
     if not len(valid):
         return depth
     half = max(1, round(reach * frame.intrinsics.fx / float(np.median(valid))))
