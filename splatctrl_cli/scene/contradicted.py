@@ -99,7 +99,7 @@ def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
             if other is not view:
                 is_passed = view.run_through(other, depths)
                 passed[other.v[is_passed], other.u[is_passed]] = other.depth[is_passed]
-        robot = _blocks(mask.robot_depth, view.side).min(axis=2)
+        robot = _reduce(mask.robot_depth, view.side, np.minimum)
         is_before = view.is_lost & (robot > 0) & is_drawn
         depths[is_before] = robot[is_before]
         until.append(_side_by_side(depths, fixed.CONTRADICTING_PIXELS))
@@ -107,7 +107,7 @@ def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
         yield Contradicted(
             side=view.side,
             until=end,
-            is_blank=np.asarray((_blocks(view.frame.depth, view.side) <= 0).all(axis=2)),
+            is_blank=_reduce(view.frame.depth, view.side, np.maximum) <= 0,
             through=_side_by_side(passed, fixed.SEEN_THROUGH_PIXELS),
         )
 
@@ -171,10 +171,11 @@ def mark_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
     return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
 
-def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
-    """Pixels (h, w, side^2) of an image's blocks, without incomplete ones at its ends."""
+def _reduce(image: NDArray[T], side: int, over: np.ufunc) -> NDArray[T]:
+    """Reduce each block of an image to a value (h, w), without incomplete blocks at its ends."""
     h, w = (size // side for size in image.shape)
-    return image[: h * side, : w * side].reshape(h, side, w, side).swapaxes(1, 2).reshape(h, w, side * side)
+    rows = over.reduce(image[: h * side, : w * side].reshape(h, side, w * side), axis=1)
+    return np.asarray(over.reduce(rows.reshape(h, w, side), axis=2))
 
 
 def _is_plane(depth: Float32) -> Bool:
@@ -207,17 +208,18 @@ class _BlockView:
     @classmethod
     def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_BlockView":
         side = max(1, frame.intrinsics.width // fixed.CONTRADICTING_COLUMNS)
-        depth = _blocks(frame.depth, side)
-        nearest, farthest = depth.min(axis=2), depth.max(axis=2)
+        nearest, farthest = (_reduce(frame.depth, side, over) for over in (np.minimum, np.maximum))
         surely = cv2.erode(nearest, BESIDE)  # 0 next to lost pixels
-        is_object = _blocks(mask.kinds == PixelKind.OBJECT, side).all(axis=2)
+        is_object = _reduce(mask.kinds == PixelKind.OBJECT, side, np.logical_and)
         v, u = np.nonzero((surely > 0) & _is_plane(nearest) & _is_plane(farthest) & is_object)
-        middle, mean = side // 2, depth.mean(axis=2)[v, u]
+        middle, (rows, columns) = side // 2, surely.shape
+        blocks = frame.depth[: rows * side, : columns * side].reshape(rows, side, columns, side)
+        mean = blocks[v, :, u].reshape(len(v), side * side).mean(axis=1)
         points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
         is_lost = (
             (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~find_shadows(frame.depth, frame.intrinsics.fx)
         )
-        is_lost = cv2.erode(_blocks(is_lost & frame.is_in_view, side).all(axis=2).view(np.uint8), BESIDE) > 0
+        is_lost = cv2.erode(_reduce(is_lost & frame.is_in_view, side, np.logical_and).view(np.uint8), BESIDE) > 0
         return cls(
             frame=frame,
             side=side,

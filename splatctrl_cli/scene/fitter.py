@@ -34,7 +34,6 @@ from splatctrl_cli.scene.seeding import (
     seeds_at,
     thin_mask,
     thinning,
-    world_points,
 )
 from splatctrl_cli.scene.self_mask import (
     PixelKind,
@@ -224,7 +223,7 @@ class SceneFitter:
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
         """Frame as the optimiser takes it; mask: of a robot in it."""
-        mappable = inside_workspace(frame, world_points(frame), self.workspace, self.occupancy.config.min_range)
+        mappable = inside_workspace(frame, self.workspace, self.occupancy.config.min_range)
         return make_view(
             frame,
             mappable,

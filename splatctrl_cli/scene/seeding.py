@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig, fixed
-from splatctrl_cli.kernels.points import CubeMeans, Cubes, SplatTree, back_projected
+from splatctrl_cli.kernels.points import CubeMeans, Cubes, SplatTree, are_inside, back_projected
 from splatctrl_cli.kernels.raster import pack_camera
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Integers, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
@@ -43,9 +43,10 @@ def world_points(frame: RgbdFrame, mask: Bool | None = None, num_threads: int = 
     return points.reshape(*frame.depth.shape, 3) if mask is None else points
 
 
-def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
+def inside_workspace(frame: RgbdFrame, workspace: Box, min_range: float = 0.0, num_threads: int = 1) -> Bool:
     """Pixels (H, W) in the workspace with valid depth of at least `min_range` [m]."""
-    return np.asarray((frame.depth > 0) & (frame.depth >= min_range) & workspace.contains(points_world))
+    box = (np.asarray(corner, np.float64) for corner in (workspace.lower, workspace.upper))
+    return are_inside(camera_in_world(frame), frame.depth, *box, min_range, num_threads)
 
 
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
@@ -79,11 +80,13 @@ def thin_mask(mask: Bool, every: int) -> Bool:
 
 def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Seeds:
     """Candidates in a mask (H, W)."""
-    focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
+    focal, pixels = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy), np.flatnonzero(mask)
+    if not len(pixels):
+        return NO_SEEDS
     return Seeds(
         centers=world_points(frame, mask, num_threads).astype(np.float32),
-        radii=(frame.depth[mask] / focal).astype(np.float32),
-        colors=frame.color[mask].astype(np.float32) / 255.0,
+        radii=(frame.depth.reshape(-1)[pixels] / focal).astype(np.float32),
+        colors=frame.color.reshape(-1, 3)[pixels].astype(np.float32) / 255.0,
     )
 
 

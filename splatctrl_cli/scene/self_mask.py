@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, fixed
-from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
+from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.kernels import Int16, native
+from splatctrl_cli.kernels import points as kernels
 from splatctrl_cli.records import Array, Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.seeding import camera_in_world
 from splatctrl_cli.scene.surface_depth import surface_steps
 from splatctrl_cli.scene.time_steps import AuditRow
@@ -223,13 +225,7 @@ def outvote_objects(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64,
 
 def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float32]:
     """Flat pixel indices (N,), -1 outside, and depths (N,) [m] of points (N, 3) [m], world."""
-    k = frame.intrinsics
-    there = transform_points(invert_transform(frame.T_world_camera), points)
-    z = there[:, 2].astype(np.float32)
-    pixels = np.floor(project(k, np.where((z > 0)[:, None], there, 1.0)) + 0.5)
-    is_inside = (z > 0) & np.all((pixels >= 0) & (pixels < [k.width, k.height]), axis=1)
-    u, v = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
-    return np.where(is_inside, v * k.width + u, -1), z
+    return kernels.pixels_at(points, camera_array(frame.intrinsics, frame.T_world_camera))
 
 
 def _group_by_link(values: Array, links: Int16, names: Sequence[str]) -> dict[str, Array]:

@@ -44,7 +44,7 @@ def asked(seen: RgbdFrame, shown: Float32, opacity: float, mappable: Bool | None
 
 
 def mappable_in(seen: RgbdFrame, *least: float) -> Bool:
-    return inside_workspace(seen, world_points(seen), WORKSPACE, *least)
+    return inside_workspace(seen, WORKSPACE, *least)
 
 
 def seeds_of(edge: float, beside: Float32 = NOTHING, config: SceneConfig = CONFIG) -> Seeds:
