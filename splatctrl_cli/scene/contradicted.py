@@ -82,15 +82,15 @@ class Contradicted:
         return out
 
 
-def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
+def find_contradicted(seen: Seen, *, is_drawn: bool, each: Each = map) -> Iterator[Contradicted]:
     """Yield what other frames or the drawn robot contradict in each frame of a step.
 
     All rays of a contradicted block and its neighbours cross another frame's surface. They end more than
     `CONTRADICTED` [m] behind it, or have no return, in range and outside stereo shadows, or none from the drawn
     robot. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks that
-    others' rays cross prove no space free.
+    others' rays cross prove no space free. each: a `map` over frames.
     """
-    views = [_BlockView.of(*one) for one in seen]
+    views = list(each(_BlockView.of, *zip(*seen, strict=True)))
     through = [np.zeros_like(view.surely) for view in views]
     until = []
     for (_, mask), view in zip(seen, views, strict=True):
@@ -99,7 +99,7 @@ def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
             if other is not view:
                 is_passed = view.run_through(other, depths)
                 passed[other.v[is_passed], other.u[is_passed]] = other.depth[is_passed]
-        robot = _reduce(mask.robot_depth, view.side, np.minimum)
+        robot = _least(mask.robot_depth, view.side)
         is_before = view.is_lost & (robot > 0) & is_drawn
         depths[is_before] = robot[is_before]
         until.append(_side_by_side(depths, fixed.CONTRADICTING_PIXELS))
@@ -107,7 +107,7 @@ def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
         yield Contradicted(
             side=view.side,
             until=end,
-            is_blank=_reduce(view.frame.depth, view.side, np.maximum) <= 0,
+            is_blank=view.farthest <= 0,
             through=_side_by_side(passed, fixed.SEEN_THROUGH_PIXELS),
         )
 
@@ -124,10 +124,10 @@ def mask_frames(
     if robot is not None:
         seen = list(zip(frames, each(lambda frame: self_mask(frame, robot, config), frames), strict=True))
         others = [[*(other for other in seen if other is not one), *last] for one in seen]
-        masks = [settle_pieces(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
+        masks = list(each(lambda one, asked: settle_pieces(*one, asked, config), seen, others))
         masks = outvote_objects(list(zip(frames, masks, strict=True)), occupancy.origin, config.voxel)
     is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
-    rays = list(find_contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
+    rays = list(find_contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn, each=each))
     masks = list(map(mark_contradicted, masks, rays))
     return [drop_pixels(*one, PixelKind.MIXED) for one in zip(frames, masks, strict=True)], masks, rays
 
@@ -159,23 +159,23 @@ def take_in_evidence(
                 occupancy.mark_unseen(points, reason)
     for points in chain.from_iterable(unanswered):
         occupancy.mark_unseen(points, Unseen.UNANSWERED)
-    occupancy.keep_edges(lost_edges(seen, robot, config))
+    occupancy.keep_edges(lost_edges(seen, robot, config, each))
     if robot is not None:
         pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
         occupancy.label_robot(robot.centers, robot.radii, pixels)
         occupancy.forget_hidden(robot.centers, robot.radii, robot.is_within)
-        explain_unseen(occupancy, seen, robot)
+        explain_unseen(occupancy, seen, robot, each)
 
 
 def mark_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
     return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
 
-def _reduce(image: NDArray[T], side: int, over: np.ufunc) -> NDArray[T]:
-    """Reduce each block of an image to a value (h, w), without incomplete blocks at its ends."""
-    h, w = (size // side for size in image.shape)
-    rows = over.reduce(image[: h * side, : w * side].reshape(h, side, w * side), axis=1)
-    return np.asarray(over.reduce(rows.reshape(h, w, side), axis=2))
+def _least(image: NDArray[T], side: int) -> NDArray[T]:
+    """Least value (h, w) of each block of an image, without incomplete blocks at its ends."""
+    height, width = image.shape
+    least = cv2.erode(image, np.ones((side, side), np.uint8), anchor=(0, 0))
+    return np.ascontiguousarray(least[: height - side + 1 : side, : width - side + 1 : side])
 
 
 def _is_plane(depth: Float32) -> Bool:
@@ -192,13 +192,15 @@ def _is_plane(depth: Float32) -> Bool:
 class _BlockView:
     """A frame in blocks of `side` pixels (h, w): its rays, and the surface that they hit.
 
-    surely (h, w) [m]: depth that all rays of a block and its neighbours reach; is_lost (h, w): they unexpectedly
-    return none. points (K, 3) [m], world: of objects away from depth edges, with block indices (K,), depth (K,) [m].
+    surely (h, w) [m]: depth that all rays of a block and its neighbours reach; farthest (h, w) [m]: of a block;
+    is_lost (h, w): all these rays unexpectedly return none. points (K, 3) [m], world: of objects away from depth
+    edges, with block indices (K,), depth (K,) [m].
     """
 
     frame: RgbdFrame
     side: int
     surely: Float32
+    farthest: Float32
     is_lost: Bool
     points: Float64
     v: Index
@@ -208,9 +210,9 @@ class _BlockView:
     @classmethod
     def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_BlockView":
         side = max(1, frame.intrinsics.width // fixed.CONTRADICTING_COLUMNS)
-        nearest, farthest = (_reduce(frame.depth, side, over) for over in (np.minimum, np.maximum))
+        nearest, farthest = _least(frame.depth, side), -_least(-frame.depth, side)
         surely = cv2.erode(nearest, BESIDE)  # 0 next to lost pixels
-        is_object = _reduce(mask.kinds == PixelKind.OBJECT, side, np.logical_and)
+        is_object = _least((mask.kinds == PixelKind.OBJECT).view(np.uint8), side) > 0
         v, u = np.nonzero((surely > 0) & _is_plane(nearest) & _is_plane(farthest) & is_object)
         middle, (rows, columns) = side // 2, surely.shape
         blocks = frame.depth[: rows * side, : columns * side].reshape(rows, side, columns, side)
@@ -219,11 +221,12 @@ class _BlockView:
         is_lost = (
             (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~find_shadows(frame.depth, frame.intrinsics.fx)
         )
-        is_lost = cv2.erode(_reduce(is_lost & frame.is_in_view, side, np.logical_and).view(np.uint8), BESIDE) > 0
+        is_lost = cv2.erode(_least((is_lost & frame.is_in_view).view(np.uint8), side), BESIDE) > 0
         return cls(
             frame=frame,
             side=side,
             surely=surely,
+            farthest=farthest,
             is_lost=np.asarray(is_lost),
             points=transform_points(frame.T_world_camera, points),
             v=v,

@@ -17,6 +17,7 @@ from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import camera_array
+from splatctrl_cli.scene.seeding import Each
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_at, tolerance_at
 from splatctrl_cli.voxels import LostEdges, Unseen
 
@@ -101,7 +102,7 @@ NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its own outline loses depth, too
 
 
 def lost_edges(
-    seen: Sequence[tuple[RgbdFrame, SelfMask]], robot: RobotPosture | None, config: OccupancyConfig
+    seen: Sequence[tuple[RgbdFrame, SelfMask]], robot: RobotPosture | None, config: OccupancyConfig, each: Each = map
 ) -> dict[str, LostEdges]:
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
@@ -112,9 +113,8 @@ def lost_edges(
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
     found = dict[str, LostEdges]()
-    for frame, mask in seen:
-        edges = _edges_of(frame, mask, config)
-        edges = edges.select(~points.seen_through(edges.centers, cameras, surely, config.see_through))
+    for (frame, _), some in zip(seen, each(lambda one: _edges_of(*one, config), seen), strict=True):
+        edges = some.select(~points.seen_through(some.centers, cameras, surely, config.see_through))
         if robot is not None and len(edges.radii):
             edges = edges.select(~robot.is_within(edges.centers, config.see_through))
         found[frame.camera] = edges
@@ -189,13 +189,13 @@ def _behind(depth: Float32) -> Float32:
 OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
 
 
-def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> None:
+def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture, each: Each = map) -> None:
     """Note why (`Unseen`) no camera ever saw voxels within `ASKED_REACH` of the robot."""
     voxels = occupancy.unexplained(robot.centers, robot.radii + fixed.ASKED_REACH)
     points = occupancy.centers_of(voxels)
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
-    for frame, mask in seen:
-        np.maximum(reasons, _explain_points(points, frame, mask), out=reasons)
+    for of_frame in each(lambda one: _explain_points(points, *one), seen):
+        np.maximum(reasons, of_frame, out=reasons)
     reasons[robot.is_within(points, 0.0)] = Unseen.SWEPT
     occupancy.last_seen.reshape(-1)[voxels] = reasons
 
