@@ -18,6 +18,8 @@ from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
     farthest_within,
+    find_outline,
+    grow_box,
     nearest_within,
     pixels_at,
     pixels_of,
@@ -27,13 +29,14 @@ from splatctrl_cli.scene.self_mask import (
 
 def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Bool:
     """Pixels (H, W) of objects within `CONTACT_REACH` of moving links."""
-    is_robot: Bool = mask.robot_depth > 0
-    chosen: Bool = mask.kinds == PixelKind.OBJECT
-    if not is_robot.any():
-        return np.zeros_like(chosen)
-    shown, reach = mask.robot_depth, pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
-    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - fixed.CONTACT_REACH  # a quick superset
-    chosen &= frame.depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS
+    chosen, outline = np.zeros(mask.kinds.shape, bool), find_outline(mask.robot_depth > 0)
+    if outline is None:
+        return chosen
+    reach = pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
+    box = grow_box(outline, reach, chosen.shape)
+    shown, depth, is_near = mask.robot_depth[box], frame.depth[box], mask.kinds[box] == PixelKind.OBJECT
+    is_near &= depth > nearest_within(shown, shown > 0, reach) - fixed.CONTACT_REACH  # a quick superset
+    chosen[box] = is_near & (depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS)
     chosen[chosen] = robot.is_within(world_points(frame, chosen), fixed.CONTACT_REACH, to_moving=True)
     return chosen
 

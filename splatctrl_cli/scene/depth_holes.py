@@ -18,7 +18,7 @@ from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.seeding import Each
-from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_at, tolerance_at
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_at, pixels_of_mask, tolerance_at
 from splatctrl_cli.voxels import LostEdges, Unseen
 
 BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
@@ -37,8 +37,10 @@ def unanswered_points(
     """
     holes = _holes(frame, robot_depth > 0)
     if before is not None and holes.any() and np.array_equal(before[0].T_world_camera, frame.T_world_camera):
-        _, groups = cv2.connectedComponents(holes.view(np.uint8), connectivity=8)
-        holes &= np.isin(groups, groups[holes & _holes(before[0], before[1].kinds == PixelKind.ROBOT)])
+        num, groups = cv2.connectedComponents(holes.view(np.uint8), connectivity=8)
+        was_hole = np.zeros(num, bool)
+        was_hole[groups[holes & _holes(before[0], before[1].kinds == PixelKind.ROBOT)]] = True
+        holes = was_hole[groups]
     if not holes.any():
         return iter(())
     behind = _nearest_depth(frame.depth)
@@ -65,6 +67,8 @@ def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
 
 def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
     """Robot pixels (H, W) and the stereo shadows that touch them, with their neighbours."""
+    if not is_shadow.any():
+        return is_robot
     _, groups = cv2.connectedComponents(is_shadow.view(np.uint8), connectivity=8)
     is_beside = is_shadow & np.isin(groups, np.unique(groups[is_robot & is_shadow]))
     return np.asarray(is_robot | (cv2.dilate(is_beside.view(np.uint8), BESIDE) > 0))
@@ -131,7 +135,7 @@ def _edges_of(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> Lost
         cv2.dilate(pixels.view(np.uint8), reach) > 0
         for pixels, reach in ((is_object, BESIDE), (is_robot, NEAR_ROBOT))
     )
-    v, u = np.nonzero((frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view)
+    v, u = pixels_of_mask((frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view)
     depths = beside[v, u]
     places = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depths))
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))

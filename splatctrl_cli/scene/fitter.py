@@ -289,7 +289,8 @@ class SceneFitter:
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
         """Fill dead slots at pixels of M_add; the first full view sets the density."""
         found: dict[Label, list[Seeds]] = {Label.OBJECT: [], Label.ROBOT: []}
-        added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
+        shown = [self.descent.rendering(view) for view in views]
+        added = list(self._each(lambda v, its: add_mask(v.frame, its, v.mappable, self.config), views, shown))
         every = thinning(added)
 
         def offered(index: int) -> list[Seeds]:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig, fixed
+from splatctrl_cli.kernels import native
 from splatctrl_cli.kernels.points import CubeMeans, Cubes, SplatTree, are_inside, back_projected
 from splatctrl_cli.kernels.raster import pack_camera
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Integers, RgbdFrame, SplatSet
@@ -56,12 +57,15 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
     lambda_MDE times the median depth error. The median is over explained mappable pixels; the threshold has a floor
     and a ceiling. The map's depth is normalised by opacity.
     """
-    is_hole = rendering.opacity < config.hole_opacity
-    error = rendering.normalised_depth() - frame.depth
-    explained = mappable & ~is_hole
-    median = float(np.median(np.abs(error[explained]))) if explained.any() else 0.0
+    images = (rendering.depth, rendering.opacity, frame.depth)
+    error, sizes = np.empty(frame.depth.shape, np.float32), np.empty(frame.depth.size, np.float32)
+    num = native.depth_errors(
+        *(np.ascontiguousarray(image, np.float32) for image in images), np.ascontiguousarray(mappable).view(np.uint8),
+        config.hole_opacity, fixed.OPAQUE_ENOUGH, error, sizes,
+    )  # fmt: skip
+    median = float(np.median(sizes[:num], overwrite_input=True)) if num else 0.0
     threshold = min(max(config.lambda_mde * median, config.min_depth_error), config.max_depth_error)
-    return np.asarray(mappable & (is_hole | (error > threshold)))
+    return np.asarray(error > threshold)
 
 
 def thinning(masks: Iterable[Bool]) -> int:

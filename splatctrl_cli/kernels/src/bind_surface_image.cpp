@@ -3,6 +3,7 @@
 #include <vector>
 
 #include "bind.h"
+#include "depth_errors.h"
 #include "depth_shadows.h"
 #include "points.h"
 #include "surface_image.h"
@@ -94,6 +95,22 @@ void bind_surface(nb::module_& m) {
       nb::arg("depth").noconvert(), nb::arg("tolerance").noconvert(), nb::arg("support").noconvert(),
       nb::arg("asked").noconvert(), nb::arg("reach"), nb::arg("variance"), nb::arg("residual"),
       nb::arg("steps").noconvert());
+  m.def(
+      "depth_errors",
+      [](const Array<const float>& depth, const Array<const float>& opacity, const Array<const float>& measured,
+         const Array<const std::uint8_t>& counted, float hole, float opaque, const Array<float>& error,
+         const Array<float>& sizes) {
+        const std::size_t size = depth.size();
+        expect(opacity.size() == size && measured.size() == size && counted.size() == size && error.size() == size &&
+                   sizes.size() == size,
+               "expected images (H, W), sizes (H W,)");
+        const nb::gil_scoped_release release;
+        return depth_errors({depth.data(), opacity.data(), measured.data(), counted.data(), size}, hole, opaque,
+                            error.data(), sizes.data());
+      },
+      nb::arg("depth").noconvert(), nb::arg("opacity").noconvert(), nb::arg("measured").noconvert(),
+      nb::arg("counted").noconvert(), nb::arg("hole"), nb::arg("opaque"), nb::arg("error").noconvert(),
+      nb::arg("sizes").noconvert());
   m.def(
       "shadow_steps",
       [](const Array<const float, nb::ndim<2>>& depth, bool is_turned, float focal, float step,
