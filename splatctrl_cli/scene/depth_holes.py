@@ -11,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
-from splatctrl_cli.kernels import native, points
+from splatctrl_cli.kernels import Int32, native, points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame, UInt16
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -62,7 +62,7 @@ def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
     is_closed = np.arange(num) > 0
     for some in (groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]):
         is_closed[some] = False
-    return np.asarray(is_closed[groups])
+    return np.asarray(is_closed[groups]) if is_closed.any() else np.zeros_like(is_blank)
 
 
 def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
@@ -148,27 +148,26 @@ def find_shadows(depth: Float32, focal: float) -> Bool:
     behind it, always on the same side. The image gives side and baseline (`_baseline`), and z_behind (`_behind`).
     """
     is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / fixed.MASK_EDGE, 1.0)
-    depth = np.ascontiguousarray(depth)
-    for is_turned in (False, True):  # the nearer object is right of its shadow, then left
-        baseline = _baseline(depth, focal, is_turned=is_turned)
+    depth, size = np.ascontiguousarray(depth), (2, depth.size)
+    height, lost = np.empty(size, np.float32), np.empty(size, np.int32)
+    counts = native.shadow_steps(depth, focal, fixed.SHADOW_STEP, height, lost)
+    for side, num in enumerate(counts):  # the nearer object is right of its shadow, then left
+        baseline = _baseline(height[side, :num], lost[side, :num])
         if baseline:
             native.mark_shadows(
-                depth, _behind(depth), is_turned, baseline * focal, fattened, is_shadow.view(np.uint8)
+                depth, _behind(depth), side == 1, baseline * focal, fattened, is_shadow.view(np.uint8)
             )
     return is_shadow
 
 
-def _baseline(depth: Float32, focal: float, *, is_turned: bool) -> float:
-    """Baseline [m] of shadows left (is_turned: right) of nearer objects; 0 without any.
+def _baseline(height: Float32, lost: Int32) -> float:
+    """Baseline [m] of shadows; 0 without any.
 
-    Each step nearer by `SHADOW_STEP` gives a baseline by its lost pixels. The median is over the higher half of the
-    steps, weighted by height.
+    Each step (K,) nearer by `SHADOW_STEP` gives a baseline by its lost pixels. The median is over the higher half of
+    the steps, weighted by height.
     """
-    height, lost = np.empty(depth.size, np.float32), np.empty(depth.size, np.int32)
-    num = native.shadow_steps(depth, is_turned, focal, fixed.SHADOW_STEP, height, lost)
-    if not num:
+    if not len(height):
         return 0.0
-    height, lost = height[:num], lost[:num]
     higher = height >= _median(height, height)
     return min(_median(lost[higher] / height[higher], height[higher]), fixed.SHADOW_BASELINE)
 

@@ -1,5 +1,8 @@
 // Rendered surfaces of solids: see kernels/surface.py for shapes.
+#include <nanobind/stl/pair.h>
+
 #include <algorithm>
+#include <utility>
 #include <vector>
 
 #include "bind.h"
@@ -113,25 +116,26 @@ void bind_surface(nb::module_& m) {
       nb::arg("sizes").noconvert());
   m.def(
       "shadow_steps",
-      [](const Array<const float, nb::ndim<2>>& depth, bool is_turned, float focal, float step,
-         const Array<float>& height, const Array<std::int32_t>& lost) {
-        expect(height.size() == depth.size() && lost.size() == depth.size(), "expected height and lost (H W,)");
-        const ShadowImage image{depth.data(), static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1)),
-                                is_turned};
+      [](const Array<const float, nb::ndim<2>>& depth, float focal, float step, const Array<float>& height,
+         const Array<std::int32_t>& lost) {
+        const std::size_t size = depth.size();
+        expect(height.size() == 2 * size && lost.size() == 2 * size, "expected height and lost (2, H W)");
+        const ShadowImage image{depth.data(), static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1))};
+        ShadowSteps right{height.data(), lost.data(), 0}, left{height.data() + size, lost.data() + size, 0};
         const nb::gil_scoped_release release;
-        return shadow_steps(image, focal, step, height.data(), lost.data());
+        shadow_steps(image, focal, step, right, left);
+        return std::make_pair(right.num, left.num);
       },
-      nb::arg("depth").noconvert(), nb::arg("is_turned"), nb::arg("focal"), nb::arg("step"),
-      nb::arg("height").noconvert(), nb::arg("lost").noconvert());
+      nb::arg("depth").noconvert(), nb::arg("focal"), nb::arg("step"), nb::arg("height").noconvert(),
+      nb::arg("lost").noconvert());
   m.def(
       "mark_shadows",
       [](const Array<const float, nb::ndim<2>>& depth, const Array<const float>& behind, bool is_turned,
          float focal_baseline, float fattened, const Array<std::uint8_t>& is_shadow) {
         expect(behind.size() == depth.size() && is_shadow.size() == depth.size(), "expected images (H, W)");
-        const ShadowImage image{depth.data(), static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1)),
-                                is_turned};
+        const ShadowImage image{depth.data(), static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1))};
         const nb::gil_scoped_release release;
-        mark_shadows(image, behind.data(), focal_baseline, fattened, is_shadow.data());
+        mark_shadows(image, is_turned, behind.data(), focal_baseline, fattened, is_shadow.data());
       },
       nb::arg("depth").noconvert(), nb::arg("behind").noconvert(), nb::arg("is_turned"), nb::arg("focal_baseline"),
       nb::arg("fattened"), nb::arg("is_shadow").noconvert());
