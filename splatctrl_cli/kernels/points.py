@@ -26,9 +26,9 @@ def back_projected(camera: Float64, depth: Float32, chosen: Bool | None = None, 
 def are_inside(
     camera: Float64, depth: Float32, low: Float64, high: Float64, min_range: float, num_threads: int = 1
 ) -> Bool:
-    """Pixels (H, W) with depth of at least `min_range` [m] whose points lie in a box, low and high (3,) [m], world.
+    """Pixels (H, W) whose points lie in a box, low and high (3,) [m], world.
 
-    camera, depth: as in `back_projected`.
+    Their depth is at least `min_range` [m]. camera, depth: as in `back_projected`.
     """
     out = np.empty(depth.shape, np.uint8)
     depth = np.ascontiguousarray(depth, np.float32)
@@ -37,9 +37,9 @@ def are_inside(
 
 
 def pixels_at(points: Floats, camera: Float64) -> tuple[Int64, Float32]:
-    """Flat pixel indices (N,), -1 outside, and depths (N,) [m] of points (N, 3) [m], world.
+    """Flat pixel indices (N,), -1 outside, and depths (N,) [m] of points (N, 3).
 
-    camera (18,): `pack_camera`.
+    Points [m], world; camera (18,): `pack_camera`.
     """
     pixel, depth = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
     native.pixels_at(np.ascontiguousarray(points, np.float64), camera, pixel, depth)

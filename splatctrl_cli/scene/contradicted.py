@@ -124,7 +124,7 @@ def mask_frames(
     if robot is not None:
         seen = list(zip(frames, each(lambda frame: self_mask(frame, robot, config), frames), strict=True))
         others = [[*(other for other in seen if other is not one), *last] for one in seen]
-        masks = list(each(lambda one, asked: settle_pieces(*one, asked, config), seen, others))
+        masks = list(each(lambda one, asked: settle_pieces(one[0], one[1], asked, config), seen, others))
         masks = outvote_objects(list(zip(frames, masks, strict=True)), occupancy.origin, config.voxel)
     is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
     rays = list(find_contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn, each=each))

@@ -12,13 +12,13 @@ import numpy as np
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.kernels import Int32, native, points
-from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame, UInt16
+from splatctrl_cli.records import Bool, Float32, Float64, Floats, Index, RgbdFrame, UInt16
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.seeding import Each
-from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_at, pixels_of_mask, tolerance_at
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_at, tolerance_at
 from splatctrl_cli.voxels import LostEdges, Unseen
 
 BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
@@ -117,7 +117,7 @@ def lost_edges(
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
     found = dict[str, LostEdges]()
-    for (frame, _), some in zip(seen, each(lambda one: _edges_of(*one, config), seen), strict=True):
+    for (frame, _), some in zip(seen, each(lambda one: _edges_of(one[0], one[1], config), seen), strict=True):
         edges = some.select(~points.seen_through(some.centers, cameras, surely, config.see_through))
         if robot is not None and len(edges.radii):
             edges = edges.select(~robot.is_within(edges.centers, config.see_through))
@@ -135,7 +135,8 @@ def _edges_of(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> Lost
         cv2.dilate(pixels.view(np.uint8), reach) > 0
         for pixels, reach in ((is_object, BESIDE), (is_robot, NEAR_ROBOT))
     )
-    v, u = pixels_of_mask((frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view)
+    is_lost = (frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view
+    v, u = np.divmod(np.flatnonzero(is_lost), frame.intrinsics.width)
     depths = beside[v, u]
     places = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depths))
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))
@@ -151,12 +152,11 @@ def find_shadows(depth: Float32, focal: float) -> Bool:
     depth, size = np.ascontiguousarray(depth), (2, depth.size)
     height, lost = np.empty(size, np.float32), np.empty(size, np.int32)
     counts = native.shadow_steps(depth, focal, fixed.SHADOW_STEP, height, lost)
-    for side, num in enumerate(counts):  # the nearer object is right of its shadow, then left
-        baseline = _baseline(height[side, :num], lost[side, :num])
+    baselines = [_baseline(height[side, :num], lost[side, :num]) for side, num in enumerate(counts)]
+    behind = _behind(depth) if any(baselines) else depth
+    for side, baseline in enumerate(baselines):  # the nearer object is right of its shadow, then left
         if baseline:
-            native.mark_shadows(
-                depth, _behind(depth), side == 1, baseline * focal, fattened, is_shadow.view(np.uint8)
-            )
+            native.mark_shadows(depth, behind, side == 1, baseline * focal, fattened, is_shadow.view(np.uint8))
     return is_shadow
 
 
@@ -172,7 +172,7 @@ def _baseline(height: Float32, lost: Int32) -> float:
     return min(_median(lost[higher] / height[higher], height[higher]), fixed.SHADOW_BASELINE)
 
 
-def _median(values: Float64, weights: Float64) -> float:
+def _median(values: Floats, weights: Floats) -> float:
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
@@ -197,7 +197,7 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture, eac
     voxels = occupancy.unexplained(robot.centers, robot.radii + fixed.ASKED_REACH)
     points = occupancy.centers_of(voxels)
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
-    for of_frame in each(lambda one: _explain_points(points, *one), seen):
+    for of_frame in each(lambda one: _explain_points(points, one[0], one[1]), seen):
         np.maximum(reasons, of_frame, out=reasons)
     reasons[robot.is_within(points, 0.0)] = Unseen.SWEPT
     occupancy.last_seen.reshape(-1)[voxels] = reasons

@@ -108,7 +108,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     is_sure |= cv2.erode(is_core.view(np.uint8), _window(edge - reach)).view(bool)
     if surface.trees:
         is_near = depth < farthest_within(farthest, wide - reach) + fixed.CONTACT_THICKNESS
-        v, u = pixels_of_mask(beside & is_near & ~is_explained)
+        v, u = np.divmod(np.flatnonzero(beside & is_near & ~is_explained), depth.shape[1])
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
         sure = tolerance_at(depth[v, u], config, fixed.MASK_SURE) + edge * depth[v, u] / np.float32(
             frame.intrinsics.fx
@@ -242,14 +242,8 @@ def find_outline(pixels: Bool) -> tuple[slice, slice] | None:
     return (slice(top, top + height), slice(left, left + width)) if width else None
 
 
-def pixels_of_mask(mask: Bool) -> tuple[Index, Index]:
-    """Rows and columns (K,) of a mask (H, W); much faster than `np.nonzero` of two axes."""
-    v, u = np.divmod(np.flatnonzero(mask), mask.shape[1])
-    return v, u
-
-
 def grow_box(box: tuple[slice, slice], pixels: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Box of rows and columns with so many pixels more on each side, within an image."""
+    """Box with so many pixels more on each side, within an image."""
     rows, columns = (
         slice(max(part.start - pixels, 0), min(part.stop + pixels, size))
         for part, size in zip(box, shape, strict=True)
