@@ -31,8 +31,8 @@ def are_inside(
     Their depth is at least `min_range` [m]. camera, depth: as in `back_projected`.
     """
     out = np.empty(depth.shape, np.uint8)
-    depth = np.ascontiguousarray(depth, np.float32)
-    native.mark_inside(camera, depth, low, high, min_range, out, num_threads)
+    box = np.array([low, high], np.float64)
+    native.mark_inside(camera, np.ascontiguousarray(depth, np.float32), box, min_range, out, num_threads)
     return out.view(bool)
 
 

@@ -102,10 +102,10 @@ class SceneFitter:
         before = {camera: (frame, self.objects[camera]) for camera, frame in known.items()}
         objects = [mask.kinds == PixelKind.OBJECT for mask in masks]
         self.objects |= {frame.camera: pixels for frame, pixels in zip(frames, objects, strict=True)}
-        averaged = self._each(
-            lambda f, pixels: steady_depth(f, before.get(f.camera), pixels, config), frames, objects
+        frames, steady = zip(
+            *self._each(lambda f, pixels: steady_depth(f, before.get(f.camera), pixels, config), frames, objects),
+            strict=True,
         )
-        frames, steady = zip(*averaged, strict=True)
         views = list(self._each(self.view, frames, masks))
         last = {frame.camera: (frame, mask) for frame, mask in self.seen}
         seen = self.seen = list(zip(frames, masks, strict=True))

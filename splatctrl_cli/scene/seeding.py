@@ -46,8 +46,7 @@ def world_points(frame: RgbdFrame, mask: Bool | None = None, num_threads: int = 
 
 def inside_workspace(frame: RgbdFrame, workspace: Box, min_range: float = 0.0, num_threads: int = 1) -> Bool:
     """Pixels (H, W) in the workspace with valid depth of at least `min_range` [m]."""
-    lower, upper = (np.asarray(corner, np.float64) for corner in (workspace.lower, workspace.upper))
-    return are_inside(camera_in_world(frame), frame.depth, lower, upper, min_range, num_threads)
+    return are_inside(camera_in_world(frame), frame.depth, workspace.lower, workspace.upper, min_range, num_threads)
 
 
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:

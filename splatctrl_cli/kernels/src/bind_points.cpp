@@ -75,16 +75,15 @@ void bind_points(nb::module_& m) {
       nb::arg("voxel"), nb::arg("share"), nb::arg("robot"), nb::arg("object"), nb::arg("outvoted"));
   m.def(
       "mark_inside",
-      [](const Array<const double>& camera, const Floats& depth, const Array<const double>& low,
-         const Array<const double>& high, float min_range, const Bytes& is_inside, int num_threads) {
+      [](const Array<const double>& camera, const Floats& depth, const Array<const double>& box, float min_range,
+         const Bytes& is_inside, int num_threads) {
         const ChosenDepth image = image_from(camera, depth, nullptr);
-        expect(low.size() == 3 && high.size() == 3 && is_inside.size() == depth.size(),
-               "expected low and high (3,), is_inside (H, W)");
+        expect(box.size() == 6 && is_inside.size() == depth.size(), "expected box (2, 3), is_inside (H, W)");
         const nb::gil_scoped_release release;
-        mark_inside(image, low.data(), high.data(), min_range, is_inside.data(), num_threads);
+        mark_inside(image, box.data(), box.data() + 3, min_range, is_inside.data(), num_threads);
       },
-      nb::arg("camera").noconvert(), nb::arg("depth").noconvert(), nb::arg("low").noconvert(),
-      nb::arg("high").noconvert(), nb::arg("min_range"), nb::arg("is_inside").noconvert(), nb::arg("num_threads"));
+      nb::arg("camera").noconvert(), nb::arg("depth").noconvert(), nb::arg("box").noconvert(), nb::arg("min_range"),
+      nb::arg("is_inside").noconvert(), nb::arg("num_threads"));
   m.def(
       "pixels_at",
       [](const Array<const double>& points, const Array<const double>& camera, const Array<std::int64_t>& pixel,
