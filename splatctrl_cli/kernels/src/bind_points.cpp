@@ -30,7 +30,8 @@ NearestDepth view_from(const Array<const double>& camera, const float* nearest) 
 ChosenDepth image_from(const Array<const double>& camera, const Floats& depth, const std::uint8_t* chosen) {
   expect(camera.size() == 18, "camera: expected 18 numbers");
   const double* p = camera.data();
-  ChosenDepth image{p[0], p[1], p[2], p[3], static_cast<int>(p[4]), static_cast<int>(p[5]), {}, {}, depth.data(), chosen};
+  ChosenDepth image{p[0], p[1], p[2],         p[3],  static_cast<int>(p[4]), static_cast<int>(p[5]),
+                    {},   {},   depth.data(), chosen};
   expect(depth.size() == static_cast<std::size_t>(p[4] * p[5]), "depth: expected (H, W), as the camera");
   std::copy(p + 6, p + 15, image.rotation);
   std::copy(p + 15, p + 18, image.translation);

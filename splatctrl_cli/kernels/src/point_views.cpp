@@ -80,7 +80,8 @@ void pixels_at(const double* points, int num_points, const NearestDepth& view, s
     project(points + 3 * static_cast<std::size_t>(first), num, view, u, v, z);
     for (int i = 0; i < num; ++i) {
       depth[first + i] = static_cast<float>(z[i]);
-      const bool is_in = depth[first + i] > 0.0f && u[i] >= 0.0 && u[i] < view.width && v[i] >= 0.0 && v[i] < view.height;
+      const bool is_in = depth[first + i] > 0.0f && u[i] >= 0.0 && u[i] < view.width && v[i] >= 0.0 &&
+                         v[i] < view.height;
       pixel[first + i] = is_in ? static_cast<std::int64_t>(v[i]) * view.width + static_cast<std::int64_t>(u[i]) : -1;
     }
   }

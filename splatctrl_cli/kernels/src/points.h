@@ -45,7 +45,8 @@ inline void back_project_pixel(const ChosenDepth& image, std::size_t pixel, doub
 // The points (K, 3) [m], world, of the chosen pixels, row after row.
 void back_project(const ChosenDepth& image, double* points, int num_threads);
 
-// is_inside (H, W): 1 where a pixel has a depth of at least min_range [m], and its point lies in a box, low to high [m].
+// is_inside (H, W): 1 where a pixel has a depth of at least min_range [m], and its point lies in a box, low to
+// high [m].
 void mark_inside(const ChosenDepth& image, const double* low, const double* high, float min_range,
                  std::uint8_t* is_inside, int num_threads);
 
@@ -57,8 +58,8 @@ struct NearestDepth {
   const float* depth;
 };
 
-// Pixel (N), row after row, that shows a point (N, 3), -1 outside the image, and the point's depth (N) [m]. The view's own
-// depth is not used.
+// Pixel (N), row after row, that shows a point (N, 3), -1 outside the image, and the point's depth (N) [m]. The view's
+// own depth is not used.
 void pixels_at(const double* points, int num_points, const NearestDepth& view, std::int64_t* pixel, float* depth);
 
 // is_seen_through (N): 1 where a view measured a depth more than `tolerance` [m] behind a point (N, 3).
