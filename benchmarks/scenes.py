@@ -15,7 +15,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import make_view
 from splatctrl_cli.scene.render import camera_array
-from splatctrl_cli.scene.seeding import inside_workspace, world_points
+from splatctrl_cli.scene.seeding import inside_workspace
 from splatctrl_cli.scene.time_steps import time_steps
 from tests.plain import plain_splats
 
@@ -83,7 +83,7 @@ def sample_problem(num_splats: int) -> FitProblem:
     scene = replace(config.scene, max_splats=num_splats, fill=1.0, gap_reserve=0.0)
     fitter = sample_fitter(replace(config, scene=scene))
     frame = enlarged(fitter.window.newest[0].frame)
-    mappable = inside_workspace(frame, world_points(frame), fitter.workspace, config.occupancy.min_range)
+    mappable = inside_workspace(frame, fitter.workspace, config.occupancy.min_range)
     view = make_view(frame, mappable)
     height, width = view.target.depth.shape
     return FitProblem(

@@ -23,6 +23,29 @@ def back_projected(camera: Float64, depth: Float32, chosen: Bool | None = None, 
     return points
 
 
+def are_inside(
+    camera: Float64, depth: Float32, low: Float64, high: Float64, min_range: float, num_threads: int = 1
+) -> Bool:
+    """Pixels (H, W) whose points lie in a box, low and high (3,) [m], world.
+
+    Their depth is at least `min_range` [m]. camera, depth: as in `back_projected`.
+    """
+    out = np.empty(depth.shape, np.uint8)
+    box = np.array([low, high], np.float64)
+    native.mark_inside(camera, np.ascontiguousarray(depth, np.float32), box, min_range, out, num_threads)
+    return out.view(bool)
+
+
+def pixels_at(points: Floats, camera: Float64) -> tuple[Int64, Float32]:
+    """Flat pixel indices (N,), -1 outside, and depths (N,) [m] of points (N, 3).
+
+    Points [m], world; camera (18,): `pack_camera`.
+    """
+    pixel, depth = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+    native.pixels_at(np.ascontiguousarray(points, np.float64), camera, pixel, depth)
+    return pixel, depth
+
+
 def seen_through(
     points: Float32, cameras: Sequence[Float64], nearest: Sequence[Float32], tolerance: float, num_threads: int = 1
 ) -> Bool:

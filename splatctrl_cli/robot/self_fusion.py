@@ -15,7 +15,7 @@ from splatctrl_cli.config.fixed import MASK_SIGMAS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, invert_transform, project, strided_lens, transform_points
 from splatctrl_cli.kernels import Int16
-from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, RgbdFrame, spread
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Index, Intrinsics, RgbdFrame, spread
 from splatctrl_cli.robot.self_intervals import (
     LEAST_CELLS,
     NUM_CONFIGURATIONS,
@@ -163,7 +163,8 @@ def _views(
         is_near = np.any([_is_in(box, points, reach) for box in near], axis=0)
         v, u = pixels[is_near].T
         points = points[is_near]
-        is_own = surface.distance(T, points, within=tolerance[v, u]) <= tolerance[v, u]
+        most = tolerance[v, u]
+        is_own = surface.distance(T, points, within=most, enough=most) <= most
         links[v[is_own], u[is_own]] = EXPLAINED
         yield _View(
             stamp_ns=frame.stamp_ns, stride=stride, lens=frame.intrinsics, links=links, points_world=points[~is_own],
@@ -351,7 +352,7 @@ def _boxes(surface: RobotSurface) -> Float64:
 
 
 def _is_in(box: Float64, points: Float64, reach: float) -> Bool:
-    return np.asarray(np.all((points >= box[0] - reach) & (points <= box[1] + reach), axis=1))
+    return Box(lower=box[0] - reach, upper=box[1] + reach).contains(points)
 
 
 def _configurations(placed: Float64, step: float) -> Index:

@@ -18,6 +18,8 @@ from splatctrl_cli.scene.self_mask import (
     PixelKind,
     SelfMask,
     farthest_within,
+    find_outline,
+    grow_box,
     nearest_within,
     pixels_at,
     pixels_of,
@@ -27,14 +29,15 @@ from splatctrl_cli.scene.self_mask import (
 
 def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Bool:
     """Pixels (H, W) of objects within `CONTACT_REACH` of moving links."""
-    is_robot: Bool = mask.robot_depth > 0
-    chosen: Bool = mask.kinds == PixelKind.OBJECT
-    if not is_robot.any():
-        return np.zeros_like(chosen)
-    shown, reach = mask.robot_depth, pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
-    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - fixed.CONTACT_REACH  # a quick superset
-    chosen &= frame.depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS
-    chosen[chosen] = robot.distance_to_moving(world_points(frame, chosen)) < fixed.CONTACT_REACH
+    chosen, outline = np.zeros(mask.kinds.shape, bool), find_outline(mask.robot_depth > 0)
+    if outline is None:
+        return chosen
+    reach = pixels_of(fixed.CONTACT_REACH, frame, mask.robot_depth)
+    box = grow_box(outline, reach, chosen.shape)
+    shown, depth, is_near = mask.robot_depth[box], frame.depth[box], mask.kinds[box] == PixelKind.OBJECT
+    is_near &= depth > nearest_within(shown, shown > 0, reach) - fixed.CONTACT_REACH  # a quick superset
+    chosen[box] = is_near & (depth < farthest_within(shown, reach) + fixed.CONTACT_REACH + fixed.CONTACT_THICKNESS)
+    chosen[chosen] = robot.is_within(world_points(frame, chosen), fixed.CONTACT_REACH, to_moving=True)
     return chosen
 
 
@@ -95,7 +98,7 @@ def lasts_at_fixed_links(
     Stereo gives pixels outside a link's outline the link's depth in some frames.
     """
     distance = robot.distance(points)
-    is_kept = (distance > fixed.ROBOT_REACH) | (distance >= robot.distance_to_moving(points))
+    is_kept = (distance > fixed.ROBOT_REACH) | (distance >= robot.distance(points, to_moving=True))
     for frame, pixels in zip(frames, lasting, strict=True):
         pixel, z = pixels_at(frame, points)
         depth = frame.depth.ravel()[pixel]
@@ -111,5 +114,5 @@ def hidden_objects(buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, 
     if robot is None:
         return np.zeros(0, np.intp)
     slots = np.flatnonzero(buffer.is_alive & (buffer.labels != Label.ROBOT))
-    slots = slots[robot.distance(buffer.centers[slots]) < fixed.ROBOT_REACH]
+    slots = slots[robot.is_within(buffer.centers[slots], fixed.ROBOT_REACH)]
     return np.asarray(slots[shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT], np.intp)

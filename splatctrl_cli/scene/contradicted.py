@@ -77,21 +77,20 @@ class Contradicted:
         return points_on_rays(frame, self.side * v + middle, self.side * u + middle, end[v, u], config)
 
     def _spread(self, blocks: Bool, shape: tuple[int, ...]) -> Bool:
-        out = np.zeros(shape, bool)
-        pixels = np.kron(blocks, np.ones((self.side, self.side), bool))
+        out, pixels = np.zeros(shape, bool), blocks.repeat(self.side, axis=0).repeat(self.side, axis=1)
         out[: pixels.shape[0], : pixels.shape[1]] = pixels
         return out
 
 
-def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
+def find_contradicted(seen: Seen, *, is_drawn: bool, each: Each = map) -> Iterator[Contradicted]:
     """Yield what other frames or the drawn robot contradict in each frame of a step.
 
     All rays of a contradicted block and its neighbours cross another frame's surface. They end more than
     `CONTRADICTED` [m] behind it, or have no return, in range and outside stereo shadows, or none from the drawn
     robot. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks that
-    others' rays cross prove no space free.
+    others' rays cross prove no space free. each: a `map` over frames.
     """
-    views = [_BlockView.of(*one) for one in seen]
+    views = list(each(_BlockView.of, *zip(*seen, strict=True)))
     through = [np.zeros_like(view.surely) for view in views]
     until = []
     for (_, mask), view in zip(seen, views, strict=True):
@@ -100,7 +99,7 @@ def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
             if other is not view:
                 is_passed = view.run_through(other, depths)
                 passed[other.v[is_passed], other.u[is_passed]] = other.depth[is_passed]
-        robot = _blocks(mask.robot_depth, view.side).min(axis=2)
+        robot = _least(mask.robot_depth, view.side)
         is_before = view.is_lost & (robot > 0) & is_drawn
         depths[is_before] = robot[is_before]
         until.append(_side_by_side(depths, fixed.CONTRADICTING_PIXELS))
@@ -108,7 +107,7 @@ def find_contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
         yield Contradicted(
             side=view.side,
             until=end,
-            is_blank=np.asarray((_blocks(view.frame.depth, view.side) <= 0).all(axis=2)),
+            is_blank=view.farthest <= 0,
             through=_side_by_side(passed, fixed.SEEN_THROUGH_PIXELS),
         )
 
@@ -125,10 +124,10 @@ def mask_frames(
     if robot is not None:
         seen = list(zip(frames, each(lambda frame: self_mask(frame, robot, config), frames), strict=True))
         others = [[*(other for other in seen if other is not one), *last] for one in seen]
-        masks = [settle_pieces(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
+        masks = list(each(lambda one, asked: settle_pieces(one[0], one[1], asked, config), seen, others))
         masks = outvote_objects(list(zip(frames, masks, strict=True)), occupancy.origin, config.voxel)
     is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
-    rays = list(find_contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
+    rays = list(find_contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn, each=each))
     masks = list(map(mark_contradicted, masks, rays))
     return [drop_pixels(*one, PixelKind.MIXED) for one in zip(frames, masks, strict=True)], masks, rays
 
@@ -160,22 +159,23 @@ def take_in_evidence(
                 occupancy.mark_unseen(points, reason)
     for points in chain.from_iterable(unanswered):
         occupancy.mark_unseen(points, Unseen.UNANSWERED)
-    occupancy.keep_edges(lost_edges(seen, robot, config))
+    occupancy.keep_edges(lost_edges(seen, robot, config, each))
     if robot is not None:
         pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
         occupancy.label_robot(robot.centers, robot.radii, pixels)
-        occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
-        explain_unseen(occupancy, seen, robot)
+        occupancy.forget_hidden(robot.centers, robot.radii, robot.is_within)
+        explain_unseen(occupancy, seen, robot, each)
 
 
 def mark_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
     return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
 
-def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
-    """Pixels (h, w, side^2) of an image's blocks, without incomplete ones at its ends."""
-    h, w = (size // side for size in image.shape)
-    return image[: h * side, : w * side].reshape(h, side, w, side).swapaxes(1, 2).reshape(h, w, side * side)
+def _least(image: NDArray[T], side: int) -> NDArray[T]:
+    """Least value (h, w) of each block of an image, without incomplete blocks at its ends."""
+    height, width = image.shape
+    least = cv2.erode(image, np.ones((side, side), np.uint8), anchor=(0, 0))
+    return np.ascontiguousarray(least[: height - side + 1 : side, : width - side + 1 : side])
 
 
 def _is_plane(depth: Float32) -> Bool:
@@ -192,13 +192,15 @@ def _is_plane(depth: Float32) -> Bool:
 class _BlockView:
     """A frame in blocks of `side` pixels (h, w): its rays, and the surface that they hit.
 
-    surely (h, w) [m]: depth that all rays of a block and its neighbours reach; is_lost (h, w): they unexpectedly
-    return none. points (K, 3) [m], world: of objects away from depth edges, with block indices (K,), depth (K,) [m].
+    surely (h, w) [m]: depth that all rays of a block and its neighbours reach; farthest (h, w) [m]: of a block;
+    is_lost (h, w): all these rays unexpectedly return none. points (K, 3) [m], world: of objects away from depth
+    edges, with block indices (K,), depth (K,) [m].
     """
 
     frame: RgbdFrame
     side: int
     surely: Float32
+    farthest: Float32
     is_lost: Bool
     points: Float64
     v: Index
@@ -208,21 +210,23 @@ class _BlockView:
     @classmethod
     def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_BlockView":
         side = max(1, frame.intrinsics.width // fixed.CONTRADICTING_COLUMNS)
-        depth = _blocks(frame.depth, side)
-        nearest, farthest = depth.min(axis=2), depth.max(axis=2)
+        nearest, farthest = _least(frame.depth, side), -_least(-frame.depth, side)
         surely = cv2.erode(nearest, BESIDE)  # 0 next to lost pixels
-        is_object = _blocks(mask.kinds == PixelKind.OBJECT, side).all(axis=2)
+        is_object = _least((mask.kinds == PixelKind.OBJECT).view(np.uint8), side) > 0
         v, u = np.nonzero((surely > 0) & _is_plane(nearest) & _is_plane(farthest) & is_object)
-        middle, mean = side // 2, depth.mean(axis=2)[v, u]
+        middle, (rows, columns) = side // 2, surely.shape
+        blocks = frame.depth[: rows * side, : columns * side].reshape(rows, side, columns, side)
+        mean = blocks[v, :, u].reshape(len(v), side * side).mean(axis=1)
         points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
         is_lost = (
             (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~find_shadows(frame.depth, frame.intrinsics.fx)
         )
-        is_lost = cv2.erode(_blocks(is_lost & frame.is_in_view, side).all(axis=2).view(np.uint8), BESIDE) > 0
+        is_lost = cv2.erode(_least((is_lost & frame.is_in_view).view(np.uint8), side), BESIDE) > 0
         return cls(
             frame=frame,
             side=side,
             surely=surely,
+            farthest=farthest,
             is_lost=np.asarray(is_lost),
             points=transform_points(frame.T_world_camera, points),
             v=v,

@@ -11,12 +11,13 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import back_project_pixels, transform_points
-from splatctrl_cli.kernels import points
-from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame, UInt16
+from splatctrl_cli.kernels import Int32, native, points
+from splatctrl_cli.records import Bool, Float32, Float64, Floats, Index, RgbdFrame, UInt16
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import camera_array
+from splatctrl_cli.scene.seeding import Each
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_at, tolerance_at
 from splatctrl_cli.voxels import LostEdges, Unseen
 
@@ -36,8 +37,10 @@ def unanswered_points(
     """
     holes = _holes(frame, robot_depth > 0)
     if before is not None and holes.any() and np.array_equal(before[0].T_world_camera, frame.T_world_camera):
-        _, groups = cv2.connectedComponents(holes.view(np.uint8), connectivity=8)
-        holes &= np.isin(groups, groups[holes & _holes(before[0], before[1].kinds == PixelKind.ROBOT)])
+        num, groups = cv2.connectedComponents(holes.view(np.uint8), connectivity=8)
+        was_hole = np.zeros(num, bool)
+        was_hole[groups[holes & _holes(before[0], before[1].kinds == PixelKind.ROBOT)]] = True
+        holes = was_hole[groups]
     if not holes.any():
         return iter(())
     behind = _nearest_depth(frame.depth)
@@ -52,16 +55,20 @@ def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return np.zeros_like(is_blank)
-    is_shadow = is_blank & find_shadows(frame.depth, frame.intrinsics.fx)
+    is_shadow = find_shadows(frame.depth, frame.intrinsics.fx)
     is_blank &= ~is_shadow
     is_end = _add_shadow(cv2.dilate(is_robot.view(np.uint8), BESIDE_ROBOT) > 0, is_shadow) | ~frame.is_in_view
-    _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
-    open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
-    return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
+    num, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
+    is_closed = np.arange(num) > 0
+    for some in (groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]):
+        is_closed[some] = False
+    return np.asarray(is_closed[groups]) if is_closed.any() else np.zeros_like(is_blank)
 
 
 def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
     """Robot pixels (H, W) and the stereo shadows that touch them, with their neighbours."""
+    if not is_shadow.any():
+        return is_robot
     _, groups = cv2.connectedComponents(is_shadow.view(np.uint8), connectivity=8)
     is_beside = is_shadow & np.isin(groups, np.unique(groups[is_robot & is_shadow]))
     return np.asarray(is_robot | (cv2.dilate(is_beside.view(np.uint8), BESIDE) > 0))
@@ -99,7 +106,7 @@ NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its own outline loses depth, too
 
 
 def lost_edges(
-    seen: Sequence[tuple[RgbdFrame, SelfMask]], robot: RobotPosture | None, config: OccupancyConfig
+    seen: Sequence[tuple[RgbdFrame, SelfMask]], robot: RobotPosture | None, config: OccupancyConfig, each: Each = map
 ) -> dict[str, LostEdges]:
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
@@ -110,11 +117,10 @@ def lost_edges(
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
     found = dict[str, LostEdges]()
-    for frame, mask in seen:
-        edges = _edges_of(frame, mask, config)
-        edges = edges.select(~points.seen_through(edges.centers, cameras, surely, config.see_through))
+    for (frame, _), some in zip(seen, each(lambda one: _edges_of(one[0], one[1], config), seen), strict=True):
+        edges = some.select(~points.seen_through(some.centers, cameras, surely, config.see_through))
         if robot is not None and len(edges.radii):
-            edges = edges.select(robot.distance(edges.centers) > config.see_through)
+            edges = edges.select(~robot.is_within(edges.centers, config.see_through))
         found[frame.camera] = edges
     return found
 
@@ -129,7 +135,8 @@ def _edges_of(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> Lost
         cv2.dilate(pixels.view(np.uint8), reach) > 0
         for pixels, reach in ((is_object, BESIDE), (is_robot, NEAR_ROBOT))
     )
-    v, u = np.nonzero((frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view)
+    is_lost = (frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view
+    v, u = np.divmod(np.flatnonzero(is_lost), frame.intrinsics.width)
     depths = beside[v, u]
     places = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depths))
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))
@@ -142,41 +149,30 @@ def find_shadows(depth: Float32, focal: float) -> Bool:
     behind it, always on the same side. The image gives side and baseline (`_baseline`), and z_behind (`_behind`).
     """
     is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / fixed.MASK_EDGE, 1.0)
-    for turn in (1, -1):  # the nearer object is right of its shadow, then left
-        image = np.ascontiguousarray(depth[:, ::turn])
-        column = np.arange(image.shape[1], dtype=np.int32)
-        following = np.where(image > 0, column, np.int32(len(column)))  # column of the next pixel with depth
-        following = np.minimum.accumulate(following[:, ::-1], axis=1)[:, ::-1]
-        baseline = _baseline(image, following, focal)
+    depth, size = np.ascontiguousarray(depth), (2, depth.size)
+    height, lost = np.empty(size, np.float32), np.empty(size, np.int32)
+    counts = native.shadow_steps(depth, focal, fixed.SHADOW_STEP, height, lost)
+    baselines = [_baseline(height[side, :num], lost[side, :num]) for side, num in enumerate(counts)]
+    behind = _behind(depth) if any(baselines) else depth
+    for side, baseline in enumerate(baselines):  # the nearer object is right of its shadow, then left
         if baseline:
-            rows, columns = np.nonzero((image <= 0) & (following < len(column)))
-            nearer = following[rows, columns]
-            inverse = 1.0 / image[rows, nearer] - 1.0 / _behind(image)[rows, columns]
-            is_beside = nearer - columns <= baseline * focal * inverse + fattened
-            is_shadow[:, ::turn][rows[is_beside], columns[is_beside]] = True
+            native.mark_shadows(depth, behind, side == 1, baseline * focal, fattened, is_shadow.view(np.uint8))
     return is_shadow
 
 
-def _baseline(depth: Float32, following: Index, focal: float) -> float:
-    """Baseline [m] of shadows left of nearer objects; 0 without any.
+def _baseline(height: Float32, lost: Int32) -> float:
+    """Baseline [m] of shadows; 0 without any.
 
-    following (H, W): column of the next depth, W = none. Each step nearer by `SHADOW_STEP` gives a baseline by its
-    lost pixels. The median is over the higher half of the steps, weighted by height.
+    Each step (K,) nearer by `SHADOW_STEP` gives a baseline by its lost pixels. The median is over the higher half of
+    the steps, weighted by height.
     """
-    following = following[:, 1:]
-    before = depth[:, :-1]
-    after = np.take_along_axis(depth, np.minimum(following, depth.shape[1] - 1), axis=1)
-    is_step = (before > 0) & (after > 0) & (fixed.SHADOW_STEP * before * after <= focal * (before - after))
-    columns = np.nonzero(is_step)[1]
-    if not len(columns):
+    if not len(height):
         return 0.0
-    height = focal * (1.0 / after[is_step] - 1.0 / before[is_step])
-    baselines = (following[is_step] - 1 - columns) / height
     higher = height >= _median(height, height)
-    return min(_median(baselines[higher], height[higher]), fixed.SHADOW_BASELINE)
+    return min(_median(lost[higher] / height[higher], height[higher]), fixed.SHADOW_BASELINE)
 
 
-def _median(values: Float64, weights: Float64) -> float:
+def _median(values: Floats, weights: Floats) -> float:
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
@@ -196,14 +192,14 @@ def _behind(depth: Float32) -> Float32:
 OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
 
 
-def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> None:
+def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture, each: Each = map) -> None:
     """Note why (`Unseen`) no camera ever saw voxels within `ASKED_REACH` of the robot."""
     voxels = occupancy.unexplained(robot.centers, robot.radii + fixed.ASKED_REACH)
     points = occupancy.centers_of(voxels)
     reasons = np.full(len(points), np.uint16(Unseen.OUT_OF_VIEW))
-    for frame, mask in seen:
-        np.maximum(reasons, _explain_points(points, frame, mask), out=reasons)
-    reasons[robot.distance(points) <= 0] = Unseen.SWEPT
+    for of_frame in each(lambda one: _explain_points(points, one[0], one[1]), seen):
+        np.maximum(reasons, of_frame, out=reasons)
+    reasons[robot.is_within(points, 0.0)] = Unseen.SWEPT
     occupancy.last_seen.reshape(-1)[voxels] = reasons
 
 

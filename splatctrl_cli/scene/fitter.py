@@ -34,7 +34,6 @@ from splatctrl_cli.scene.seeding import (
     seeds_at,
     thin_mask,
     thinning,
-    world_points,
 )
 from splatctrl_cli.scene.self_mask import (
     PixelKind,
@@ -104,10 +103,7 @@ class SceneFitter:
         objects = [mask.kinds == PixelKind.OBJECT for mask in masks]
         self.objects |= {frame.camera: pixels for frame, pixels in zip(frames, objects, strict=True)}
         frames, steady = zip(
-            *(
-                steady_depth(frame, before.get(frame.camera), pixels, config)
-                for frame, pixels in zip(frames, objects, strict=True)
-            ),
+            *self._each(lambda f, pixels: steady_depth(f, before.get(f.camera), pixels, config), frames, objects),
             strict=True,
         )
         views = list(self._each(self.view, frames, masks))
@@ -224,7 +220,7 @@ class SceneFitter:
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
         """Frame as the optimiser takes it; mask: of a robot in it."""
-        mappable = inside_workspace(frame, world_points(frame), self.workspace, self.occupancy.config.min_range)
+        mappable = inside_workspace(frame, self.workspace, self.occupancy.config.min_range)
         return make_view(
             frame,
             mappable,
@@ -293,7 +289,8 @@ class SceneFitter:
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
         """Fill dead slots at pixels of M_add; the first full view sets the density."""
         found: dict[Label, list[Seeds]] = {Label.OBJECT: [], Label.ROBOT: []}
-        added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
+        shown = [self.descent.rendering(view) for view in views]
+        added = list(self._each(lambda v, its: add_mask(v.frame, its, v.mappable, self.config), views, shown))
         every = thinning(added)
 
         def offered(index: int) -> list[Seeds]:
@@ -390,7 +387,7 @@ class SceneFitter:
             return Filled()
         radius, is_object = 0.5 * self.config.contact_radius, self._standing_for(Label.OBJECT)
         slots = np.flatnonzero(is_object)
-        is_near = robot.distance_to_moving(self.buffer.centers[slots]) < fixed.CONTACT_REACH
+        is_near = robot.is_within(self.buffer.centers[slots], fixed.CONTACT_REACH, to_moving=True)
         self.buffer.set_radius(slots[is_near], radius)
         splats = self.buffer.splats(self.num_threads, is_object)
         mappable = [view.mappable & pixels for view, pixels in zip(views, steady, strict=True)]
@@ -410,7 +407,7 @@ class SceneFitter:
             return
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
-        slots = slots[robot.distance(self.buffer.centers[slots]) < fixed.ROBOT_REACH]
+        slots = slots[robot.is_within(self.buffer.centers[slots], fixed.ROBOT_REACH)]
         self.buffer.centers[slots] = move_to_surface(self.buffer.centers[slots], views, config.see_through)
         error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
         radii = shrink_radii(

@@ -58,13 +58,13 @@ def make_view(
         depth=np.ascontiguousarray(frame.depth, np.float32),
         counted=counted.astype(np.uint8),
     )
-    nearest = nearest_depth(frame, reach)
+    nearest, nearest_object = nearest_depth(frame, reach, is_robot)
     return View(
         frame=frame,
         camera=camera_array(frame.intrinsics, frame.T_world_camera),
         target=target,
         nearest=nearest,
-        nearest_object=nearest if is_robot is None else nearest_depth(frame, reach, is_robot),
+        nearest_object=nearest_object,
     )
 
 

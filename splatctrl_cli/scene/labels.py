@@ -51,8 +51,8 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
     is_solid = occupancy.entity_at(buffer.centers) & SOLID > 0
     is_robot = alive & (kind == PixelKind.ROBOT)
     unseen = np.flatnonzero(alive & (kind == PixelKind.NOTHING) & (was_robot | ~is_solid))
-    depth = -robot.distance(buffer.centers[unseen])
-    is_robot[unseen] = np.where(was_robot[unseen], depth > -config.see_through, depth > fixed.WELL_INSIDE)
+    reach = np.where(was_robot[unseen], config.see_through, -fixed.WELL_INSIDE)
+    is_robot[unseen] = robot.is_within(buffer.centers[unseen], reach)
     solid = np.flatnonzero(alive & (kind == PixelKind.NOTHING) & ~was_robot & is_solid)
     is_robot[solid] = robot.holds(buffer.centers[solid], fixed.WELL_INSIDE)
     return is_robot, np.asarray(alive & (kind == PixelKind.OBJECT))

@@ -61,7 +61,7 @@ class OccupancyMap:
         self._was_free = self.log_odds < 0
         masked = [(frame, frame.human) for frame in frames if frame.human is not None]
         entity, log_odds = self.entity.reshape(-1), self.log_odds.reshape(-1)
-        known = np.flatnonzero(entity & (Label.HUMAN | SOLID))
+        known = np.flatnonzero(entity & (Label.HUMAN | SOLID) > 0)
         before = log_odds[known]
         for frame in frames:
             self.integrate(frame)
@@ -106,8 +106,8 @@ class OccupancyMap:
 
     def unexplained(self, centers: Float64, radii: Float64) -> Index:
         """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] with changeable reasons."""
-        is_near = np.zeros_like(self.entity)
-        native.mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
+        is_near = np.zeros(self.entity.shape, bool)
+        native.mark_spheres(self._packed, is_near.view(np.uint8), centers, radii, 1, self.num_threads)
         voxels = np.flatnonzero(is_near)
         last = self.last_seen.reshape(-1)[voxels]
         is_open = (last == 0) | (last >= Unseen.OUT_OF_VIEW) & (last < Unseen.CONTRADICTED)
@@ -125,35 +125,36 @@ class OccupancyMap:
         seen: frames of one time step, pixels (H, W) of robot and objects. A voxel that an object pixel hits is solid,
         not robot, until rays pass or robot pixels alone hit; a swept one falls to the log-odds of one hit.
         """
-        was_solid = self.entity & SOLID > 0
+        before, entity, log_odds = self.entity.flatten(), self.entity.reshape(-1), self.log_odds.reshape(-1)
         self.mark_robot(centers, radii)
         for frame, is_robot, _ in seen:
-            self._label_hits(frame, is_robot, set_bits=Label.ROBOT | SWEPT)
-            self._label_hits(frame, is_robot, clear_bits=SOLID)
+            self._label_hits(frame, is_robot, set_bits=Label.ROBOT | SWEPT, clear_bits=SOLID)
         for frame, _, is_object in seen:
             self._label_hits(frame, is_object, set_bits=SOLID)
-        self.entity[self.entity & SOLID > 0] &= np.uint8(~Label.ROBOT & 0xFF)
-        is_new = (self.entity & (SWEPT | SOLID) == SWEPT | SOLID) & ~was_solid
-        self.log_odds[is_new] = np.minimum(self.log_odds[is_new], self.config.log_odds_hit)
-        arrived = np.argwhere(self._was_free & (self.entity & SOLID > 0))
+        solid = np.flatnonzero(entity & SOLID > 0)
+        entity[solid] &= np.uint8(~Label.ROBOT & 0xFF)
+        new = solid[(entity[solid] & SWEPT > 0) & (before[solid] & SOLID == 0)]
+        log_odds[new] = np.minimum(log_odds[new], self.config.log_odds_hit)
+        arrived = solid[self._was_free.reshape(-1)[solid]]
         self._hide_beside(arrived, math.ceil(len(self.edges) / max(len(seen), 1)))
 
     def _hide_beside(self, arrived: Index, num_steps: int) -> None:
-        """Forget views of space within `HIDDEN` of voxels (K, 3), before the last `num_steps` steps.
+        """Forget views of space within `HIDDEN` of voxels (K,), before the last `num_steps` steps.
 
         The unseen side of an object that arrived may fill that space.
         """
         reach = math.ceil(fixed.HIDDEN / self.config.voxel)
-        around = (arrived[:, None] + np.argwhere(np.ones(3 * [2 * reach + 1])) - reach).reshape(-1, 3)
+        cells = np.stack(np.unravel_index(arrived, self.entity.shape), axis=1)
+        around = (cells[:, None] + np.argwhere(np.ones(3 * [2 * reach + 1])) - reach).reshape(-1, 3)
         i, j, k = around[np.all((around >= 0) & (around < self.last_seen.shape), axis=1)].T
         last = self.last_seen[i, j, k]
         is_old = (last > 0) & (last <= len(self.step_stamps_ns) - num_steps)
         self.last_seen[i[is_old], j[is_old], k[is_old]] = Unseen.HIDDEN_BY_THING
 
-    def forget_hidden(self, centers: Float64, radii: Float64, distance: Callable[[Float32], Float64]) -> None:
+    def forget_hidden(self, centers: Float64, radii: Float64, is_within: Callable[[Float32, float], Bool]) -> None:
         """Clear solid voxels within the robot that connect to none outside.
 
-        Spheres (S, 3), (S,) [m] contain the robot; distance: points (Q, 3) -> signed distance (Q,) [m].
+        Spheres (S, 3), (S,) [m] contain the robot; is_within: `RobotPosture.is_within`.
         """
         reach = radii.max() + 2.0 * self.config.voxel
         low, high = ((f - self.origin) / self.config.voxel for f in (centers.min(axis=0), centers.max(axis=0)))
@@ -164,7 +165,7 @@ class OccupancyMap:
         is_solid = crop & SOLID > 0
         cells = np.argwhere(is_solid)
         points = (self.origin + self.config.voxel * (start + cells)).astype(np.float32)
-        is_met = distance(points) < 0.5 * np.sqrt(3.0) * self.config.voxel
+        is_met = is_within(points, 0.5 * np.sqrt(3.0) * self.config.voxel)
         groups = label(is_solid, np.ones((3, 3, 3)))[0][is_solid]
         is_forgotten = is_met & ~np.isin(groups, groups[~is_met])
         crop[tuple(cells[is_forgotten].T)] &= np.uint8(~SOLID & 0xFF)

@@ -17,19 +17,23 @@ from splatctrl_cli.scene.self_mask import least_within
 REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak", "evicted")
 
 
-def nearest_depth(frame: RgbdFrame, reach: float = fixed.NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
-    """Least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
+def nearest_depth(
+    frame: RgbdFrame, reach: float = fixed.NEAREST_REACH, is_robot: Bool | None = None
+) -> tuple[Float32, Float32]:
+    """Least valid depth (H, W) [m] within `reach` [m] of each pixel, inf without any; the same of all but the robot.
 
-    `reach` is at the median depth. Robot pixels count only for themselves and neighbours.
+    `reach` is at the median depth. Robot pixels then count only for themselves and neighbours.
     """
-    depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
-    valid = frame.depth[frame.depth > 0]
+    is_valid = frame.depth > 0
+    depth, valid = np.where(is_valid, frame.depth, np.float32(np.inf)), frame.depth[is_valid]
     if not len(valid):
-        return depth
+        return depth, depth
     half = max(1, round(reach * frame.intrinsics.fx / float(np.median(valid))))
+    nearest = least_within(depth, half)
     if is_robot is None or not is_robot.any():
-        return least_within(depth, half)
-    return np.minimum(least_within(np.where(is_robot, np.float32(np.inf), depth), half), least_within(depth, 1))
+        return nearest, nearest
+    others = least_within(np.where(is_robot, np.float32(np.inf), depth), half)
+    return nearest, np.minimum(others, least_within(depth, 1))
 
 
 def removals(

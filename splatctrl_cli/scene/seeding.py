@@ -15,7 +15,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig, fixed
-from splatctrl_cli.kernels.points import CubeMeans, Cubes, SplatTree, back_projected
+from splatctrl_cli.kernels import native
+from splatctrl_cli.kernels.points import CubeMeans, Cubes, SplatTree, are_inside, back_projected
 from splatctrl_cli.kernels.raster import pack_camera
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Integers, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
@@ -28,20 +29,24 @@ NO_SEEDS = Seeds(
 )
 
 
+def camera_in_world(frame: RgbdFrame) -> Float64:
+    """Camera (18,) as `back_projected` takes it."""
+    k = frame.intrinsics
+    return pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
+
+
 def world_points(frame: RgbdFrame, mask: Bool | None = None, num_threads: int = 1) -> Float64:
     """Back-projected points [m], world: (K, 3) of a mask (H, W), else (H, W, 3).
 
     The latter are meaningless where depth is 0.
     """
-    k = frame.intrinsics
-    camera = pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
-    points = back_projected(camera, frame.depth, mask, num_threads)
+    points = back_projected(camera_in_world(frame), frame.depth, mask, num_threads)
     return points.reshape(*frame.depth.shape, 3) if mask is None else points
 
 
-def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
+def inside_workspace(frame: RgbdFrame, workspace: Box, min_range: float = 0.0, num_threads: int = 1) -> Bool:
     """Pixels (H, W) in the workspace with valid depth of at least `min_range` [m]."""
-    return np.asarray((frame.depth > 0) & (frame.depth >= min_range) & workspace.contains(points_world))
+    return are_inside(camera_in_world(frame), frame.depth, workspace.lower, workspace.upper, min_range, num_threads)
 
 
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
@@ -51,12 +56,15 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
     lambda_MDE times the median depth error. The median is over explained mappable pixels; the threshold has a floor
     and a ceiling. The map's depth is normalised by opacity.
     """
-    is_hole = rendering.opacity < config.hole_opacity
-    error = rendering.normalised_depth() - frame.depth
-    explained = mappable & ~is_hole
-    median = float(np.median(np.abs(error[explained]))) if explained.any() else 0.0
+    images = (rendering.depth, rendering.opacity, frame.depth)
+    error, sizes = np.empty(frame.depth.shape, np.float32), np.empty(frame.depth.size, np.float32)
+    num = native.depth_errors(
+        *(np.ascontiguousarray(image, np.float32) for image in images), np.ascontiguousarray(mappable).view(np.uint8),
+        config.hole_opacity, fixed.OPAQUE_ENOUGH, error, sizes,
+    )  # fmt: skip
+    median = float(np.median(sizes[:num], overwrite_input=True)) if num else 0.0
     threshold = min(max(config.lambda_mde * median, config.min_depth_error), config.max_depth_error)
-    return np.asarray(mappable & (is_hole | (error > threshold)))
+    return np.asarray(error > threshold)
 
 
 def thinning(masks: Iterable[Bool]) -> int:
@@ -75,11 +83,13 @@ def thin_mask(mask: Bool, every: int) -> Bool:
 
 def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Seeds:
     """Candidates in a mask (H, W)."""
-    focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
+    focal, pixels = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy), np.flatnonzero(mask)
+    if not len(pixels):
+        return NO_SEEDS
     return Seeds(
         centers=world_points(frame, mask, num_threads).astype(np.float32),
-        radii=(frame.depth[mask] / focal).astype(np.float32),
-        colors=frame.color[mask].astype(np.float32) / 255.0,
+        radii=(frame.depth.reshape(-1)[pixels] / focal).astype(np.float32),
+        colors=frame.color.reshape(-1, 3)[pixels].astype(np.float32) / 255.0,
     )
 
 

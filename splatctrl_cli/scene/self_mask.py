@@ -10,11 +10,14 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, fixed
-from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
+from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.kernels import Int16, native
+from splatctrl_cli.kernels import points as kernels
 from splatctrl_cli.records import Array, Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.render import camera_array
+from splatctrl_cli.scene.seeding import camera_in_world
 from splatctrl_cli.scene.surface_depth import surface_steps
 from splatctrl_cli.scene.time_steps import AuditRow
 
@@ -79,13 +82,13 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     )
     kinds = object_mask(frame).kinds
     mask = SelfMask(kinds=kinds, robot_depth=shown.depth, residuals={}, num_inside={})
-    box = _outline(shown.depth > 0)
+    box = find_outline(shown.depth > 0)
     if box is None:
         return mask
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
     edge = max(round(frame.intrinsics.width / fixed.MASK_EDGE), reach)
     wide = 2 * edge + reach + 1  # pixels, beyond which nothing is explained, doubted or inside
-    part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may extend
+    part = grow_box(box, wide + 1, frame.depth.shape)  # one more, where a surface may extend
     depth, rendered, kinds = np.ascontiguousarray(frame.depth[part]), shown.depth[part], kinds[part]
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0
@@ -105,7 +108,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     is_sure |= cv2.erode(is_core.view(np.uint8), _window(edge - reach)).view(bool)
     if surface.trees:
         is_near = depth < farthest_within(farthest, wide - reach) + fixed.CONTACT_THICKNESS
-        v, u = np.nonzero(beside & is_near & ~is_explained)
+        v, u = np.divmod(np.flatnonzero(beside & is_near & ~is_explained), depth.shape[1])
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
         sure = tolerance_at(depth[v, u], config, fixed.MASK_SURE) + edge * depth[v, u] / np.float32(
             frame.intrinsics.fx
@@ -194,12 +197,13 @@ def settle_pieces(
     A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` (of other cameras, and
     settled ones of the last step) measured half of it, or without any.
     """
-    doubted = (mask.kinds == PixelKind.DOUBTED).view(np.uint8)
-    v, u = np.nonzero(doubted)
-    if not len(v):
+    box = find_outline(mask.kinds == PixelKind.DOUBTED)
+    if box is None:
         return mask
-    depth = np.ascontiguousarray(frame.depth)
-    points = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depth[v, u]))
+    depth, doubted = np.ascontiguousarray(frame.depth[box]), (mask.kinds[box] == PixelKind.DOUBTED).view(np.uint8)
+    v, u = np.nonzero(doubted)
+    rays = back_project_pixels(frame.intrinsics, u + box[1].start, v + box[0].start, depth[v, u])
+    points = transform_points(frame.T_world_camera, rays)
     is_object, steps = np.full(len(v), not others), np.full_like(depth, fixed.MASK_STEP)
     votes, balance = np.zeros(depth.shape), np.empty(depth.shape)
     for other, its in others:
@@ -211,7 +215,7 @@ def settle_pieces(
         native.piece_areas(depth, steps, votes, doubted, doubted, balance)
         is_object |= balance[v, u] >= 0
     kinds = mask.kinds.copy()
-    kinds[v, u] = np.where(is_object, np.uint8(PixelKind.OBJECT), np.uint8(PixelKind.MIXED))
+    kinds[box][v, u] = np.where(is_object, np.uint8(PixelKind.OBJECT), np.uint8(PixelKind.MIXED))
     return replace(mask, kinds=kinds)
 
 
@@ -221,40 +225,21 @@ def outvote_objects(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64,
     Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
     object pixels become mixed.
     """
-    parts = []
-    for number, (frame, mask) in enumerate(seen):
-        is_robot, is_object = mask.kinds == PixelKind.ROBOT, mask.kinds == PixelKind.OBJECT
-        beside = cv2.dilate(is_robot.view(np.uint8), _window(pixels_of(voxel, frame, mask.robot_depth)))
-        v, u = np.nonzero(is_robot | (is_object & (beside > 0)))
-        points = back_project_pixels(frame.intrinsics, u, v, frame.depth[v, u])
-        cells = np.floor((transform_points(frame.T_world_camera, points) - origin) / voxel + 0.5).astype(np.int64)
-        parts.append(np.column_stack([cells, np.full(len(u), number), v, u, is_object[v, u]]))
-    rows = np.concatenate(parts)
-    of_robot = rows[rows[:, 6] == 0, :3]
-    if not len(of_robot):
-        return [mask for _, mask in seen]
-    low, high = of_robot.min(axis=0), of_robot.max(axis=0)
-    rows = rows[np.all((rows[:, :3] >= low) & (rows[:, :3] <= high), axis=1)]
-    cell = np.ravel_multi_index(tuple((rows[:, :3] - low).T), tuple(high - low + 1))
-    num_robot, num_object = (np.bincount(cell, weights=rows[:, 6] == own) for own in (0, 1))
-    lost = rows[(rows[:, 6] == 1) & (num_object < fixed.VOTE_SHARE * num_robot)[cell]]
-    found = []
-    for number, (_, mask) in enumerate(seen):
-        kinds = mask.kinds.copy()
-        kinds[tuple(lost[lost[:, 3] == number, 4:6].T)] = PixelKind.MIXED
-        found.append(replace(mask, kinds=kinds))
+    beside, found = [], [replace(mask, kinds=mask.kinds.copy()) for _, mask in seen]
+    for frame, mask in seen:
+        reach = pixels_of(voxel, frame, mask.robot_depth)
+        beside.append(cv2.dilate((mask.kinds == PixelKind.ROBOT).view(np.uint8), _window(reach)))
+    native.outvote(
+        [camera_in_world(frame) for frame, _ in seen], [np.ascontiguousarray(frame.depth) for frame, _ in seen],
+        beside, [mask.kinds for mask in found], origin, voxel, fixed.VOTE_SHARE,
+        PixelKind.ROBOT, PixelKind.OBJECT, PixelKind.MIXED,
+    )  # fmt: skip
     return found
 
 
 def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float32]:
     """Flat pixel indices (N,), -1 outside, and depths (N,) [m] of points (N, 3) [m], world."""
-    k = frame.intrinsics
-    there = transform_points(invert_transform(frame.T_world_camera), points)
-    z = there[:, 2].astype(np.float32)
-    pixels = np.floor(project(k, np.where((z > 0)[:, None], there, 1.0)) + 0.5)
-    is_inside = (z > 0) & np.all((pixels >= 0) & (pixels < [k.width, k.height]), axis=1)
-    u, v = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
-    return np.where(is_inside, v * k.width + u, -1), z
+    return kernels.pixels_at(points, camera_array(frame.intrinsics, frame.T_world_camera))
 
 
 def _group_by_link(values: Array, links: Int16, names: Sequence[str]) -> dict[str, Array]:
@@ -264,12 +249,14 @@ def _group_by_link(values: Array, links: Int16, names: Sequence[str]) -> dict[st
     return {name: part for name, part in parts.items() if len(part)}
 
 
-def _outline(is_robot: Bool) -> tuple[slice, slice] | None:
-    left, top, width, height = cv2.boundingRect(is_robot.view(np.uint8))
+def find_outline(pixels: Bool) -> tuple[slice, slice] | None:
+    """Rows and columns of the box about a mask's pixels (H, W); None without any."""
+    left, top, width, height = cv2.boundingRect(pixels.view(np.uint8))
     return (slice(top, top + height), slice(left, left + width)) if width else None
 
 
-def _grown(box: tuple[slice, slice], pixels: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def grow_box(box: tuple[slice, slice], pixels: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Box with so many pixels more on each side, within an image."""
     rows, columns = (
         slice(max(part.start - pixels, 0), min(part.stop + pixels, size))
         for part, size in zip(box, shape, strict=True)

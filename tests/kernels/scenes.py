@@ -35,6 +35,8 @@ def points_bytes() -> bytes:
     arrays = [
         kernels.back_projected(camera, depth),
         kernels.seen_through(points, [camera], [depth], 0.01),
+        kernels.are_inside(camera, depth, np.full(3, -1.0), np.ones(3), 0.7),
+        *kernels.pixels_at(points, camera),
         *(means.count, means.center, means.color, means.square, means.covariance, means.nearest),
         kernels.SplatTree(points, colors[:, 0] * np.float32(0.1), 2).are_further(colors.astype(float), 0.05),
         kernels.solid_distance(points, solid),

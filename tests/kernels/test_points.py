@@ -6,7 +6,7 @@ import pytest
 from splatctrl_cli.geometry import invert_transform, look_at, transform_points
 from splatctrl_cli.kernels import points as kernels
 from splatctrl_cli.kernels.raster import pack_camera
-from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame
 from tests.plain import plain_frame
 from tests.reference import points as reference
 
@@ -45,6 +45,34 @@ def test_pixels_are_back_projected_row_after_row(width: int, height: int) -> Non
         np.testing.assert_array_equal(found, wanted[chosen])
     np.testing.assert_array_equal(kernels.back_projected(camera, seen.depth), wanted.reshape(-1, 3))
     assert len(kernels.back_projected(camera, seen.depth, np.zeros_like(chosen))) == 0
+
+
+@needs_fma
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (7, 33)])
+def test_pixels_inside_a_box_are_those_whose_points_are(width: int, height: int) -> None:
+    seen = frame(width, height)
+    points = reference.world_points(seen)[seen.depth > 0]
+    lower, upper = np.percentile(points, [10, 90], axis=0, method="nearest")  # points on its sides
+    box = Box(lower=lower, upper=upper)
+    camera, wanted = packed(seen, seen.T_world_camera), reference.are_inside(seen, box, 1.5)
+    assert 0 < np.count_nonzero(wanted) < np.count_nonzero(reference.are_inside(seen, box, 0.0))
+    for threads in THREADS:
+        found = kernels.are_inside(camera, seen.depth, box.lower, box.upper, 1.5, threads)
+        np.testing.assert_array_equal(found, wanted)
+
+
+@needs_fma
+@pytest.mark.parametrize("count", [0, 1, 64, 3000])
+def test_points_are_shown_by_the_pixels_of_their_rays(count: int) -> None:
+    """Also behind the camera and beside the image."""
+    seen = frame(80, 60)
+    points = RNG.normal(size=(count, 3)).astype(np.float32)
+    points[::3] = reference.world_points(seen).reshape(-1, 3)[: len(points[::3])]
+    pixel, z = kernels.pixels_at(points, packed(seen, invert_transform(seen.T_world_camera)))
+    wanted = reference.pixels_at(seen, points)
+    np.testing.assert_array_equal(pixel, wanted[0])
+    np.testing.assert_array_equal(z, wanted[1].astype(np.float32))
+    assert count < 3000 or 500 < np.count_nonzero(pixel < 0) < 2500
 
 
 @needs_fma

@@ -1,8 +1,9 @@
-"""Plain float64 forms of the image metrics, window by window."""
+"""Plain float64 forms of the image metrics, window by window, and of the mask of new seeds."""
 
 import numpy as np
 
-from splatctrl_cli.records import Float64
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.records import Bool, Float64
 
 
 def gaussian_window(size: int = 11, sigma: float = 1.5) -> Float64:
@@ -30,3 +31,15 @@ def mirrored(index: int, length: int) -> int:
     """Index of a half-sample mirrored signal: … 1 0 | 0 1 2 … length-1 | length-1 …"""
     index = index % (2 * length)
     return index if index < length else 2 * length - 1 - index
+
+
+def add_mask(
+    depth: Float64, opacity: Float64, measured: Float64, mappable: Bool, config: SceneConfig, opaque: float
+) -> Bool:
+    """Pixels (H, W) to seed: holes, and those nearer than the map by a multiple of the median error (eq. 5)."""
+    is_hole, is_opaque = opacity < config.hole_opacity, opacity >= opaque
+    error = np.where(is_opaque, depth / np.where(is_opaque, opacity, 1.0), 0.0) - measured
+    explained = mappable & ~is_hole
+    median = float(np.median(np.abs(error[explained]))) if explained.any() else 0.0
+    threshold = min(max(config.lambda_mde * median, config.min_depth_error), config.max_depth_error)
+    return np.asarray(mappable & (is_hole | (error > threshold)))

@@ -43,7 +43,7 @@ def test_objects_in_contact_get_splats_of_one_radius_up_to_what_is_measured() ->
     for view, posture in (*[(frame(block=VISITOR), ball(5.0))] * 3, *[(seen_with(robot, block=VISITOR), robot)] * 2):
         target.step([view], posture)
     objects = target.splats().select(target.splats().labels == Label.OBJECT)
-    radii = objects.radii[robot.distance_to_moving(objects.centers) < CONTACT_REACH]
+    radii = objects.radii[robot.distance(objects.centers, to_moving=True) < CONTACT_REACH]
     assert len(radii) > 5
     assert ((radii > (1 - 1e-5) * CONFIG.contact_radius / 2) & (radii <= CONFIG.contact_radius)).all()
     clearance = np.min(np.linalg.norm(objects.centers - [0, 0, 0.28], axis=1) - objects.radii) - 0.08

@@ -103,3 +103,12 @@ def test_a_centre_beside_a_step_of_depth_stays_with_the_nearer_surface() -> None
     pixel, z = pixels_at(seen.frame, POST)
     seen.frame.depth.reshape(-1)[pixel + 1] = z
     np.testing.assert_array_equal(move_to_surface(POST, [seen], 0.02), POST)
+
+
+def test_a_point_behind_the_camera_has_no_pixel() -> None:
+    """Nor the camera's own place: the point mirrored at it has one."""
+    seen = view(0).frame
+    place = seen.T_world_camera[:3, 3]
+    points = np.array([POST[0], place, 2.0 * place - POST[0]])
+    pixel, z = pixels_at(seen, points)
+    assert (pixel >= 0).tolist() == [True, False, False] and z[2] == -z[0]

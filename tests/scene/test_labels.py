@@ -242,7 +242,7 @@ def labelled(grid: OccupancyMap, robot: RobotPosture, view: RgbdFrame, times: in
     for _ in range(times):
         grid.take_in([view])
         grid.label_robot(robot.centers, robot.radii, [(view, kinds == PixelKind.ROBOT, kinds == PixelKind.OBJECT)])
-        grid.forget_hidden(robot.centers, robot.radii, robot.distance)
+        grid.forget_hidden(robot.centers, robot.radii, robot.is_within)
 
 
 def bits(grid: OccupancyMap, *points: tuple[float, float, float]) -> list[int]:
@@ -307,3 +307,19 @@ def test_within_a_robot_of_which_all_is_drawn_no_splat_is_an_objects(is_drawn: b
     assert robot_splats(buffer, grid, robot, [])[0].tolist() == [is_drawn, False, False]
     center = np.float32([[0.0, 0.0, 0.34]])
     assert robot.holds(center, 0.03).tolist() == [is_drawn] and not robot.holds(center, 0.07).any()
+
+
+@pytest.mark.parametrize("to_moving", [False, True])
+def test_points_within_a_reach_are_those_whose_distance_says_so(to_moving: bool) -> None:
+    """Two meshes that overlap and a ball, one mesh of a fixed link; a reach of each point, below 0 too."""
+    tip = Shape(link="arm", kind="sphere", size=(0.05,), T_link_shape=pose_at([0.1, 0.1, 0.2]))
+    meshes = [
+        trimesh.creation.icosphere(radius=radius).triangles + shift for radius, shift in ((0.1, 0.0), (0.2, 0.15))
+    ]
+    surface = RobotSurface.from_parts([tip], [("arm", meshes[0]), ("base", meshes[1])], fixed=("base",))
+    robot = replace(ball(0.3), surface=surface, T_world_surface={0: np.tile(np.eye(4), (2, 1, 1))})
+    rng = np.random.default_rng(3)
+    points, reach = rng.uniform(-0.25, 0.35, (2000, 3)).astype(np.float32), rng.choice([-0.02, 0.0, 0.03, 0.1], 2000)
+    expected = robot.distance(points, to_moving=to_moving) <= reach
+    assert 100 < np.count_nonzero(expected) < 1900
+    assert (robot.is_within(points, reach, to_moving=to_moving) == expected).all()

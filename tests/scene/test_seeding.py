@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config import SceneConfig, fixed
 from splatctrl_cli.kernels.points import Cubes
 from splatctrl_cli.records import Bool, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds
@@ -25,6 +25,7 @@ from splatctrl_cli.scene.seeding import (
     world_points,
 )
 from tests.plain import plain_splats
+from tests.reference import images
 from tests.scene.wall import WORKSPACE, frame
 
 CONFIG = SceneConfig()
@@ -44,13 +45,27 @@ def asked(seen: RgbdFrame, shown: Float32, opacity: float, mappable: Bool | None
 
 
 def mappable_in(seen: RgbdFrame, *least: float) -> Bool:
-    return inside_workspace(seen, world_points(seen), WORKSPACE, *least)
+    return inside_workspace(seen, WORKSPACE, *least)
 
 
 def seeds_of(edge: float, beside: Float32 = NOTHING, config: SceneConfig = CONFIG) -> Seeds:
     """Seeds of the floor, one in each cube of a given edge."""
     source = candidates(frame(), np.ones((60, 80), bool))
     return seeds_at([source], beside, SeedDensity(edge=edge, tolerance=1e9), config)
+
+
+@pytest.mark.parametrize("lambda_mde", [1.0, 40.0])
+def test_seeded_pixels_are_those_of_the_reference(lambda_mde: float) -> None:
+    """Random opacity about both thresholds, and a threshold between its floor and its ceiling."""
+    rng, seen, config = np.random.default_rng(1), frame(), CONFIG.derived(lambda_mde=lambda_mde)
+    opacity = rng.uniform(0.3, 1.0, seen.depth.shape).astype(np.float32)
+    depth = (seen.depth * opacity * rng.normal(1.0, 0.02, opacity.shape)).astype(np.float32)
+    mappable = rng.random(opacity.shape) < 0.8
+    shown = Rendering(color=np.zeros((*depth.shape, 3), np.float32), depth=depth, opacity=opacity)
+    wide = (image.astype(np.float64) for image in (depth, opacity, seen.depth))
+    expected = images.add_mask(*wide, mappable, config, fixed.OPAQUE_ENOUGH)
+    assert (add_mask(seen, shown, mappable, config) == expected).all()
+    assert 100 < np.count_nonzero(expected) < 0.95 * np.count_nonzero(mappable)
 
 
 def test_an_empty_map_asks_for_every_mappable_pixel() -> None:

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
-from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.config import OccupancyConfig, fixed
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Box, Float64, Intrinsics, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
@@ -23,6 +24,7 @@ from splatctrl_cli.scene.self_mask import (
     settle_pieces,
 )
 from tests.plain import plain_frame
+from tests.reference.points import outvoted
 
 K = Intrinsics(fx=160.0, fy=160.0, cx=79.5, cy=59.5, width=160, height=120)
 FLOOR, CENTER, RADIUS = 1.2, np.array([0.0, 0.0, 0.9]), 0.1
@@ -291,6 +293,24 @@ def test_the_robots_votes_count_in_their_own_voxel_alone() -> None:
     assert not (
         outvote_objects([robot, beside], np.array([0.0, 0.0, 1.1]), 0.3)[1].kinds == PixelKind.MIXED
     ).any()  # 16 to 16
+
+
+def test_the_votes_of_random_pixels_are_those_of_the_reference() -> None:
+    """Two cameras; all object pixels are near enough to the robot's to vote."""
+    rng, seen = np.random.default_rng(2), []
+    for turn in (0.0, 0.2):
+        kinds = rng.choice(4 * [PixelKind.NOTHING] + OBJECT + 7 * ROBOT, (K.height, K.width)).astype(np.uint8)
+        view = frame(rng.uniform(0.9, 1.1, kinds.shape))
+        T = pose_at([turn, 0.0, 0.0], Rotation.from_euler("y", turn).as_matrix())
+        rendered = np.where(kinds == PixelKind.ROBOT, view.depth, np.float32(0.0))
+        mask = SelfMask(kinds=kinds, robot_depth=rendered, residuals={}, num_inside={})
+        seen.append((replace(view, T_world_camera=T), mask))
+    robots, objects = ([mask.kinds == kind for _, mask in seen] for kind in (PixelKind.ROBOT, PixelKind.OBJECT))
+    origin = np.array([0.013, 0.0, 1.0])
+    expected = outvoted([view for view, _ in seen], robots, objects, origin, 0.1, fixed.VOTE_SHARE)
+    for (_, mask), found, lost in zip(seen, outvote_objects(seen, origin, 0.1), expected, strict=True):
+        assert (found.kinds == np.where(lost, PixelKind.MIXED, mask.kinds)).all()
+        assert 100 < lost.sum() < 0.9 * (mask.kinds == PixelKind.OBJECT).sum()
 
 
 def drawn() -> RobotPosture:

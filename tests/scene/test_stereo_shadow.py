@@ -5,8 +5,9 @@ import pytest
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.records import Bool, Float32, Intrinsics
-from splatctrl_cli.scene.depth_holes import find_shadows, unanswered_points
+from splatctrl_cli.scene.depth_holes import _behind, find_shadows, unanswered_points
 from tests.plain import plain_frame
+from tests.reference import shadows
 
 FOCAL, BASELINE = 400.0, 0.05  # [px], [m]
 WALL, PLATE = 2.0, 1.0  # [m]; the shadow is 10 px wide
@@ -55,6 +56,20 @@ def test_a_dark_thing_is_none_away_from_the_shadow() -> None:
     found = find_shadows(seen, FOCAL)
     assert not found[DARK, 90:109].any() and not found[DARK, 20:49].any()  # to the pixel
     assert found[DARK, 50:60].all()
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+@pytest.mark.parametrize("seed", range(4))
+def test_shadows_have_the_bytes_of_the_reference(seed: int, turn: int) -> None:
+    """Noisy plates, pixels lost at random, and rows without any depth."""
+    rng = np.random.default_rng(seed)
+    seen = as_stereo(plates(slice(30, 50), slice(80 + 5 * seed, 110)))
+    seen *= rng.normal(1.0, 0.01, seen.shape).astype(np.float32) * (rng.random(seen.shape) > 0.1 * seed)
+    seen[[7, -1]] = 0.0
+    seen = seen[:, ::turn]
+    found = find_shadows(seen, FOCAL)
+    assert 100 < np.count_nonzero(found) < np.count_nonzero(seen == 0)
+    assert (found == shadows.find_shadows(seen, FOCAL, _behind(seen))).all()
 
 
 def test_a_baseline_is_that_of_a_camera() -> None:

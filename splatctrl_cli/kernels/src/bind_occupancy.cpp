@@ -64,7 +64,7 @@ void bind_occupancy(nb::module_& m) {
         const VoxelGrid g = grid_from(grid, entity.size());
         const DepthImage image = image_from(intrinsics, T_world_camera, depth, min_range, max_range);
         if (chosen.size() != depth.size()) throw std::invalid_argument("chosen: expected (H, W), as depth");
-        if (set && clear) throw std::invalid_argument("set, clear: expected one of them to be 0");
+        if (set & clear) throw std::invalid_argument("set, clear: expected no bit of both");
         const nb::gil_scoped_release release;
         label_hits(g, entity.data(), image, chosen.data(), set, clear, num_threads);
       },

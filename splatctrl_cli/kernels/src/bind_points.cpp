@@ -8,6 +8,7 @@
 
 #include "bind.h"
 #include "points.h"
+#include "robot_votes.h"
 
 namespace splatctrl {
 namespace {
@@ -16,14 +17,25 @@ using Floats = Array<const float>;
 using Bytes = Array<std::uint8_t>;
 
 // camera: as of camera_from, in double precision.
-NearestDepth view_from(const Array<const double>& camera, const Floats& nearest) {
+NearestDepth view_from(const Array<const double>& camera, const float* nearest) {
   expect(camera.size() == 18, "camera: expected 18 numbers");
   const double* p = camera.data();
-  NearestDepth view{p[0], p[1], p[2], p[3], static_cast<int>(p[4]), static_cast<int>(p[5]), {}, {}, nearest.data()};
-  expect(nearest.size() == static_cast<std::size_t>(p[4] * p[5]), "nearest: expected (H, W), as the camera");
+  NearestDepth view{p[0], p[1], p[2], p[3], static_cast<int>(p[4]), static_cast<int>(p[5]), {}, {}, nearest};
   std::copy(p + 6, p + 15, view.rotation);
   std::copy(p + 15, p + 18, view.translation);
   return view;
+}
+
+// camera: as of view_from, but from camera to world; chosen: all pixels where null.
+ChosenDepth image_from(const Array<const double>& camera, const Floats& depth, const std::uint8_t* chosen) {
+  expect(camera.size() == 18, "camera: expected 18 numbers");
+  const double* p = camera.data();
+  ChosenDepth image{p[0], p[1], p[2],         p[3],  static_cast<int>(p[4]), static_cast<int>(p[5]),
+                    {},   {},   depth.data(), chosen};
+  expect(depth.size() == static_cast<std::size_t>(p[4] * p[5]), "depth: expected (H, W), as the camera");
+  std::copy(p + 6, p + 15, image.rotation);
+  std::copy(p + 15, p + 18, image.translation);
+  return image;
 }
 
 }  // namespace
@@ -33,14 +45,8 @@ void bind_points(nb::module_& m) {
       "back_project",
       [](const Array<const double>& camera, const Floats& depth, const std::optional<Array<const std::uint8_t>>& chosen,
          const Array<double>& points, int num_threads) {
-        expect(camera.size() == 18, "camera: expected 18 numbers");
-        const double* p = camera.data();
-        ChosenDepth image{p[0], p[1], p[2], p[3], static_cast<int>(p[4]), static_cast<int>(p[5]), {}, {}, depth.data(),
-                          chosen ? chosen->data() : nullptr};
-        std::copy(p + 6, p + 15, image.rotation);
-        std::copy(p + 15, p + 18, image.translation);
-        expect(depth.size() == static_cast<std::size_t>(p[4] * p[5]) && (!chosen || chosen->size() == depth.size()),
-               "expected depth and chosen (H, W), as the camera");
+        const ChosenDepth image = image_from(camera, depth, chosen ? chosen->data() : nullptr);
+        expect(!chosen || chosen->size() == depth.size(), "chosen: expected (H, W), as the camera");
         const std::size_t num = depth.size() - (chosen ? std::count(chosen->data(), chosen->data() + depth.size(), 0) : 0);
         expect(points.size() == 3 * num, "expected points (K, 3)");
         const nb::gil_scoped_release release;
@@ -49,13 +55,60 @@ void bind_points(nb::module_& m) {
       nb::arg("camera").noconvert(), nb::arg("depth").noconvert(), nb::arg("chosen").none(),
       nb::arg("points").noconvert(), nb::arg("num_threads"));
   m.def(
+      "outvote",
+      [](const std::vector<Array<const double>>& cameras, const std::vector<Floats>& depths,
+         const std::vector<Array<const std::uint8_t>>& chosen, const std::vector<Bytes>& kinds,
+         const Array<const double>& origin, double voxel, double share, std::uint8_t robot, std::uint8_t object,
+         std::uint8_t outvoted) {
+        expect(depths.size() == cameras.size() && chosen.size() == cameras.size() && kinds.size() == cameras.size(),
+               "expected as many images as cameras");
+        expect(origin.size() == 3, "origin: expected 3 numbers");
+        std::vector<VoteImage> images;
+        for (std::size_t i = 0; i < cameras.size(); ++i) {
+          expect(chosen[i].size() == depths[i].size() && kinds[i].size() == depths[i].size(), "expected images (H, W)");
+          images.push_back({image_from(cameras[i], depths[i], chosen[i].data()), kinds[i].data()});
+        }
+        const double* o = origin.data();
+        const nb::gil_scoped_release release;
+        outvote(images, {{o[0], o[1], o[2]}, voxel, share, robot, object, outvoted});
+      },
+      nb::arg("cameras"), nb::arg("depths"), nb::arg("chosen"), nb::arg("kinds"), nb::arg("origin").noconvert(),
+      nb::arg("voxel"), nb::arg("share"), nb::arg("robot"), nb::arg("object"), nb::arg("outvoted"));
+  m.def(
+      "mark_inside",
+      [](const Array<const double>& camera, const Floats& depth, const Array<const double>& box, float min_range,
+         const Bytes& is_inside, int num_threads) {
+        const ChosenDepth image = image_from(camera, depth, nullptr);
+        expect(box.size() == 6 && is_inside.size() == depth.size(), "expected box (2, 3), is_inside (H, W)");
+        const nb::gil_scoped_release release;
+        mark_inside(image, box.data(), box.data() + 3, min_range, is_inside.data(), num_threads);
+      },
+      nb::arg("camera").noconvert(), nb::arg("depth").noconvert(), nb::arg("box").noconvert(), nb::arg("min_range"),
+      nb::arg("is_inside").noconvert(), nb::arg("num_threads"));
+  m.def(
+      "pixels_at",
+      [](const Array<const double>& points, const Array<const double>& camera, const Array<std::int64_t>& pixel,
+         const Array<float>& depth) {
+        expect(points.size() == 3 * pixel.size() && depth.size() == pixel.size(),
+               "expected points (N, 3), pixel and depth (N,)");
+        const NearestDepth view = view_from(camera, nullptr);
+        const nb::gil_scoped_release release;
+        pixels_at(points.data(), static_cast<int>(pixel.size()), view, pixel.data(), depth.data());
+      },
+      nb::arg("points").noconvert(), nb::arg("camera").noconvert(), nb::arg("pixel").noconvert(),
+      nb::arg("depth").noconvert());
+  m.def(
       "seen_through",
       [](const Floats& points, const std::vector<Array<const double>>& cameras, const std::vector<Floats>& nearest,
          float tolerance, const Bytes& out, int num_threads) {
         expect(points.size() == 3 * out.size(), "expected points (N, 3), out (N,)");
         expect(cameras.size() == nearest.size(), "expected as many images as cameras");
         std::vector<NearestDepth> views;
-        for (std::size_t i = 0; i < cameras.size(); ++i) views.push_back(view_from(cameras[i], nearest[i]));
+        for (std::size_t i = 0; i < cameras.size(); ++i) {
+          views.push_back(view_from(cameras[i], nearest[i].data()));
+          expect(nearest[i].size() == static_cast<std::size_t>(views[i].width) * views[i].height,
+                 "nearest: expected (H, W), as the camera");
+        }
         const nb::gil_scoped_release release;
         seen_through(points.data(), static_cast<int>(out.size()), views.data(), static_cast<int>(views.size()),
                      tolerance, out.data(), num_threads);

@@ -1,8 +1,13 @@
 // Rendered surfaces of solids: see kernels/surface.py for shapes.
+#include <nanobind/stl/pair.h>
+
 #include <algorithm>
+#include <utility>
 #include <vector>
 
 #include "bind.h"
+#include "depth_errors.h"
+#include "depth_shadows.h"
 #include "points.h"
 #include "surface_image.h"
 #include "surface_pieces.h"
@@ -93,6 +98,47 @@ void bind_surface(nb::module_& m) {
       nb::arg("depth").noconvert(), nb::arg("tolerance").noconvert(), nb::arg("support").noconvert(),
       nb::arg("asked").noconvert(), nb::arg("reach"), nb::arg("variance"), nb::arg("residual"),
       nb::arg("steps").noconvert());
+  m.def(
+      "depth_errors",
+      [](const Array<const float>& depth, const Array<const float>& opacity, const Array<const float>& measured,
+         const Array<const std::uint8_t>& counted, float hole, float opaque, const Array<float>& error,
+         const Array<float>& sizes) {
+        const std::size_t size = depth.size();
+        expect(opacity.size() == size && measured.size() == size && counted.size() == size && error.size() == size &&
+                   sizes.size() == size,
+               "expected images (H, W), sizes (H W,)");
+        const nb::gil_scoped_release release;
+        return depth_errors({depth.data(), opacity.data(), measured.data(), counted.data(), size}, hole, opaque,
+                            error.data(), sizes.data());
+      },
+      nb::arg("depth").noconvert(), nb::arg("opacity").noconvert(), nb::arg("measured").noconvert(),
+      nb::arg("counted").noconvert(), nb::arg("hole"), nb::arg("opaque"), nb::arg("error").noconvert(),
+      nb::arg("sizes").noconvert());
+  m.def(
+      "shadow_steps",
+      [](const Array<const float, nb::ndim<2>>& depth, float focal, float step, const Array<float>& height,
+         const Array<std::int32_t>& lost) {
+        const std::size_t size = depth.size();
+        expect(height.size() == 2 * size && lost.size() == 2 * size, "expected height and lost (2, H W)");
+        const ShadowImage image{depth.data(), static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1))};
+        ShadowSteps right{height.data(), lost.data(), 0}, left{height.data() + size, lost.data() + size, 0};
+        const nb::gil_scoped_release release;
+        shadow_steps(image, focal, step, right, left);
+        return std::make_pair(right.num, left.num);
+      },
+      nb::arg("depth").noconvert(), nb::arg("focal"), nb::arg("step"), nb::arg("height").noconvert(),
+      nb::arg("lost").noconvert());
+  m.def(
+      "mark_shadows",
+      [](const Array<const float, nb::ndim<2>>& depth, const Array<const float>& behind, bool is_turned,
+         float focal_baseline, float fattened, const Array<std::uint8_t>& is_shadow) {
+        expect(behind.size() == depth.size() && is_shadow.size() == depth.size(), "expected images (H, W)");
+        const ShadowImage image{depth.data(), static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1))};
+        const nb::gil_scoped_release release;
+        mark_shadows(image, is_turned, behind.data(), focal_baseline, fattened, is_shadow.data());
+      },
+      nb::arg("depth").noconvert(), nb::arg("behind").noconvert(), nb::arg("is_turned"), nb::arg("focal_baseline"),
+      nb::arg("fattened"), nb::arg("is_shadow").noconvert());
   m.def(
       "piece_areas",
       [](const Array<const float, nb::ndim<2>>& depth, const Array<const float>& steps, const Array<const double>& area,

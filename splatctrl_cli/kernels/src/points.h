@@ -34,8 +34,21 @@ struct ChosenDepth {
   const std::uint8_t* chosen;
 };
 
+// The point (3) [m], world, of a pixel.
+inline void back_project_pixel(const ChosenDepth& image, std::size_t pixel, double* point) {
+  const double u = static_cast<double>(pixel % image.width), v = static_cast<double>(pixel / image.width);
+  const double z = image.depth[pixel];
+  const double p[3] = {(u - image.cx) / image.fx * z, (v - image.cy) / image.fy * z, z};
+  moved(image.rotation, image.translation, p, point);
+}
+
 // The points (K, 3) [m], world, of the chosen pixels, row after row.
 void back_project(const ChosenDepth& image, double* points, int num_threads);
+
+// is_inside (H, W): 1 where a pixel has a depth of at least min_range [m], and its point lies in a box, low to
+// high [m].
+void mark_inside(const ChosenDepth& image, const double* low, const double* high, float min_range,
+                 std::uint8_t* is_inside, int num_threads);
 
 // nearest (H, W) [m]: the least depth around each pixel, infinite where there is none.
 struct NearestDepth {
@@ -44,6 +57,10 @@ struct NearestDepth {
   double rotation[9], translation[3];  // from world to camera
   const float* depth;
 };
+
+// Pixel (N), row after row, that shows a point (N, 3), -1 outside the image, and the point's depth (N) [m]. The view's
+// own depth is not used.
+void pixels_at(const double* points, int num_points, const NearestDepth& view, std::int64_t* pixel, float* depth);
 
 // is_seen_through (N): 1 where a view measured a depth more than `tolerance` [m] behind a point (N, 3).
 void seen_through(const float* points, int num_points, const NearestDepth* views, int num_views, float tolerance,

@@ -32,7 +32,7 @@ inline std::size_t index_of(const VoxelGrid& grid, const int* cell) {
 // Parts of size `edge` that cover `size`.
 inline int parts(int size, int edge) { return (size + edge - 1) / edge; }
 
-// Bits are only ever set within one call, or only ever cleared, so that threads may meet in a voxel: no order, no
+// A bit is only ever set within one call, or only ever cleared, so that threads may meet in a voxel: no order, no
 // lost update. Returns whether the voxel changed.
 inline bool set_bits(std::uint8_t* voxel, std::uint8_t bits) {
   if ((__atomic_load_n(voxel, __ATOMIC_RELAXED) & bits) == bits) return false;

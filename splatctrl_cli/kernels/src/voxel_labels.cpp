@@ -14,6 +14,7 @@ void label_hits(const VoxelGrid& grid, std::uint8_t* entity, const DepthImage& i
     HitRow hits(grid, image);
     for (int v = chunk * kRows; v < std::min(image.height, (chunk + 1) * kRows); ++v) {
       const std::uint8_t* is_chosen = chosen + static_cast<std::size_t>(v) * image.width;
+      if (std::none_of(is_chosen, is_chosen + image.width, [](std::uint8_t one) { return one != 0; })) continue;
       for (const std::int32_t index : hits.find(v)) {
         if (!*is_chosen++ || index < 0) continue;
         set_bits(entity + index, set);

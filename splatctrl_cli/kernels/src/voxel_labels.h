@@ -7,8 +7,8 @@
 
 namespace splatctrl {
 
-// Clears, or ORs, bits of entity in every voxel that holds the point of a pixel with chosen (H, W) not zero. One of
-// `set` and `clear` must be 0.
+// ORs bits of entity, and clears others, in every voxel that holds the point of a pixel with chosen (H, W) not zero.
+// No bit may be in `set` and `clear`.
 void label_hits(const VoxelGrid& grid, std::uint8_t* entity, const DepthImage& image, const std::uint8_t* chosen,
                 std::uint8_t set, std::uint8_t clear, int num_threads);
 
