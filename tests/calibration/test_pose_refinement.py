@@ -57,6 +57,44 @@ def test_poses_that_are_right_stay_to_the_last_bit(views: list[RgbdFrame]) -> No
     assert all(np.array_equal(T, view.T_world_camera) for T, view in zip(found.T_world_camera, views, strict=True))
 
 
+def blotched(views: Sequence[RgbdFrame], share: float, num: int = 8) -> list[RgbdFrame]:
+    """Depths that err by `share` at 1 m, growing with their square, alike over the width of an image by `num`."""
+    rng, found = np.random.default_rng(0), []
+    for view in views:
+        height, width = view.depth.shape
+        error = cv2.resize(rng.normal(size=(3 * num // 4, num)), (width, height), interpolation=cv2.INTER_CUBIC)
+        found.append(replace(view, depth=(view.depth / (1 + share * view.depth * error)).astype(np.float32)))
+    return found
+
+
+@pytest.mark.parametrize(("is_gray", "num"), [(False, 4), (False, 8), (True, 8)])
+def test_right_poses_stay_where_depth_errs_alike_in_neighbouring_pixels(
+    views: list[RgbdFrame], is_gray: bool, num: int
+) -> None:
+    """Poses that are wrong by a centimetre bring such surfaces nearer to each other."""
+    off = blotched(views, 0.01, num)
+    if is_gray:
+        off = [replace(view, color=np.full_like(view.color, 128)) for view in off]
+    found = refined_poses(off)
+    assert not found.is_better and found.after == found.before
+    assert all(np.array_equal(T, view.T_world_camera) for T, view in zip(found.T_world_camera, off, strict=True))
+
+
+@pytest.mark.parametrize(("share", "num", "millimetres"), [(0.005, 8, 10.0), (0.01, 32, 3.0)])
+def test_poses_that_are_off_are_put_right_where_depth_errs_too(
+    views: list[RgbdFrame], share: float, num: int, millimetres: float
+) -> None:
+    off = disturbed(blotched(views, share, num), millimetres, 0.05 * millimetres)
+    before, found = errors([view.T_world_camera for view in off], views), refined_poses(off)
+    assert errors(found.T_world_camera, views)[0] < 0.5 * before[0]
+
+
+def test_one_view_among_many_that_is_off_is_put_right(views: list[RgbdFrame]) -> None:
+    """It hardly changes the median distance."""
+    off = [disturbed(views, 30.0, 1.5)[k] if k == 3 else view for k, view in enumerate(views)]
+    assert errors(refined_poses(off).T_world_camera, views)[0] < 1.0
+
+
 def test_a_scene_ten_times_as_large_is_put_right_alike(views: list[RgbdFrame]) -> None:
     def large(view: RgbdFrame) -> RgbdFrame:
         T = scaled(view.T_world_camera, 10.0)
