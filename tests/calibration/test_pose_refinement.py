@@ -18,6 +18,7 @@ from splatctrl_cli.jobs.reconstruct.correct_views import Corrections, corrected_
 from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.calibration.scan import disturbed, gains_of, views_of
+from tests.jobs.score.wall import FakeSource
 from tests.plain import plain_frame
 
 
@@ -139,7 +140,7 @@ def test_one_view_is_put_among_others_that_stay(views: list[RgbdFrame]) -> None:
 
 def test_what_is_stored_is_where_each_view_is(views: list[RgbdFrame]) -> None:
     off = disturbed(views, 20.0, 1.0)
-    moved, told = Corrections(poses=True).of(off, "scan", SILENT)
+    moved, told = Corrections(poses=True).of(off, FakeSource(frames=off, has_clock=False), SILENT)
     for frame, row in zip(moved, told["corrected_views"], strict=True):
         assert np.array_equal(np.reshape(row["T_world_camera"], (4, 4)), frame.T_world_camera)
     assert told["pose_residual"] < 0.1 * told["poses"]["residual_before"]
