@@ -1,10 +1,11 @@
 """`python -m tools.mujoco.facade OUT`: photographs of a facade at 6 to 9 m, exact poses, depth by stereo matching.
 
-MuJoCo draws; OpenCV matches each view with one 0.7 m to its right. Every eighth view is held out, with exact depth.
+MuJoCo draws; OpenCV matches each view with one to its right. Every eighth view is held out, with exact depth.
 """
 
 import argparse
 import io
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 525.0
-BASELINE = 0.7  # [m]
 NUM_VIEWS, HELD_OUT = 40, 8
 COLOR_NOISE = 2.0  # standard deviation of a channel, of 255
-SKY, FARTHEST = 40.0, 14.0  # [m] of exact depth, and of a match
+SKY, NEAREST, FARTHEST = 40.0, 3.9, 14.0  # [m] of exact depth, and of matches
 UNLIKE = 1.0  # [px] between matches from left and right
 PLAIN = 1.6  # times the noise's variance: less texture has no match
 MATERIALS = {  # rows and columns of bricks, joint [px], colour, repetitions per metre
@@ -37,21 +37,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--baseline", type=float, default=1.2, help="[m] of the matched views")
+    parser.add_argument("--finer", type=int, default=2, help="pixels along one, at which they are matched")
     args = parser.parse_args()
-    write_views(args.out, args.seed)
+    write_views(args.out, args.seed, args.baseline, args.finer)
 
 
-def write_views(out: Path, seed: int) -> None:
-    """Write images, poses and `facade.toml`, which describes them."""
+def write_views(out: Path, seed: int, baseline: float = 1.2, finer: int = 2) -> None:
+    """Write images, poses and `facade.toml`, which describes them.
+
+    baseline [m]: between matched views; finer: pixels along one, at which they are matched.
+    """
     out.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     camera, names = Camera(build_facade(rng)), [f"{k:03d}" for k in range(NUM_VIEWS)]
     for k, T in enumerate(choose_poses(rng)):
         T_right = T.copy()
-        T_right[:3, 3] += BASELINE * T[:3, 0]
+        T_right[:3, 3] += baseline * T[:3, 0]
         (color, exact), (right, _) = camera.take(T), camera.take(T_right)
         color, right = (add_noise(image, rng) for image in (color, right))
-        depth = exact if k % HELD_OUT == HELD_OUT // 2 else match(color, right)
+        depth = exact if k % HELD_OUT == HELD_OUT // 2 else match(color, right, baseline, finer)
         cv2.imwrite(str(out / f"{names[k]}.color.png"), color[..., ::-1])
         cv2.imwrite(str(out / f"{names[k]}.depth.png"), np.round(1000 * depth).astype(np.uint16))
         np.savetxt(out / f"{names[k]}.pose.txt", T, fmt="%.17g")
@@ -77,7 +82,8 @@ def draw_texture(rng: np.random.Generator, rows: int, columns: int, joint: int, 
     image = np.array(color) + (12 * noise + 14 * tones[row, along * columns // size])[..., None]
     is_joint = (v % (size // rows) < joint) | (along % (size // columns) < joint)
     image[is_joint] = np.array([190, 185, 175]) + 8 * noise[is_joint, None]
-    return np.clip(image, 0, 255).astype(np.uint8)
+    drawn: UInt8 = np.clip(image, 0, 255).astype(np.uint8)
+    return drawn
 
 
 def boxes() -> Iterator[tuple[str, float, float, float, float, float, float]]:
@@ -166,18 +172,21 @@ def add_noise(color: UInt8, rng: np.random.Generator) -> UInt8:
     return np.clip(color + rng.normal(0, COLOR_NOISE, color.shape), 0, 255).astype(np.uint8)
 
 
-def match(left: UInt8, right: UInt8) -> Float32:
+def match(left: UInt8, right: UInt8, baseline: float, finer: int) -> Float32:
     """Depth (H, W) [m] of the left image by semi-global matching; 0 without texture, or where matches disagree."""
-    matcher = cv2.StereoSGBM.create(0, 96, 5, 8 * 75, 32 * 75, 1, 0, 15, 100, 2, cv2.STEREO_SGBM_MODE_HH)
+    num_disparities = 16 * math.ceil(finer * FOCAL * baseline / NEAREST / 16)
+    matcher = cv2.StereoSGBM.create(0, num_disparities, 5, 8 * 75, 32 * 75, 1, 0, 15, 100, 2, cv2.STEREO_SGBM_MODE_HH)
     gray, other = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
-    disparity = matcher.compute(gray, other).astype(np.float32) / 16
-    back = cv2.flip(matcher.compute(cv2.flip(other, 1), cv2.flip(gray, 1)).astype(np.float32) / 16, 1)
+    fine, other = (cv2.resize(i, None, fx=finer, fy=finer, interpolation=cv2.INTER_CUBIC) for i in (gray, other))
+    disparity = matcher.compute(fine, other).astype(np.float32)[::finer, ::finer] / (16 * finer)
+    back = cv2.flip(matcher.compute(cv2.flip(other, 1), cv2.flip(fine, 1)).astype(np.float32), 1)
+    back = back[::finer, ::finer] / (16 * finer)
     u = np.arange(WIDTH)[None] - np.round(disparity).astype(np.int64)
     is_matched = (disparity > 1) & (u >= 0)
     is_matched &= np.abs(disparity - np.take_along_axis(back, np.clip(u, 0, WIDTH - 1), 1)) < UNLIKE
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 2.0)
     is_matched &= cv2.GaussianBlur(np.square(gray - smooth), (0, 0), 4.0) > PLAIN * COLOR_NOISE**2
-    depth = FOCAL * BASELINE / np.maximum(disparity, 0.1)
+    depth = FOCAL * baseline / np.maximum(disparity, 0.1)
     return np.where(is_matched & (depth < FARTHEST), depth, 0.0).astype(np.float32)
 
 
