@@ -351,25 +351,25 @@ def _gains(
     Errors of depth, alike in neighbouring pixels, let wrong poses reduce distances: grey values must agree better
     beyond their noise, or no worse if distances fall by `REFINE_GAIN`.
     """
-    rows: list[list[Float64]] = [[] for _ in views]
+    parts: list[list[Float64]] = [[np.zeros((5, 0))] for _ in views]
     for i, j in pairs:
         (at_first, tiles), (at_last, _) = (
             misfits_of(views[i], views[j], invert_transform(poses[j]) @ poses[i]) for poses in (before, after)
         )
+        rows = np.vstack([at_first, at_last, tiles + views[i].gray.size * 2 * i])
         for k in (i, j):
-            rows[k].append(np.vstack([at_first, at_last, tiles + views[i].gray.size * 2 * i]))
-    found = np.zeros(len(views), np.bool_)
-    for k, parts in enumerate(rows):
-        if not parts:
-            continue
-        *misfits, tiles = np.hstack(parts)
-        (depth, depth_sure), (gray, gray_sure) = (_gain(*misfits[part::2], tiles) for part in (0, 1))
-        is_gain_of_depth = depth_sure > fixed.REFINE_SURE and depth > fixed.REFINE_GAIN
-        if gray_sure > fixed.REFINE_SURE:
-            found[k] = depth_sure > -fixed.REFINE_SURE
-        else:
-            found[k] = gray >= 0 and is_gain_of_depth
-    return found
+            parts[k].append(rows)
+    return np.array([_agrees_better(*np.hstack(part)) for part in parts])
+
+
+def _agrees_better(
+    depth_before: Float64, gray_before: Float64, depth_after: Float64, gray_after: Float64, tiles: Float64
+) -> bool:
+    depth, depth_sure = _gain(depth_before, depth_after, tiles)
+    gray, gray_sure = _gain(gray_before, gray_after, tiles)
+    if gray_sure > fixed.REFINE_SURE:
+        return depth_sure > -fixed.REFINE_SURE
+    return gray >= 0 and depth_sure > fixed.REFINE_SURE and depth > fixed.REFINE_GAIN
 
 
 def _gain(before: Float64, after: Float64, tiles: Float64) -> tuple[float, float]:
