@@ -155,7 +155,7 @@ def _gains(frames: list[RgbdFrame], scale: float, console: Progress, *, is_reque
 
 
 def _are_exposures(gains: Float64, frames: Sequence[RgbdFrame], scale: float) -> bool:
-    """True for gains that differ as `check` names it, and explain differences between parts of images.
+    """True for gains that differ as `check` names it, and explain half of what parts of images differ by.
 
     Gloss and moving shadows differ within an image: gains of whole images explain little of them.
     """
