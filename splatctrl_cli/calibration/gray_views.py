@@ -18,13 +18,20 @@ EVERY = slice(None)
 class GrayView:
     """A view with lengths divided by the recording's scale, and its grey values.
 
-    gray (h, w) in [0, 1]; slope (h, w, 2) per pixel; points_gray (K,): at the view's points.
+    gray (h, w) in [0, 1]; slope (h, w, 2) per pixel; points_gray (K,): at the view's points. tiles (K,): number of
+    each point's tile, in a checkerboard; poses are solved from points in even tiles, and judged in odd ones.
     """
 
     depth: DepthView
     gray: Float32
     slope: Float32
     points_gray: Float64
+    tiles: Index
+
+    @property
+    def is_solved(self) -> Bool:
+        """Points (K,) that poses are solved from."""
+        return np.asarray(self.tiles % 2 == 0)
 
 
 def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
@@ -43,11 +50,13 @@ def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
     )
     view = DepthView.of(small, fixed.REFINE_POINTS, 2)
     u, v = np.round(project(view.lens, view.points)).astype(np.int64).T
+    row, column = v * fixed.REFINE_TILES // len(gray), u * fixed.REFINE_TILES // len(gray)
     return GrayView(
         depth=view,
         gray=np.asarray(gray, np.float32),
         slope=np.stack([cv2.Sobel(gray, cv2.CV_32F, dx, 1 - dx, ksize=3) / 8 for dx in (1, 0)], axis=-1),
         points_gray=gray[v, u].astype(np.float64),
+        tiles=2 * (row * gray.shape[1] + column) + (row + column) % 2,
     )
 
 
@@ -103,9 +112,9 @@ class Rows:
 
 
 def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
-    """Rows of every second point of view a on view b, T (4, 4) apart."""
-    number = np.arange(0, len(a.depth.points), 2)
-    there, lands, surface, normals, distance = hit_surface(a, b, T, slice(None, None, 2))
+    """Rows of view a's solved points on view b, T (4, 4) apart."""
+    number = np.flatnonzero(a.is_solved)
+    there, lands, surface, normals, distance = hit_surface(a, b, T, a.is_solved)
     sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
     lands &= np.abs(distance) < width * sigma
     number, there, normals, surface = number[lands], there[lands], normals[lands], surface[lands]
@@ -124,9 +133,7 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
     )
     if width > fixed.REFINE_COLOR_FROM or len(own) < fixed.REFINE_FEWEST:
         return depth
-    slope = b.slope[v, u].astype(np.float64)
-    value = b.gray[v, u] + np.einsum("ki,ki->k", slope, exact - np.stack([u, v], axis=1))
-    difference = _alike(value, a.points_gray[number])
+    difference, slope = _gray_differences(a, b, number, exact)
     along = slope * [lens.fx, lens.fy] / z[:, None]
     gradient = np.column_stack([along, -np.einsum("ki,ki->k", along, there[:, :2]) / z])
     deviation = difference / fixed.REFINE_COLOR
@@ -143,7 +150,7 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
 
 
 def hit_surface(
-    a: GrayView, b: GrayView, T: Float64, which: slice = EVERY
+    a: GrayView, b: GrayView, T: Float64, which: slice | Bool = EVERY
 ) -> tuple[Float64, Bool, Float64, Float64, Float64]:
     """View a's points in view b, at T (4, 4): points, hits, surface, normals, distances.
 
@@ -153,6 +160,32 @@ def hit_surface(
     lands, surface, normals = landed(there, b.depth)
     lands &= np.einsum("ki,ki->k", a.depth.point_normals[which] @ T[:3, :3].T, normals) > fixed.REFINE_ALIKE
     return there, lands, surface, normals, np.asarray(np.einsum("ki,ki->k", there - surface, normals))
+
+
+def misfits_of(a: GrayView, b: GrayView, T: Float64) -> tuple[Float64, Index]:
+    """Squared differences (2, K) [sigma^2] of depth and grey value, and tiles (K,), of view a's judging points.
+
+    T (4, 4) apart. Differences are cut as in the last round, and nan without a common surface.
+    """
+    number = np.flatnonzero(~a.is_solved)
+    there, lands, _, _, distance = hit_surface(a, b, T, ~a.is_solved)
+    sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
+    widest = fixed.REFINE_WIDTHS[-1]
+    found = np.full((2, len(number)), np.nan)
+    found[0, lands] = np.minimum(np.square(distance / sigma), widest**2)[lands]
+    lands &= np.abs(distance) < widest * sigma
+    if lands.sum() >= fixed.REFINE_FEWEST:
+        difference, _ = _gray_differences(a, b, number[lands], project(b.depth.lens, there[lands]))
+        found[1, lands] = np.minimum(np.square(difference / fixed.REFINE_COLOR), fixed.REFINE_CUT**2)
+    return found, a.tiles[number]
+
+
+def _gray_differences(a: GrayView, b: GrayView, number: Index, pixels: Float64) -> tuple[Float64, Float64]:
+    """Grey differences (K,) of view a's points `number` from view b at pixels (K, 2), and b's slopes (K, 2) there."""
+    u, v = np.round(pixels).astype(np.int64).T
+    slope = b.slope[v, u].astype(np.float64)
+    value = b.gray[v, u] + np.einsum("ki,ki->k", slope, pixels - np.stack([u, v], axis=1))
+    return _alike(value, a.points_gray[number]), slope
 
 
 def _alike(value: Float64, other: Float64) -> Float64:

@@ -17,7 +17,16 @@ from scipy.linalg import null_space
 from scipy.sparse import csr_array
 
 from splatctrl_cli.calibration.evidence import HELD, POSE, transform_of, twist_between
-from splatctrl_cli.calibration.gray_views import GrayView, Rows, gray_view, hit_surface, overlapping, rows_of, scaled
+from splatctrl_cli.calibration.gray_views import (
+    GrayView,
+    Rows,
+    gray_view,
+    hit_surface,
+    misfits_of,
+    overlapping,
+    rows_of,
+    scaled,
+)
 from splatctrl_cli.calibration.views import surface_normals
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, project
@@ -187,38 +196,43 @@ class RefinedPoses:
     is_better: bool
 
 
-def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | None = None) -> RefinedPoses:
+def refined_poses(
+    frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | None = None, *, must_gain: bool = True
+) -> RefinedPoses:
     """Refine the poses of `free` (N,) frames; scale: of the recording's lengths.
 
-    A wide prior anchors the whole. Frames that would move beyond `REFINE_FARTHEST` stay.
+    A wide prior anchors the whole. Frames that would move beyond `REFINE_FARTHEST` stay, and with must_gain those
+    whose judging points gain nothing.
     """
     views = [gray_view(frame, scale) for frame in frames]
     recorded = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
-    wanted = np.ones(len(views), np.bool_) if free is None else free.copy()
-    is_free = wanted.copy()
+    wanted = np.ones(len(views), np.bool_) if free is None else free
+    is_held, stays = np.zeros((2, len(views)), np.bool_)
     while True:
-        pairs = overlapping(views, recorded, is_free | ~wanted, is_free)
-        is_free &= np.bincount(np.ravel(pairs).astype(np.int64), minlength=len(views)) > 0
+        pairs = overlapping(views, recorded, ~is_held, wanted & ~is_held)
+        is_held |= wanted & (np.bincount(np.ravel(pairs).astype(np.int64), minlength=len(views)) == 0)
+        is_free = wanted & ~is_held & ~stays
         poses = _solved(views, recorded, pairs, is_free)
         twists = np.array([twist_between(a, b) for a, b in zip(recorded, poses, strict=True)]).reshape(-1, POSE)
         moved, turned = np.linalg.norm(twists[:, 3:], axis=1), np.degrees(np.linalg.norm(twists[:, :3], axis=1))
         is_far = (moved > fixed.REFINE_FARTHEST[0]) | (turned > fixed.REFINE_FARTHEST[1])
-        if not is_far.any():
+        if is_far.any():
+            is_held |= is_far
+            continue
+        gains_nothing = is_free & ~_gains(views, recorded, poses, pairs)
+        if not (must_gain and gains_nothing.any()):
             break
-        is_free &= ~is_far
-    before, after = (_distances(views, T, pairs, odd=True) for T in (recorded, poses))
-    is_better = after < (1 - fixed.REFINE_GAIN) * before
-    if not is_better:
-        poses, moved, turned, after = recorded, 0.0 * moved, 0.0 * turned, before
+        stays |= gains_nothing
+    before, after = (_distance(views, T, pairs) for T in (recorded, poses))
     return RefinedPoses(
         T_world_camera=tuple(scaled(T, scale) if f else frame.T_world_camera
-                             for T, f, frame in zip(poses, is_free & is_better, frames, strict=True)),
+                             for T, f, frame in zip(poses, is_free, frames, strict=True)),
         moved=scale * moved,
         turned=turned,
         before=scale * before,
         after=scale * after,
-        is_held=wanted & ~is_free,
-        is_better=is_better,
+        is_held=is_held,
+        is_better=bool(is_free.any()),
     )  # fmt: skip
 
 
@@ -261,7 +275,8 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
     gains = []
     for half, grids in zip(halves, reversed(told), strict=True):
         without, with_ = (
-            refined_poses(part, scale).after for part in (half, freed(half, {name: grids[name] for name in chosen}))
+            refined_poses(part, scale, must_gain=False).after
+            for part in (half, freed(half, {name: grids[name] for name in chosen}))
         )
         gains.append(1 - with_ / without if without else 0.0)
     is_told = min(gains) > fixed.BEND_GAIN
@@ -306,6 +321,8 @@ def _solved(
             bends.begin(size)
             now = bends.now
         for i, j in pairs:
+            if not (is_free[i] or is_free[j]):
+                continue
             rows = rows_of(now[i], now[j], invert_transform(poses[j]) @ poses[i], width)
             own, other = (POSE * column[k] + np.arange(POSE) for k in (i, j))
             keep = np.repeat([is_free[i], is_free[j]], POSE)
@@ -326,14 +343,52 @@ def _solved(
     return poses
 
 
-def _distances(
-    views: Sequence[GrayView], poses: Sequence[Float64], pairs: Sequence[tuple[int, int]], *, odd: bool
-) -> float:
-    """Median distance of points from other surfaces; `odd`: those not in `rows_of`."""
+def _gains(
+    views: Sequence[GrayView], before: Sequence[Float64], after: Sequence[Float64], pairs: Sequence[tuple[int, int]]
+) -> Bool:
+    """Views (N,) whose judging points agree better with other views at poses `after`.
+
+    Errors of depth, alike in neighbouring pixels, let wrong poses reduce distances: grey values must agree better
+    beyond their noise, or no worse if distances fall by `REFINE_GAIN`.
+    """
+    parts: list[list[Float64]] = [[np.zeros((5, 0))] for _ in views]
+    for i, j in pairs:
+        (at_first, tiles), (at_last, _) = (
+            misfits_of(views[i], views[j], invert_transform(poses[j]) @ poses[i]) for poses in (before, after)
+        )
+        rows = np.vstack([at_first, at_last, tiles + views[i].gray.size * 2 * i])
+        for k in (i, j):
+            parts[k].append(rows)
+    return np.array([_agrees_better(*np.hstack(part)) for part in parts])
+
+
+def _agrees_better(
+    depth_before: Float64, gray_before: Float64, depth_after: Float64, gray_after: Float64, tiles: Float64
+) -> bool:
+    depth, depth_sure = _gain(depth_before, depth_after, tiles)
+    gray, gray_sure = _gain(gray_before, gray_after, tiles)
+    if gray_sure > fixed.REFINE_SURE:
+        return depth_sure > -fixed.REFINE_SURE
+    return gray >= 0 and depth_sure > fixed.REFINE_SURE and depth > fixed.REFINE_GAIN
+
+
+def _gain(before: Float64, after: Float64, tiles: Float64) -> tuple[float, float]:
+    """Share of the misfit (K,) gained, and that by its standard error over tiles (K,); 0 without common points."""
+    is_known = np.isfinite(before) & np.isfinite(after)
+    gain, of_tile = (before - after)[is_known], np.unique(tiles[is_known], return_inverse=True)[1]
+    if not gain.any():
+        return 0.0, 0.0
+    sums, counts = np.bincount(of_tile, gain), np.bincount(of_tile)
+    error = np.sqrt(np.square(sums - counts * gain.mean()).sum())
+    return float(gain.sum() / before[is_known].sum()), float(gain.sum() / max(error, 1e-12))
+
+
+def _distance(views: Sequence[GrayView], poses: Sequence[Float64], pairs: Sequence[tuple[int, int]]) -> float:
+    """Median distance of judging points from other surfaces."""
     found = [np.zeros(0)]
     for i, j in pairs:
         _, lands, _, _, distance = hit_surface(
-            views[i], views[j], invert_transform(poses[j]) @ poses[i], slice(int(odd), None, 2)
+            views[i], views[j], invert_transform(poses[j]) @ poses[i], ~views[i].is_solved
         )
         found.append(np.minimum(np.abs(distance[lands]), fixed.REFINE_FARTHEST[0]))
     every = np.concatenate(found)

@@ -99,7 +99,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
             "exposure",
             where,
             f"one image shows a surface up to {100 * ratio:.0f} % brighter or more coloured than another",
-            "fix exposure and white balance in its driver; 'reconstruct --refine-exposure' corrects a still scene",
+            "fix exposure and white balance in its driver; 'reconstruct' corrects the views of a still scene",
             value=round(100 * ratio, 1),
             unit="%",
         )
@@ -110,7 +110,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
             where,
             f"rows of one image differ in exposure by up to {100 * uneven:.0f} %, unlike those of its others",
             "set the driver's anti-flicker to the mains frequency, or expose for whole periods of the lamp;"
-            " 'reconstruct --refine-exposure' has one gain for a whole image and leaves this as it is",
+            " 'reconstruct' has one gain for a whole image and leaves this as it is",
             value=round(100 * uneven, 1),
             unit="%",
         )

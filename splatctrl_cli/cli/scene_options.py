@@ -80,7 +80,7 @@ RECONSTRUCT = (
         ),
         option(
             "--refine-exposure",
-            "give the views of a still scene one brightness and white balance",
+            "give the views of a still scene one brightness and white balance, even if they differ by less than 5 %",
             fields={"exposure": bool},
         ),
     ),

@@ -18,6 +18,7 @@ from splatctrl_cli.jobs.reconstruct.correct_views import Corrections, corrected_
 from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.calibration.scan import disturbed, gains_of, views_of
+from tests.jobs.score.wall import FakeSource
 from tests.plain import plain_frame
 
 
@@ -55,6 +56,44 @@ def test_poses_that_are_right_stay_to_the_last_bit(views: list[RgbdFrame]) -> No
     found = refined_poses(views)
     assert not found.is_better
     assert all(np.array_equal(T, view.T_world_camera) for T, view in zip(found.T_world_camera, views, strict=True))
+
+
+def blotched(views: Sequence[RgbdFrame], share: float, num: int = 8) -> list[RgbdFrame]:
+    """Depths that err by `share` at 1 m, growing with their square, alike over the width of an image by `num`."""
+    rng, found = np.random.default_rng(0), []
+    for view in views:
+        height, width = view.depth.shape
+        error = cv2.resize(rng.normal(size=(3 * num // 4, num)), (width, height), interpolation=cv2.INTER_CUBIC)
+        found.append(replace(view, depth=(view.depth / (1 + share * view.depth * error)).astype(np.float32)))
+    return found
+
+
+@pytest.mark.parametrize(("is_gray", "num"), [(False, 4), (False, 8), (True, 8)])
+def test_right_poses_stay_where_depth_errs_alike_in_neighbouring_pixels(
+    views: list[RgbdFrame], is_gray: bool, num: int
+) -> None:
+    """Poses that are wrong by a centimetre bring such surfaces nearer to each other."""
+    off = blotched(views, 0.01, num)
+    if is_gray:
+        off = [replace(view, color=np.full_like(view.color, 128)) for view in off]
+    found = refined_poses(off)
+    assert not found.is_better and found.after == found.before
+    assert all(np.array_equal(T, view.T_world_camera) for T, view in zip(found.T_world_camera, off, strict=True))
+
+
+@pytest.mark.parametrize(("share", "num", "millimetres"), [(0.005, 8, 10.0), (0.01, 32, 3.0)])
+def test_poses_that_are_off_are_put_right_where_depth_errs_too(
+    views: list[RgbdFrame], share: float, num: int, millimetres: float
+) -> None:
+    off = disturbed(blotched(views, share, num), millimetres, 0.05 * millimetres)
+    before, found = errors([view.T_world_camera for view in off], views), refined_poses(off)
+    assert errors(found.T_world_camera, views)[0] < 0.5 * before[0]
+
+
+def test_one_view_among_many_that_is_off_is_put_right(views: list[RgbdFrame]) -> None:
+    """It hardly changes the median distance."""
+    off = [disturbed(views, 30.0, 1.5)[k] if k == 3 else view for k, view in enumerate(views)]
+    assert errors(refined_poses(off).T_world_camera, views)[0] < 1.0
 
 
 def test_a_scene_ten_times_as_large_is_put_right_alike(views: list[RgbdFrame]) -> None:
@@ -101,7 +140,7 @@ def test_one_view_is_put_among_others_that_stay(views: list[RgbdFrame]) -> None:
 
 def test_what_is_stored_is_where_each_view_is(views: list[RgbdFrame]) -> None:
     off = disturbed(views, 20.0, 1.0)
-    moved, told = Corrections(poses=True).of(off, "scan", SILENT)
+    moved, told = Corrections(poses=True).of(off, FakeSource(frames=off, has_clock=False), SILENT)
     for frame, row in zip(moved, told["corrected_views"], strict=True):
         assert np.array_equal(np.reshape(row["T_world_camera"], (4, 4)), frame.T_world_camera)
     assert told["pose_residual"] < 0.1 * told["poses"]["residual_before"]

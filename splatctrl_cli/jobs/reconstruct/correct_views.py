@@ -1,4 +1,4 @@
-"""``--refine-poses`` and ``--refine-exposure``: correct a still scene's views by each other."""
+"""Poses (``--refine-poses``) and exposure of a still scene's views, corrected by each other."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.calibration.gray_views import exposed, exposure_gains
+from splatctrl_cli.calibration.gray_views import band_ratios, exposed, exposure_gains
 from splatctrl_cli.calibration.pose_refinement import (
     FoundBends,
     depth_bends,
@@ -15,6 +15,7 @@ from splatctrl_cli.calibration.pose_refinement import (
     refined_poses,
     unbent,
 )
+from splatctrl_cli.checks import limits
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import UsageError, refuse_if, require
 from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
@@ -26,7 +27,10 @@ from splatctrl_cli.scene.scale import RecordedDepth
 
 @dataclass(frozen=True, kw_only=True)
 class Corrections:
-    """Kinds of correction of a still scene's views."""
+    """Requested corrections of a still scene's views.
+
+    Without a robot, exposure is also corrected unrequested, if brightness or colour differ as `check` names it.
+    """
 
     poses: bool = False
     exposure: bool = False
@@ -50,17 +54,17 @@ class Corrections:
         )
 
     def of(
-        self, frames: Sequence[RgbdFrame], name: str, console: Progress, *, has_robot: bool = False
+        self, frames: Sequence[RgbdFrame], source: RecordSource, console: Progress, *, has_robot: bool = False
     ) -> tuple[list[RgbdFrame], dict[str, Any]]:
         """Correct the frames; also return the facts for ``run.json``.
 
         has_robot: depth stays as measured, since the map will judge. Raises InputError without depth.
         """
-        if not self:
+        depth = RecordedDepth.of(frames)
+        if not self and (source.has_clock or has_robot or depth is None):
             return list(frames), {}
         depth = require(
-            RecordedDepth.of(frames),
-            f"{name}: {self.options}: no view has depth, which alone says what views have in common",
+            depth, f"{source.name}: {self.options}: no view has depth, which alone says what views have in common"
         )
         scale, told = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
         rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
@@ -72,12 +76,12 @@ class Corrections:
                 row | {"T_world_camera": f.T_world_camera.ravel().tolist()}
                 for row, f in zip(rows, moved, strict=True)
             ]
-        if self.exposure:
-            gains = _gains(moved, scale, console)
+        gains = _gains(moved, scale, console, is_requested=self.exposure)
+        if gains is not None:
             told["exposure_spread"] = float(np.abs(np.log(gains)).max())
             rows = [row | {"gain": gain.tolist()} for row, gain in zip(rows, gains, strict=True)]
             moved = [exposed(frame, gain) for frame, gain in zip(moved, gains, strict=True)]
-        return moved, told | {"corrected_views": rows}
+        return moved, told | {"corrected_views": rows} if told else {}
 
 
 def _correct_poses(
@@ -137,14 +141,28 @@ def _describe(bends: FoundBends, scale: float, apart: float, after: float, conso
     )
 
 
-def _gains(frames: list[RgbdFrame], scale: float, console: Progress) -> Float64:
+def _gains(frames: list[RgbdFrame], scale: float, console: Progress, *, is_requested: bool) -> Float64 | None:
+    """Gains (N, 3), 1 if they differ by less than `EXPOSURE_GAIN`; None if neither requested nor found."""
     gains = exposure_gains(frames, scale)
     least, most = float(gains.min()), float(gains.max())
-    if np.abs(np.log(gains)).max() < fixed.EXPOSURE_GAIN:
+    if is_requested and np.abs(np.log(gains)).max() < fixed.EXPOSURE_GAIN:
         console.log(f"exposure: the same in all {len(frames)} views, within {100 * max(most - 1, 1 - least):.1f} %")
         return np.ones_like(gains)
+    if not is_requested and not _are_exposures(gains, frames, scale):
+        return None
     console.log(f"exposure: {len(frames)} views are divided by {least:.2f} to {most:.2f}, each colour by its own")
     return gains
+
+
+def _are_exposures(gains: Float64, frames: Sequence[RgbdFrame], scale: float) -> bool:
+    """True for gains that differ as `check` names it, and explain half of what parts of images differ by.
+
+    Gloss and moving shadows differ within an image: gains of whole images explain little of them.
+    """
+    if (gains.max(axis=0) / gains.min(axis=0)).max() <= 1 + limits.EXPOSURE_RATIO:
+        return False
+    bands = band_ratios(frames, scale, np.ones(len(frames), np.bool_), limits.EXPOSURE_BANDS)
+    return bands.misfit(gains[:, None]) < limits.EXPOSURE_EXPLAINED * bands.misfit(np.ones((1, 1, 3)))
 
 
 def corrected(frame: RgbdFrame, corrections: Mapping[tuple[str, int], ViewCorrection]) -> RgbdFrame:

@@ -190,7 +190,7 @@ class Reconstruction:
         if self._fitter is None:
             self._fit_to(RecordedDepth.of(step.frames), console)
             frames, self.corrected = self.request.corrections.of(
-                step.frames, self.source.name, console, has_robot=self.robot is not None
+                step.frames, self.source, console, has_robot=self.robot is not None
             )
             step = replace(step, frames=tuple(frames))
         self.agreement.check(step, self.config.occupancy, console)

@@ -1,15 +1,16 @@
-"""``--refine-poses``, ``--refine-exposure`` and corrected cameras, from the recording to the score."""
+"""``--refine-poses``, exposure and corrected cameras, from the recording to the score."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from splatctrl_cli.calibration.displacement import is_corrected
-from splatctrl_cli.calibration.gray_views import exposed
+from splatctrl_cli.calibration.gray_views import exposed, exposure_gains
 from splatctrl_cli.calibration.pose_refinement import unbent
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import load_config
@@ -21,6 +22,7 @@ from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.replay.evidence_criteria import calibration
+from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.jobs.score import reference as score_reference
 from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.recording.source import open_source
@@ -133,16 +135,49 @@ def test_right_views_give_the_same_splats_with_and_without(views: list[RgbdFrame
     assert without.metrics["exposure_spread"] is None
 
 
-def test_a_view_held_out_is_scored_at_its_own_exposure_and_at_that_of_the_others(
-    views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def unlike(views: list[RgbdFrame]) -> list[RgbdFrame]:
+    """Exposed each for itself."""
     gains = gains_of(len(views)) ** 1.5
     gains[HELD_OUT] = [1.3, 1.2, 1.1]
-    off = held_out([exposed(view, 1 / gain) for view, gain in zip(views, gains, strict=True)])
-    result = reconstruct(request(off, tmp_path / "scene", corrections=EXPOSURE))
+    return [exposed(view, 1 / gain) for view, gain in zip(views, gains, strict=True)]
+
+
+@pytest.mark.parametrize("corrections", [EXPOSURE, Corrections()], ids=["asked for", "found"])
+def test_a_view_held_out_is_scored_at_its_own_exposure_and_at_that_of_the_others(
+    views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, corrections: Corrections
+) -> None:
+    off = held_out(unlike(views))
+    result = reconstruct(request(off, tmp_path / "scene", corrections=corrections))
     assert result.metrics["exposure_spread"] > 0.1
     metrics = scored(tmp_path, off, monkeypatch)
     assert metrics["psnr_all_corrected"] > metrics["psnr_all"] + 1.0
+
+
+def glossy(views: list[RgbdFrame]) -> list[RgbdFrame]:
+    """Gloss and shadows that lie elsewhere in each image."""
+    rng, found = np.random.default_rng(0), []
+    for view in views:
+        height, width = view.depth.shape
+        light = np.exp(cv2.resize(0.4 * rng.normal(size=(3, 4)), (width, height), interpolation=cv2.INTER_LINEAR))
+        found.append(replace(view, color=np.clip(view.color * light[..., None], 0, 255).astype(np.uint8)))
+    return found
+
+
+def test_exposures_are_found_where_whole_images_differ_and_no_robot_is_judged(seven: list[RgbdFrame]) -> None:
+    def is_found(views: list[RgbdFrame], *, has_clock: bool = False, has_robot: bool = False) -> bool:
+        source = FakeSource(frames=views, has_clock=has_clock)
+        made, facts = Corrections().of(views, source, SILENT, has_robot=has_robot)
+        is_same = all(np.array_equal(a.color, b.color) for a, b in zip(made, views, strict=True))
+        assert is_same != ("exposure_spread" in facts)
+        return not is_same
+
+    assert is_found(unlike(seven))
+    assert not is_found([exposed(view, np.full(3, 1 + 0.005 * k)) for k, view in enumerate(seven)])
+    assert not is_found(unlike(seven), has_clock=True)
+    assert not is_found(unlike(seven), has_robot=True)
+    assert not is_found([replace(view, depth=np.zeros_like(view.depth)) for view in unlike(seven)])
+    assert np.ptp(exposure_gains(glossy(seven))) > 0.1, "whole images seem to differ"
+    assert not is_found(glossy(seven))
 
 
 def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_path: Path) -> None:
