@@ -77,7 +77,7 @@ Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Limit | 
 Registry = tuple[tuple[str, ...], Iterable[Entry]]
 LISTS: dict[str, Registry] = {  # with the words before what follows an entry's first sentence
     "criteria": (("**else**",), CRITERIA),
-    "limits": (("since",), (LIMITS[0], BY_FEW, *LIMITS[1:], PROOF)),
+    "limits": (("since",), (LIMITS[0], *BY_FEW.values(), *LIMITS[1:], PROOF)),
     "metrics": (("",), [*documented()]),
     "splat_formats": (("rounding", "without"), SPLAT_FORMATS.values()),
     "grid_formats": (("for",), GRID_FORMATS.values()),

@@ -14,7 +14,8 @@ from splatctrl_cli.config.fixed import (
     HIDDEN,
     MISPLACED,
     UNSEEN,
-    UNSEEN_BY_FEW,
+    UNSEEN_BY_ONE,
+    UNSEEN_BY_TWO,
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.metrics import lowest
@@ -136,12 +137,18 @@ LIMITS = (
         remedy="reconstruct with a larger --box",
     ),
 )
-BY_FEW = replace(
-    LIMITS[0],
-    asked="never seen by one or two cameras, of all points within the margin",
-    why="the far side of the arm may hide a whole object from them",
-    most=UNSEEN_BY_FEW,
-)
+BY_FEW = {
+    num: replace(
+        LIMITS[0],
+        asked=f"never seen by {cameras}, of all points within the margin",
+        why=f"the far side of the arm may hide a whole object from {them}",
+        most=most,
+    )
+    for num, cameras, them, most in (
+        (2, "two cameras", "them", UNSEEN_BY_TWO),
+        (1, "a lone camera", "it", UNSEEN_BY_ONE),
+    )
+}
 PROOF = Limit(
     asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
     why="such a run would be safe by assumption",
@@ -156,7 +163,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
     """Every class of evidence within the margin of the arm keeps its limit (listed below); at most `--max-unknown`
     of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
-    first = BY_FEW if len(judged.inputs.scene.cameras or ()) in (1, 2) else LIMITS[0]
+    first = BY_FEW.get(len(judged.inputs.scene.cameras or ()), LIMITS[0])
     for limit in (first, *LIMITS[1:]):
         yield from _check_limit(judged, limit)
     if judged.request.unseen == OCCUPIED:

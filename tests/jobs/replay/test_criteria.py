@@ -287,9 +287,12 @@ def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, mor
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
 
 
-@pytest.mark.parametrize(("cameras", "count"), [("a", 1), ("ab", 1), ("abc", 0), (None, 0)])
-def test_one_or_two_cameras_must_see_more_of_the_space_about_the_arm(cameras: Any, count: int) -> None:
-    run = judged({"unseen": np.full(NUM, 0.5 * (evidence.UNSEEN + evidence.UNSEEN_BY_FEW))})
+@pytest.mark.parametrize(
+    ("share", "cameras", "count"),
+    [(0.34, "a", 1), (0.32, "a", 0), (0.39, "ab", 0), (0.41, "ab", 1), (0.47, "abc", 0), (0.47, None, 0)],
+)
+def test_fewer_cameras_must_see_more_of_the_space_about_the_arm(share: float, cameras: Any, count: int) -> None:
+    run = judged({"unseen": np.full(NUM, share)})
     run = replace(run, inputs=replace(run.inputs, scene=replace(run.inputs.scene, cameras=cameras)))
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
 
