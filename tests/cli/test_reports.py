@@ -127,7 +127,7 @@ def test_a_report_inside_the_output_is_refused(log: Path, tmp_path: Path) -> Non
     out = tmp_path / "out"
     told = splatctrl("reconstruct", log, "-o", out, "--junit", out / "j.xml")
     assert (told.returncode, out.exists()) == (2, False)
-    assert "j.xml: is in --out, which appears whole; put it beside that" in told.stderr
+    assert "j.xml: is in --out, which appears whole; put it next to that folder" in told.stderr
 
 
 def test_on_github_a_command_annotates_and_sums_up_and_its_json_is_whole(

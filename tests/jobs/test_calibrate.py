@@ -297,7 +297,7 @@ def test_directions_that_a_table_does_not_show_are_named(tmp_path: Path) -> None
     assert "not observed: " in told
     assert "of cam1" in told
     assert "translation in the table's plane" in told
-    assert "put things of different shapes" in told
+    assert "put objects of different shapes" in told
 
 
 def test_a_robot_that_meshes_draw_needs_no_spheres(sample_data: Path) -> None:
