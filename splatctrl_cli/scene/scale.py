@@ -29,13 +29,14 @@ Lengths of the robot and its contacts are not among them.
 class RecordedDepth:
     """Recorded depth [m]: median, 10th percentile `nearest`, and `farthest` without stray pixels.
 
-    noise [1/m]: `depth_noise` of the noisiest camera, 0 if unknown.
+    noise [1/m]: `depth_noise` of the noisiest camera, 0 if unknown. pixel [m]: width of a pixel at the median depth.
     """
 
     median: float
     nearest: float
     farthest: float
     noise: float = 0.0
+    pixel: float = float("inf")
 
     @classmethod
     def of(cls, frames: Sequence[RgbdFrame]) -> "RecordedDepth | None":
@@ -51,6 +52,7 @@ class RecordedDepth:
             nearest=nearest,
             farthest=farthest,
             noise=max(depth_noise([f.depth for f in frames if f.camera == camera]) for camera in cameras),
+            pixel=median / max(frame.intrinsics.fx for frame in frames),
         )
 
 
@@ -84,9 +86,9 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
 def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:
     """`config` with defaults fitted to the recording; the same object if nothing changes.
 
-    Lengths scale by `scene.scale`, or if 0, by the median depth over a table's at arm's length. min_range becomes at
-    most half the nearest depth, max_range at least the farthest. With a robot, scale 0 scales nothing, and a larger
-    recorded error replaces the default.
+    Lengths scale by `scene.scale`, or if 0, by the median depth over a table's at arm's length. min_radius becomes at
+    most a pixel, min_range at most half the nearest depth, max_range at least the farthest. With a robot, scale 0
+    scales nothing, and a larger recorded error replaces the default.
     """
     least = OccupancyConfig().depth_error
     if has_robot and depth.noise > least == config.occupancy.depth_error:
@@ -99,6 +101,8 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
     values: dict[str, float] = {"scale": scale}
     if is_found and scene.radius_depth == 0:
         values["radius_depth"] = depth.median
+    if is_found and config.scene.min_radius == SceneConfig().min_radius:
+        values["min_radius"] = min(scene.min_radius, depth.pixel)
     ranges: dict[str, float] = {}
     if is_found and config.occupancy.min_range == OccupancyConfig().min_range:
         least = config.occupancy.min_range  # a nearer scene changes neither noise nor what a camera carries

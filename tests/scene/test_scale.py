@@ -72,6 +72,19 @@ def test_lengths_grow_with_the_depth_and_what_is_set_stays() -> None:
     assert ranges == pytest.approx((0.6, 12.0, 0.05))
 
 
+@pytest.mark.parametrize(("pixel", "expected"), [(0.004, 0.004), (0.01, 0.006)])
+def test_a_splat_may_be_as_small_as_a_pixel(pixel: float, expected: float) -> None:
+    depth = replace(ROOM, pixel=pixel)
+    assert fitted_to(Config(), depth).scene.min_radius == pytest.approx(expected)
+    given = SceneConfig(min_radius=0.008)
+    assert fitted_to(Config(scene=given), depth).scene.min_radius == 0.008
+    assert fitted_to(Config(), depth, has_robot=True).scene.min_radius == SceneConfig().min_radius
+    seen = frame(0, block=0.2)
+    recorded = RecordedDepth.of([seen])
+    assert recorded is not None
+    assert recorded.pixel == pytest.approx(recorded.median / seen.intrinsics.fx)
+
+
 def slanted(noise: float, seed: int = 0) -> Float32:
     """Depth (240, 320) of a floor seen from the side, with a box on it; noise [1/m]."""
     v, u = np.mgrid[0:240, 0:320]
