@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import WriteError
+from splatctrl_cli.kernels import Int32
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame, UInt8
 
 NEAR = 0.05  # [m] in front of a camera below which nothing is drawn
 HIDDEN = 0.03  # [m] by which a surface must stand before a sphere to hide it
-OUTLINE = np.linspace(0.0, 2.0 * np.pi, 49)
+OUTLINE, SHIFT = np.linspace(0.0, 2.0 * np.pi, 49), 4
 FONT, FONT_SCALE, LINE_HEIGHT, EDGE = cv2.FONT_HERSHEY_DUPLEX, 0.52, 24, 10
 BODY, STILL, WORST, POINT = (253, 214, 150), (190, 190, 190), (0, 94, 213), (66, 228, 240)  # BGR
 INK, PAPER = (34, 34, 34), (255, 255, 255)
@@ -81,17 +82,18 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 
 def draw_sight(path: Path, moment: Moment, frame: RgbdFrame) -> None:
-    """Write the image with the spheres' silhouettes, a line to the obstacle, and the caption."""
+    """Write the image with the arm's silhouette, a line to the obstacle, and the caption."""
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
     picture = np.asarray(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     T_camera_world = np.linalg.inv(frame.T_world_camera)
     centers = moment.centers @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    for index in np.argsort(-centers[:, 2]):
-        color = BODY if moment.is_moving[index] else STILL
-        _outline(picture, centers[index], moment.radii[index], frame.intrinsics, zoom, color, 1)
+    rings = [_ring(*ball, frame.intrinsics, zoom) for ball in zip(centers, moment.radii, strict=True)]
+    for color, is_drawn in ((STILL, ~moment.is_moving), (BODY, moment.is_moving)):
+        _fill(picture, [rings[index] for index in np.flatnonzero(is_drawn)], color)
     worst = centers[moment.worst]
-    _outline(picture, worst, moment.radii[moment.worst], frame.intrinsics, zoom, WORST, 3)
+    for color, thickness in ((INK, 5), (WORST, 3)):
+        cv2.polylines(picture, rings[moment.worst], True, color, thickness, cv2.LINE_AA, SHIFT)
     obstacle = T_camera_world[:3, :3] @ moment.obstacle + T_camera_world[:3, 3]
     if np.isfinite(obstacle).all() and min(obstacle[2], worst[2]) > NEAR:
         _join(
@@ -134,18 +136,11 @@ def _pixel(point: Float64, intrinsics: Intrinsics, zoom: int) -> Float64:
     return np.asarray((plane + 0.5) * zoom - 0.5)
 
 
-def _outline(
-    picture: UInt8,
-    center: Float64,
-    radius: float,
-    intrinsics: Intrinsics,
-    zoom: int,
-    color: tuple[int, int, int],
-    thickness: int,
-) -> None:
+def _ring(center: Float64, radius: float, intrinsics: Intrinsics, zoom: int) -> list[Int32]:
+    """Outline (49, 2) [px / 2^SHIFT] of a sphere, camera frame; none if it is around the camera or behind it."""
     away = float(np.linalg.norm(center))
     if center[2] - radius <= NEAR:
-        return
+        return []
     share = 1.0 - (radius / away) ** 2
     first = np.cross(center, [0.0, 1.0, 0.0] if abs(center[1]) < 0.9 * away else [1.0, 0.0, 0.0])
     first /= np.linalg.norm(first)
@@ -154,9 +149,18 @@ def _outline(
         np.cos(OUTLINE)[:, None] * first + np.sin(OUTLINE)[:, None] * second
     )
     pixels = np.array([_pixel(point, intrinsics, zoom) for point in ring])
-    points = [np.round(16 * pixels).astype(np.int32)]
-    cv2.polylines(picture, points, True, INK, thickness + 2, cv2.LINE_AA, 4)
-    cv2.polylines(picture, points, True, color, thickness, cv2.LINE_AA, 4)
+    return [np.round(2**SHIFT * pixels).astype(np.int32)]
+
+
+def _fill(picture: UInt8, rings: Sequence[list[Int32]], color: tuple[int, int, int]) -> None:
+    """Tint the union of the rings in place, and outline it."""
+    mask = np.zeros(picture.shape[:2], np.uint8)
+    for ring in rings:
+        cv2.fillPoly(mask, ring, 255, cv2.LINE_8, SHIFT)
+    picture[mask > 0] = np.round(0.55 * picture[mask > 0] + 0.45 * np.array(color)).astype(np.uint8)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    for shade, thickness in ((INK, 4), (color, 2)):
+        cv2.drawContours(picture, outlines, -1, shade, thickness, cv2.LINE_AA)
 
 
 def _surface(center: Float64, obstacle: Float64, moment: Moment) -> Float64:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.worst_frames import WORST, Moment, draw_sight, sights_of, worst_moments
+from splatctrl_cli.evaluate.worst_frames import BODY, WORST, Moment, draw_sight, sights_of, worst_moments
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.plain import plain_frame
@@ -88,6 +88,17 @@ def test_the_worst_sphere_is_outlined_where_it_is(tmp_path: Path) -> None:
     np.testing.assert_allclose(radius, 100 * 0.05 * 6, atol=5)
     assert np.median(radius) == pytest.approx(30, abs=1)
     assert (pixels[720:].min(axis=(1, 2)) < 100).any()
+
+
+def test_the_arm_is_one_tinted_silhouette(tmp_path: Path) -> None:
+    """Two spheres that overlap have one outline; the image shows through."""
+    both = replace(MOMENT, centers=np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0]]), is_moving=np.array([True, True]))
+    pixels = drawn(tmp_path / "worst.png", both, frame(SECOND))
+    row, column = (int(6 * (middle + 0.5)) for middle in (LENS.cy, LENS.cx))
+    np.testing.assert_allclose(pixels[row - 50, column], 0.55 * 10 + 0.45 * np.array(BODY), atol=1)
+    along = pixels[row + 12, column : column + 36]  # from the middle to the worst sphere: inside of the silhouette
+    np.testing.assert_allclose(along[:2], pixels[row - 50, column][None].repeat(2, axis=0), atol=1)
+    assert (np.abs(pixels[row - 50, : column - 100] - 10) < 1).all(), "nothing outside"
 
 
 def test_a_sphere_around_the_camera_or_behind_it_is_not_drawn(tmp_path: Path) -> None:
