@@ -76,6 +76,7 @@ class Stage:
     balls: Sequence[Ball] = (FAR,)
     later: Sequence[Ball] = ()
     later_from: int = SECOND // 2  # [ns] from which these are there
+    are_later_people: bool = False
     people: Sequence[Ball] = ()
     map_stamps: Sequence[int] = tuple(i * QUARTER for i in range(5))
     unrepresented: ArrayLike = ()
@@ -155,7 +156,7 @@ class Stage:
     def _splats(self, stamp_ns: int) -> SplatSet:
         later = self.later if stamp_ns >= self.later_from else ()
         splats = splats_of(*self.balls, *later, *self.people)
-        splats.labels[len(self.balls) + len(later) :] = Label.HUMAN
+        splats.labels[len(self.balls) + (0 if self.are_later_people else len(later)) :] = Label.HUMAN
         return splats
 
     def _voxels(self, stamp_ns: int) -> KnownVoxels:

@@ -356,6 +356,15 @@ def test_a_scene_that_comes_into_the_driven_arm_is_a_hit(stage: Stage) -> None:
     assert (hit["value"], hit["time_s"]) == (1, pytest.approx(0.5, abs=0.02))
 
 
+def test_a_person_beside_the_driven_arm_is_no_hit_although_the_controller_keeps_further_off(
+    stage: Stage,
+) -> None:
+    stage.states, stage.later = passing(), [ball_beside(stage.arm, START + 0.3 * MOVE, 0.05)]
+    stage.are_later_people = True
+    _, verdict = stage.judged("--set", "control.human_margin=0.25", mode="closed-loop")
+    assert stage.desk.metrics()["num_scene_hits"] == 0 and "scene hits" not in decisive(verdict)
+
+
 def test_what_came_while_the_arm_was_driven_and_the_next_map_shows_is_a_hit(stage: Stage) -> None:
     """The loop ends between two maps; the first map after it has a ball where the arm now stands."""
     assert stage.judged(mode="closed-loop")[0] == 0
