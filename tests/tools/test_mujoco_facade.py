@@ -9,10 +9,11 @@ from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene.seeding import world_points
+from tests.tools.test_mujoco import renderer  # noqa: F401  # chooses EGL, and skips where MuJoCo is missing
+from tools.mujoco import facade
 
-facade = pytest.importorskip("tools.mujoco.facade")
 
-
+@pytest.mark.usefixtures("renderer")
 def test_stereo_depth_has_gaps_and_errors_and_held_out_depth_is_exact(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,4 +1,4 @@
-"""Recordings by MuJoCo and what the tool says of them: ``python -m tools.mujoco record | campaign``."""
+"""Recordings by MuJoCo and what the tool says of them: ``python -m tools.mujoco record | campaign | facade``."""
 
 import argparse
 import os
@@ -15,10 +15,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from tools.mujoco.campaign import campaign
 
         return campaign(words[1:])
+    if words[:1] == ["facade"]:
+        from tools.mujoco import facade
+
+        return facade.main(words[1:])
     from tools.mujoco.recording import record
 
     parser = argparse.ArgumentParser(prog="python -m tools.mujoco", description=__doc__, allow_abbrev=False)
-    parser.add_argument("command", choices=("record", "campaign"))
+    parser.add_argument("command", choices=("record", "campaign", "facade"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--index", type=int, default=0)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the recording's folder")

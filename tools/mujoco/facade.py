@@ -1,4 +1,4 @@
-"""`python -m tools.mujoco.facade OUT`: photographs of a facade at 6 to 9 m, exact poses, depth by stereo matching.
+"""`python -m tools.mujoco facade OUT`: photographs of a facade at 6 to 9 m, exact poses, depth by stereo matching.
 
 MuJoCo draws; OpenCV matches each view with one to its right. Every eighth view is held out, with exact depth.
 """
@@ -6,7 +6,7 @@ MuJoCo draws; OpenCV matches each view with one to its right. Every eighth view 
 import argparse
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -33,14 +33,18 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def main(words: Sequence[str]) -> int:
+    """Write the views that the command line describes."""
+    parser = argparse.ArgumentParser(prog="python -m tools.mujoco facade", description=__doc__, allow_abbrev=False)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--baseline", type=float, default=1.2, help="[m] of the matched views")
     parser.add_argument("--finer", type=int, default=2, help="pixels along one, at which they are matched")
-    args = parser.parse_args()
+    args = parser.parse_args(words)
+    if args.baseline <= 0 or args.finer < 1:
+        parser.error("expected --baseline above 0 m and --finer of at least 1 pixel")
     write_views(args.out, args.seed, args.baseline, args.finer)
+    return 0
 
 
 def write_views(out: Path, seed: int, baseline: float = 1.2, finer: int = 2) -> None:
@@ -188,7 +192,3 @@ def match(left: UInt8, right: UInt8, baseline: float, finer: int) -> Float32:
     is_matched &= cv2.GaussianBlur(np.square(gray - smooth), (0, 0), 4.0) > PLAIN * COLOR_NOISE**2
     depth = FOCAL * baseline / np.maximum(disparity, 0.1)
     return np.where(is_matched & (depth < FARTHEST), depth, 0.0).astype(np.float32)
-
-
-if __name__ == "__main__":
-    main()
