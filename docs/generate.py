@@ -1,7 +1,7 @@
 """Writes the lists of the pages from the registries of formats, layouts, checks and criteria, for `make docs`."""
 
 import re
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,30 +31,35 @@ WORDS = {  # of a name in the documentation, for those that it stands for
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
-    """Figures of a command that are compared alike, as the documentation lists them."""
+    """Figures of a command with one better direction, as the documentation lists them."""
 
     command: str
-    names: tuple[str, ...]
-    scale: Scale
+    better: Better
+    names: Mapping[Scale, Iterable[str]]
 
     @property
     def docs(self) -> str:
         """The entry of the list, its cells separated by |."""
-        scale, shown = self.scale, ", ".join(f"`{name}`" for name in self.names)
-        parts = [f"{scale.absolute:g} {scale.unit}".rstrip()] if scale.absolute else []
-        parts += [f"{100 * scale.relative:g} %"] if scale.relative else []
-        return f"{self.command} | {shown}, {scale.better} | {' + '.join(parts) or '0'}"
+        alike = (", ".join(f"`{name}`" for name in names) + f": {_tolerance(s)}" for s, names in self.names.items())
+        return f"{self.command}, {self.better} | {'; '.join(alike)}"
+
+
+def _tolerance(scale: Scale) -> str:
+    parts = [f"{scale.absolute:g} {scale.unit}".rstrip()] if scale.absolute else []
+    parts += [f"{100 * scale.relative:g} %"] if scale.relative else []
+    return " + ".join(parts) or "0"
 
 
 def documented() -> Iterator[Compared]:
-    """The entries of the documentation's list: figures that have a direction, alike ones together."""
+    """The entries of the documentation's list: by command and direction, names of one tolerance together."""
     for command, of_name in scales().items():
-        alike: dict[Scale, list[str]] = {}
-        for name, scale in of_name.items():
-            if scale.better is not Better.NEITHER:
-                alike.setdefault(scale, []).append(_general(name, of_name))
-        for scale, names in alike.items():
-            yield Compared(command=command, names=tuple(dict.fromkeys(names)), scale=scale)
+        for better in (Better.LOWER, Better.HIGHER):
+            alike: dict[Scale, dict[str, None]] = {}  # names in order, each once
+            for name, scale in of_name.items():
+                if scale.better is better:
+                    alike.setdefault(scale, {})[_general(name, of_name)] = None
+            if alike:
+                yield Compared(command=command, better=better, names=alike)
 
 
 def _general(name: str, names: Container[str]) -> str:
