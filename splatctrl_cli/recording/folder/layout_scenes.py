@@ -199,7 +199,7 @@ ENTRIES = (
 3DMatch | the same, `camera-intrinsics.txt` | a file a frame | as above, not registered | of that file; 585, 585,
     320, 240 counts as 7-Scenes
 
-12-Scenes, BundleFusion, 3RScan | the same, `info.txt` or `_info.txt` | by a [description](#datasets-by-description)
+12-Scenes, BundleFusion, 3RScan | the same, `info.txt` or `_info.txt` | by [description](#datasets-by-description)
 """,
     ),
     Layout(
@@ -219,7 +219,7 @@ Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.
         matches=find_marks(*(f"color/ depth/ pose/ {lens}" for lens in ("intrinsic/", "intrinsics_color.txt"))),
         read=ask_description("ScanNet export", "scannet"),
         docs="""
-ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | by a
+ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | by
     [description](#datasets-by-description)
 """,
     ),
@@ -229,7 +229,7 @@ ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color
         matches=find_marks("rgb/ depth/ *.gt.freiburg"),
         read=ask_description("ICL-NUIM", "icl_nuim"),
         docs="""
-ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description](#datasets-by-description)
+ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by [description](#datasets-by-description)
 """,
     ),
     Layout(
@@ -238,7 +238,7 @@ ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description
         matches=find_marks("traj.txt results/frame*", "traj_w_c.txt rgb/rgb_*"),
         read=ask_description("Replica", "replica_nice_slam", "replica_semantic_nerf"),
         docs="""
-Replica of NICE-SLAM or Semantic-NeRF | `traj.txt`, `results/frame*`; `traj_w_c.txt`, `rgb/rgb_*` | by a
+Replica of NICE-SLAM or Semantic-NeRF | `traj.txt`, `results/frame*`; `traj_w_c.txt`, `rgb/rgb_*` | by
     [description](#datasets-by-description)
 """,
     ),
