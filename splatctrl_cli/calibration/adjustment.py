@@ -88,10 +88,7 @@ class Adjustment:
         return estimate
 
     def _step(self, normal: Normal, estimate: Estimate, start: Estimate, hold: float) -> Float64:
-        """The Gauss-Newton step; unobserved directions stay near the start.
-
-        So do all others, by a share `hold` of the residuals' weight, while wrong surfaces pull.
-        """
+        """The Gauss-Newton step, with a prior of weight `hold`; unobserved directions stay."""
         weight, offset = self._prior(estimate, start)
         weight = weight + hold * float(np.trace(normal.H)) / len(weight)
         V = self._basis
@@ -278,13 +275,12 @@ class Adjustment:
 
 
 def _cells(points_world: Float64, depth: float) -> Index:
-    """World cube of each point (K, 3), in which all cameras see the same errors. depth [m]: the median."""
+    """World cube of each point (K, 3); its errors are alike. depth [m]: the median."""
     x, y, z = np.floor(points_world / (fixed.CALIBRATION_CELL * depth)).astype(np.int64).T
     return np.asarray((x * 1_000_003 + y) * 1_000_003 + z)
 
 
 def _carry(twist: Float64, T: Float64) -> Float64:
-    """The motion (6,) of a frame fixed at T (4, 4) to one moving by `twist`, own axes."""
     if not twist.any():
         return twist
     turn, move = twist[:3], twist[3:]

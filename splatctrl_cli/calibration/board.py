@@ -87,7 +87,6 @@ def other_size(frame: RgbdFrame) -> tuple[int, int] | None:
 
 
 def _plain_corners(board: Board, gray: UInt8) -> Float64 | None:
-    """Pixels (K, 2) of a chessboard's corners, as `Board.points`, from a black square on."""
     is_found, corners = cv2.findChessboardCornersSB(
         gray, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
     )
@@ -109,7 +108,6 @@ def _brightness(gray: UInt8, square: Float64) -> float:
 
 
 def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
-    """Pixels (K, 2) of a ChArUco board's corners, from the markers' middles, whatever their size."""
     for name in MARKERS:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(gray)
@@ -273,7 +271,6 @@ def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool
 
 
 def _place_by_link(arm: Arm, sightings: Sequence[Sighting]) -> Float64:
-    """T_world_camera of a camera that sees the board on the best-fitting link."""
     fits: list[HandEye] = []
     reasons = ["no joint states at its frames"]
     for link in arm.model.frame_names:

@@ -227,5 +227,4 @@ def _list(texts: Any) -> str:
 
 
 def _text(text: str) -> str:
-    """A TOML basic string, whose escapes are JSON's."""
     return json.dumps(text, ensure_ascii=False)

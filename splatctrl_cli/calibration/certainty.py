@@ -168,7 +168,6 @@ def _share(unknown: Float64, direction: Float64, T_world_camera: Float64) -> flo
 
 
 def _named_directions(plane: Plane | None) -> Sequence[tuple[str, tuple[Float64, Float64]]]:
-    """Named rotations and translations, world: of a plane, or the world's axes."""
     zero = np.zeros(3)
     if plane is None:
         return [

@@ -85,10 +85,7 @@ def _correct_camera(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | N
 
 
 def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
-    """True if two links or more are clearly visible, each within half of `MISPLACED`.
-
-    With a wrong joint zero, no pose fits the links on both sides.
-    """
+    """True if two links or more are clearly visible, each within half of `MISPLACED`."""
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     found = [rows for frame in shown if (rows := _rows(arm, frame, np.eye(4))) is not None]
     links, residual = (np.concatenate([getattr(rows, name) for rows in found]) for name in ("links", "residual"))

@@ -138,7 +138,6 @@ class Arm:
         return None if q is None else self.model.frame_pose(q, link)
 
     def _surface_poses(self, stamp_ns: int) -> Float64 | None:
-        """T_world_link (L, 4, 4) of the surface's links, or None."""
         q = self.posture(stamp_ns)
         if q is None:
             return None
@@ -343,7 +342,6 @@ def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
 
 
 def _step(frame: RgbdFrame, num_averaged: int) -> int:
-    """Baseline of normals [pixels]."""
     depth = frame.depth[frame.depth > 0]
     if not len(depth):
         return 1
@@ -354,7 +352,6 @@ def _step(frame: RgbdFrame, num_averaged: int) -> int:
 
 
 def _robot_near(frame: RgbdFrame, arm: Arm | None) -> Bool:
-    """Pixels (h, w) where the robot may appear, despite pose errors."""
     poses = None if arm is None else arm.surface_poses(frame.stamp_ns)
     shown = np.zeros(frame.depth.shape, np.float32)
     if arm is not None and poses is not None:
@@ -369,7 +366,6 @@ def _robot_near(frame: RgbdFrame, arm: Arm | None) -> Bool:
 
 
 def _pairs(views: Sequence[DepthView], moving: frozenset[str]) -> list[tuple[int, int]]:
-    """Ordered pairs of views of two cameras, or of a moving one from different places."""
     still, others = [], []
     for i, a in enumerate(views):
         for j, b in enumerate(views):

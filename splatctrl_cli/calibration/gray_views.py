@@ -189,7 +189,6 @@ def _gray_differences(a: GrayView, b: GrayView, number: Index, pixels: Float64) 
 
 
 def _alike(value: Float64, other: Float64) -> Float64:
-    """Grey differences (K,), less a robust gain and offset."""
     gain, offset = 1.0, float(np.median(value - other))
     for _ in range(2):
         near = np.abs(value - gain * other - offset) < fixed.REFINE_CUT * fixed.REFINE_COLOR

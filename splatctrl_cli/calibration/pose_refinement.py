@@ -57,7 +57,6 @@ def largest_share(grid: Float64, depth: float) -> float:
 
 
 def _weights(shape: tuple[int, ...]) -> csr_array:
-    """(H W, G) bilinear weights of grid nodes, the outer on the image's edges."""
     rows, columns = fixed.BEND_GRID
     at = [np.arange(size) * (nodes - 1) / size for size, nodes in zip(shape, (rows, columns), strict=True)]
     low = [x.astype(np.int64) for x in at]
@@ -76,7 +75,6 @@ def _weights(shape: tuple[int, ...]) -> csr_array:
 
 
 def _roughness() -> Float64:
-    """(G, G) matrix S: ``c^T S c`` sums a grid's squared second differences."""
     rows, columns = fixed.BEND_GRID
     nodes = np.eye(rows * columns).reshape(rows, columns, -1)
     twist = nodes[1:, 1:] - nodes[1:, :-1] - nodes[:-1, 1:] + nodes[:-1, :-1]
@@ -288,7 +286,6 @@ def freed(frames: Sequence[RgbdFrame], grids: Mapping[str, Float64]) -> list[Rgb
 
 
 def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) -> dict[str, Float64]:
-    """Bends [1/m] of `cameras`, solved with all poses."""
     views = [gray_view(frame, scale) for frame in frames]
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     every = np.ones(len(views), np.bool_)
@@ -348,8 +345,8 @@ def _gains(
 ) -> Bool:
     """Views (N,) whose judging points agree better with other views at poses `after`.
 
-    Errors of depth, alike in neighbouring pixels, let wrong poses reduce distances: grey values must agree better
-    beyond their noise, or no worse if distances fall by `REFINE_GAIN`.
+    Wrong poses may reduce distances: grey values must agree better beyond their noise, or no worse if distances fall
+    by `REFINE_GAIN`.
     """
     parts: list[list[Float64]] = [[np.zeros((5, 0))] for _ in views]
     for i, j in pairs:
@@ -384,7 +381,6 @@ def _gain(before: Float64, after: Float64, tiles: Float64) -> tuple[float, float
 
 
 def _distance(views: Sequence[GrayView], poses: Sequence[Float64], pairs: Sequence[tuple[int, int]]) -> float:
-    """Median distance of judging points from other surfaces."""
     found = [np.zeros(0)]
     for i, j in pairs:
         _, lands, _, _, distance = hit_surface(

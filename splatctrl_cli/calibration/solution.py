@@ -79,7 +79,6 @@ def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution
 
 
 def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution:
-    """The solution near a rough one."""
     near = adjustment.solved(rough, [WIDE[-1]], rounds=2)
     solution = _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
     unknowns = adjustment.unknowns
@@ -91,7 +90,6 @@ def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution
 
 
 def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]:
-    """Misfits; inf with few comparable points."""
     fits = [adjustment.cost(one, WIDE[-1][0]) for one in estimates]
     most = max(num for _, num in fits)
     return [cost if 2 * num >= most else np.inf for cost, num in fits]
@@ -135,7 +133,6 @@ def _starts(unknowns: Unknowns, start: Estimate) -> list[Estimate]:
 
 
 def _apart(solution: Solution, other: Estimate) -> float:
-    """Largest displacement [m] of a camera's points by another estimate."""
     apart = [0.0]
     for camera in solution.adjustment.unknowns.poses:
         middle, radius = middle_of(solution.adjustment, camera)
@@ -223,7 +220,6 @@ def _hold(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]
 
 
 def _positive(covariance: Float64) -> Float64:
-    """A covariance (P, P) with positive variances despite rounding."""
     np.fill_diagonal(covariance, np.maximum(np.diag(covariance), np.finfo(float).tiny))
     return covariance
 
@@ -257,7 +253,6 @@ def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
 
 
 def _free_depths(solution: Solution, unknowns: Unknowns) -> Solution:
-    """Solve again with scales and biases, from the best of several scales."""
     evidence = solution.adjustment.evidence
     adjustment, few = Adjustment(evidence, unknowns), Adjustment(evidence.thinned(), unknowns)
     estimates = []

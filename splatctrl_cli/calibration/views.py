@@ -70,7 +70,7 @@ def _balance_directions(normals: Float64, most: int) -> Index:
 
 
 def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
-    """Every n-th pixel, for at most about `rows` rows; without colour."""
+    """Every n-th pixel, for about `rows` rows; without colour."""
     stride = max(1, frame.depth.shape[0] // rows)
     depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
     return replace(

@@ -224,7 +224,6 @@ def _arm_findings(
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
-    """Offsets that fit much better than the median's."""
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():
@@ -269,7 +268,6 @@ def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
 
 
 def _clock_finding(where: str, text: str, offset_s: float, least_s: float, value: float) -> Finding:
-    """A warning beyond `least_s` [s], else a note; value: the offset [ms]."""
     if abs(offset_s) <= least_s:
         return note("robot-clock", where, text, "", value=value, unit="ms")
     return warning(

@@ -117,10 +117,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
-    """Log brightness (N, B) by bands of rows, less a parabola, or 0.
-
-    Gloss and vignetting vary slowly, lamps on mains within 10 or 8 ms.
-    """
+    """Log brightness (N, B) by bands of rows, less a parabola: gloss varies slowly."""
     found = bands.gains(np.ones(bands.num_images, np.bool_))
     logs = np.log(found).mean(axis=2)
     if bands.misfit(found) > limits.EXPOSURE_LEFT * bands.misfit(gains):

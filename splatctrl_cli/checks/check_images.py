@@ -136,7 +136,6 @@ class ImageWatch:
 
 
 def _constant(depth: Float32) -> list[float]:
-    """The largest depth [m], if frequent and isolated like a no-return code."""
     values, counts = np.unique(depth, return_counts=True)
     if len(values) < 2 or counts[-1] < limits.CONSTANT_SHARE * depth.size:
         return []
@@ -355,7 +354,6 @@ def _transform(image: Float32) -> Float64:
 
 
 def _correlate(edges: Sequence[tuple[Float64, Float64]]) -> Float64:
-    """(h, w) mean by shift of colour against depth edges."""
     surfaces = [np.fft.fftshift(np.fft.irfft2(color * np.conj(depth))) for color, depth in edges]
     return np.asarray(np.mean(surfaces, axis=0))
 

@@ -192,7 +192,7 @@ def _world(model: RobotModel, state: JointState) -> Float64:
 
 
 def _explain(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
-    """X (4, 4) of logged = poses X, by mean rotation and median position; rest."""
+    """X (4, 4) of logged = poses X, and the rest."""
     relative = _inverse(poses) @ logged
     U, _, Vt = np.linalg.svd(relative[:, :3, :3].sum(axis=0))
     X = pose_at(np.median(relative[:, :3, 3], axis=0), U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
@@ -215,7 +215,6 @@ def _spread(poses: Float64, logged: Float64) -> Spread:
 
 
 def _angle(R: Float64) -> float:
-    """Angle [rad] of a rotation, exact near zero."""
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     return float(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1.0))
 

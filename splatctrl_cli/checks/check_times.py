@@ -311,7 +311,6 @@ def _drift(times: TimesWatch) -> list[Finding]:
 
 
 def _slope(at: Float64, delay: Float64) -> float:
-    """Median slope between the halves."""
     half = len(at) // 2
     rise = delay[-half:] - delay[:half]
     run = at[-half:] - at[:half]

@@ -129,10 +129,7 @@ def wrong_poses(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) ->
 def _overlap_findings(
     views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], used: Mapping[str, float | None], *, is_sure: bool
 ) -> list[Finding]:
-    """Findings of unusual depths at which views would meet at a tenth or ten times.
-
-    If the unit is not sure, any scale counts.
-    """
+    """Findings of unusual depths at which views would meet at a tenth or ten times."""
     low, high = limits.TABLE_DEPTH[0], limits.VIEWS_UNUSUAL * limits.TABLE_DEPTH[1]
     depths = np.concatenate([view.points[:, 2] for view in views])
     if not len(depths) or (is_sure and low <= float(np.median(depths)) <= high):
@@ -364,5 +361,4 @@ def _cost(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> tuple
 
 
 def _moved(frames: Sequence[_Posed], moves: Mapping[str, Float64]) -> list[_Posed]:
-    """Frames of some cameras moved, by T_camera_corrected of each."""
     return [replace(f, T_world_camera=f.T_world_camera @ moves.get(f.camera, np.eye(4))) for f in frames]

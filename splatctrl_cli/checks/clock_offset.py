@@ -55,7 +55,6 @@ class ImageMotion:
 
 
 def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) -> Float32:
-    """Change per pixel in [0, 1]: of depth if in both frames, else of brightness."""
     both = (depth_a > 0) & (depth_b > 0)
     of_depth = np.minimum(np.abs(depth_b - depth_a) / limits.MOTION_DEPTH_STEP, 1.0)
     of_gray = np.minimum(np.abs(gray_b.astype(np.float32) - gray_a) / limits.MOTION_COLOR_STEP, 1.0)
@@ -192,7 +191,6 @@ def select_states(stamp_ns: Stamps, motion: ImageMotion) -> Index:
 
 
 def _span(cameras: Sequence[CameraMotion]) -> tuple[int, int]:
-    """First and last stamp [ns] within `OFFSET_REACH` of a frame."""
     reach = round(limits.OFFSET_REACH * 1e9)
     return min(c.stamps_ns[0] for c in cameras) - reach, max(c.stamps_ns[-1] for c in cameras) + reach
 
@@ -248,7 +246,6 @@ def _trim(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarra
 
 
 def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
-    """Rows (K, D) of a curve (T, D) at times (K,), linear."""
     after = np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
     before = after - 1
     share = np.clip((at - seconds[before]) / (seconds[after] - seconds[before]), 0.0, 1.0)[:, None]
@@ -256,7 +253,6 @@ def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
 
 
 def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: float) -> ClockOffset:
-    """The peak of the mean of scores (C, O); error [s]: of the method."""
     score = scores.mean(axis=0)
     best = int(np.argmax(score))
     inner = score[1:-1]
@@ -282,7 +278,6 @@ def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: floa
 
 
 def _vertex(offsets: Float64, score: Float64, best: int) -> float:
-    """Vertex of a parabola through scores within half a frame interval of the best."""
     reach = min(max(limits.OFFSET_STEPS // 2, 2), best, len(score) - 1 - best)
     if reach == 0:
         return float(offsets[best])

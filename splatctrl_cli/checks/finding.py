@@ -229,7 +229,6 @@ class CheckReport:
 
     @property
     def unit(self) -> str:
-        """The unit of `num_messages`."""
         return "frames and states" if self.kind in {"capture", "image folder"} else "messages"
 
     @property

@@ -41,7 +41,6 @@ class Config:
     derived = copy_unchecked
 
     def as_dict(self) -> dict[str, Any]:
-        """Nested plain values for ``run.json``."""
         return asdict(self)
 
 
@@ -125,7 +124,6 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
 
 
 def _convert(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Typed values. Raises UsageError for unknown keys or types."""
     kind = type(getattr(Config(), section))
     assert issubclass(kind, Section)
     hints, declared = get_type_hints(kind), kind.declared
@@ -177,7 +175,6 @@ def _options(hint: Any) -> tuple[Any, ...]:
 
 
 def _has_type(value: Any, hint: Any) -> Any:
-    """The value; integers to floats, lists to tuples, by type."""
     options = _options(hint)
     if str in options and isinstance(value, float) and math.isnan(value):
         return "nan"  # a word here, which TOML takes for a number

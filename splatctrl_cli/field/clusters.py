@@ -102,10 +102,7 @@ def _padded(count: int, multiple: int) -> int:
 
 
 def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> Index:
-    """Places (N,) along a Hilbert curve.
-
-    Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004).
-    """
+    """Places (N,) along a Hilbert curve (Skilling, AIP Conf. Proc. 707, 2004)."""
     last = 2**_BITS - 1
     cells = np.clip((points - lower) / max(extent, 1e-30) * last, 0, last).astype(np.int64).T.copy()
     for bit in range(_BITS - 1, 0, -1):

@@ -270,7 +270,6 @@ class OnDevice:
         return found.distance.astype(np.float64), found.gradient.astype(np.float64)
 
     def distance(self, points: Float64) -> Float64:
-        """Distance (Q,) [m] at points (Q, 3) [m]."""
         return self._answer(points).distance.astype(np.float64) if len(points) else np.zeros(0)
 
     def nearest(self, points: Float64) -> Index:

@@ -80,9 +80,7 @@ def bounding_box(splats: SplatSet, padding: float) -> Box:
 def check_loss(voxel: float, max_loss: float) -> None:
     """Raise UsageError if cells of `voxel` [m] may lose more than max_loss [m] of distance.
 
-    The certified distance is ``max_c (hard(c) - |x - c|)`` over eight centres c around x. One is within half a
-    diagonal, and ``hard(c) >= hard(x) - |x - c|``: it loses at most a diagonal, ``sqrt(3) voxel``, interpolation
-    half.
+    The certified distance loses at most a diagonal, ``sqrt(3) voxel``, interpolation half.
     """
     loss = LOSS * voxel
     if loss > max_loss:

@@ -114,7 +114,6 @@ def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.v
 
 
 def _ranks(centers: Float64) -> NDArray[np.int64]:
-    """Number of earlier rows equal to each row (N, 3)."""
     order = np.lexsort(centers.T)  # stable
     is_first = np.ones(len(centers), np.bool_)
     is_first[1:] = (np.diff(centers[order], axis=0) != 0).any(axis=1)

@@ -35,8 +35,8 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
     """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
     Each centre spreads one unit over eight nodes (trilinear), and reads their convolution. Its own term becomes k(0)
-    = 1. Spreading and reading blur by h^2 / 3 per axis (h: node spacing), which convolving with ``2 k - (mean of k at
-    the six neighbours)`` undoes to second order. Raises UsageError for over `MAX_BLOCKS` blocks.
+    = 1. Convolving with ``2 k - (mean of k at the six neighbours)`` undoes the blur, h^2 / 3 per axis (h: node
+    spacing), to second order. Raises UsageError for over `MAX_BLOCKS` blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
     nodes = (centers - centers.min(axis=0)) / voxel

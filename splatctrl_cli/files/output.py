@@ -142,7 +142,6 @@ def _is_at(path: Path, descriptor: int) -> bool:
 
 
 def _holder(inode: int) -> int | None:
-    """Process that locks an inode, None if the kernel lists none."""
     try:
         lines = LOCKS.read_text(encoding="ascii").splitlines()
     except OSError:
@@ -184,8 +183,8 @@ def output_path(
     A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
     card leaves it, too. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
     its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind.
-    It also does so for a folder that no command wrote, another writer, or an unwritable parent. Raises WriteError if
-    `is_write_failure`; other errors pass.
+    Also for a foreign folder, another writer, or an unwritable parent. Raises WriteError if `is_write_failure`; other
+    errors pass.
     """
 
     def can_go_on() -> bool:

@@ -32,7 +32,6 @@ class Summary:
     damaged: int = 0
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for JSON; tables are lists of objects."""
         return {
             "path": self.path,
             "kind": self.kind,

@@ -74,7 +74,7 @@ def _jpeg_head(data: bytes) -> ImageHead | None:
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yield kind, start and end of a PNG's chunks up to IEND; the end of a cut one is beyond the data."""
+    """Yield kind, start and end of a PNG's chunks; a cut one ends beyond the data."""
     at, kind = len(PNG), b""
     while at + 12 <= len(data) and kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -122,10 +122,7 @@ def decode_file(data: bytes, *, color: bool) -> Array | None:
 
 
 def _says_more_than_it_holds(png: bytes) -> bool:
-    """True if a PNG announces more than its bytes.
-
-    Also without pixels, or with an unknown critical chunk.
-    """
+    """True if a PNG announces more than its bytes, or an unknown critical chunk."""
     if len(png) < _PNG_HEAD.size:
         return True
     width, height, bits = _PNG_HEAD.unpack_from(png)

@@ -76,7 +76,7 @@ class _Element:
         )
 
     def end(self, content: bytes, offset: int, byte_order: str) -> int:
-        """End of the element at `offset`; beyond `content` if truncated."""
+        """End of the element at `offset`, perhaps beyond `content`."""
         kinds = [[np.dtype(byte_order + SCALARS[word]) for word in kind.split()] for _, kind in self.properties]
         if not any(" " in kind for _, kind in self.properties):
             return offset + self.count * sum(kind.itemsize for (kind,) in kinds)

@@ -87,7 +87,6 @@ class Solids:
 
 
 def _packed(solid: Solid) -> Float64:
-    """A solid's row (16,) of `kernels.points.solid_distance`."""
     if isinstance(solid, Ball):
         kind, T, sizes = BALL, pose_at(solid.center), np.array([solid.radius, 0.0, 0.0])
     elif isinstance(solid, Cuboid):
@@ -224,7 +223,6 @@ class Clearance:
 
 
 def _apart(centers: Float64, pairs: Integers) -> Float64:
-    """Distances of pairs by ``|a|^2 + |b|^2 - 2 a b``, good to 1e-8 m."""
     B, S = centers.shape[:2]
     squares = np.einsum("bsk,bsk->bs", centers, centers)
     apart = centers @ np.swapaxes(-2.0 * centers, 1, 2)
@@ -235,7 +233,6 @@ def _apart(centers: Float64, pairs: Integers) -> Float64:
 
 
 def _between(levers: Float64, pairs: Integers) -> Float64:
-    """Bounds (P, J) on how fast two spheres approach; shared joints count nothing."""
     a, b = levers[pairs[:, 0]], levers[pairs[:, 1]]
     moves_both: Bool = (a > 0) & (b > 0)
     return np.where(moves_both, 0.0, np.maximum(a, b))

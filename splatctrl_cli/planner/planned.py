@@ -245,7 +245,6 @@ def goal_postures(
 def _solve(
     model: RobotModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
 ) -> Float64 | None:
-    """Levenberg's method with steps clipped at the limits; None without convergence."""
     scale = 1.0 / np.repeat([fixed.GOAL_SHARE * config.goal_position, fixed.GOAL_SHARE * config.goal_rotation], 3)
     q, damping = np.clip(guess, model.lower, model.upper), fixed.GOAL_DAMPING
     error = scale * pose_error(model.frame_pose(q, frame), T_world_goal)

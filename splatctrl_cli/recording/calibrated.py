@@ -37,7 +37,7 @@ class Correction:
         return round((self.calibration.clock or 0.0) * SECOND_NS)
 
     def camera(self, name: str) -> CalibratedCamera:
-        """A calibrated camera. Raises InputError for another."""
+        """A calibrated camera. Raises InputError for others."""
         cameras = self.calibration.cameras
         if name == HOLDOUT and len(cameras) == 1:  # views of the one camera, held out
             return next(iter(cameras.values()))
@@ -68,7 +68,7 @@ class Correction:
         )
 
     def late_ns(self, name: str) -> int:
-        """Delay [ns] of frame stamps against poses; 0 for a fixed camera."""
+        """Delay [ns] of frame stamps against poses; 0 if fixed."""
         return self.clock_ns if self.clock_ns and self.camera(name).moves else 0
 
     def depth(self, name: str, depth: Float32) -> Float32:
@@ -157,9 +157,9 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 class ChangedSource(FrameSource):
     """Another source's records, corrected by a calibration or perturbed, in memory.
 
-    A calibrated clock moves joint states to the frames'. A moving camera then takes its pose at the frame's time on
-    the robot's clock, from a log's transforms or interpolated between frames. Frames without a pose within
-    `tolerance_ns` are left out and counted.
+    A calibrated clock moves joint states. A moving camera then takes its pose at the frame's time on the robot's
+    clock, from a log's transforms or interpolated between frames. Frames without a pose within `tolerance_ns` are
+    left out and counted.
     """
 
     def __init__(self, source: FrameSource, change: "Correction | Perturbation", tolerance_ns: int) -> None:
@@ -172,7 +172,6 @@ class ChangedSource(FrameSource):
 
     @property
     def loss(self) -> LossReport:
-        """The source's, a note, and frames the clock leaves unposed."""
         loss = self.inner.loss
         return replace(
             loss,
@@ -219,7 +218,6 @@ class ChangedSource(FrameSource):
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-    """Interpolate the pose (4, 4) on a path; beyond it, the end within the tolerance."""
     after = int(np.searchsorted(stamps, stamp_ns))
     if after in (0, len(stamps)):
         end = min(after, len(stamps) - 1)
@@ -281,7 +279,6 @@ class Perturbation:
         return np.asarray(T_world_camera @ transform_from(self.pose_error * way / np.linalg.norm(way), quat_xyzw))
 
     def changed(self, stored: StoredFrame, T: Float64) -> StoredFrame:
-        """The frame at pose T (4, 4), with noise in its depth."""
         if not self.depth_noise:
             return replace(stored, T_world_camera=T)
         return _replace_depth(stored, T, lambda: self.depth(stored.camera, stored.stamp_ns, stored.depth))

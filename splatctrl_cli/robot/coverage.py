@@ -97,7 +97,6 @@ class CoverageReport:
 
     @property
     def uncovered_share(self) -> float:
-        """Surface share outside all spheres."""
         return sum(link.uncovered_area for link in self.links) / sum(link.area for link in self.links)
 
     @property
@@ -260,7 +259,6 @@ def _measure_link(
 
 
 def _measure_part(part: Solid, centers: Float64, radii: Float64) -> Deficit:
-    """A solid's deficit, its slack added; a ball within one sphere is covered exactly."""
     found = largest_deficit(part.surface.corners, centers, radii - part.slack)
     proven = found.proven
     if part.ball is not None:

@@ -69,7 +69,6 @@ class Declarations:
             self.num_uses[table, index] = self.num_uses.get((table, index), 0) + count
 
     def carried_uses(self) -> list[dict[str, Any]]:
-        """Carried entries with their number of points, for JSON."""
         return [
             {
                 **{"link": entry.link, "start": entry.start, "end": entry.end},

@@ -391,7 +391,6 @@ class RobotModel:
         return np.array([f.parentJoint for f in frames], dtype=np.int64), np.array(offsets, dtype=np.float64)
 
     def _find_moving(self) -> Bool:
-        """Spheres on the base, or centred on their only axes, never move."""
         postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
         return np.asarray(np.max([np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures], axis=0) > 1e-9)
 

@@ -43,7 +43,6 @@ def model_difference(one: UrdfFile, other: UrdfFile) -> str:
 
 
 def _limits(model: pinocchio.Model, name: str) -> Float64:
-    """Lower, upper, fastest; the last alone for an endless joint."""
     joint = model.joints[model.getJointId(name)]
     speed = model.velocityLimit[joint.idx_v : joint.idx_v + 1]
     if joint.nq == 2:

@@ -141,9 +141,8 @@ class _View:
 def _views(
     surface: RobotSurface, frames: Sequence[RgbdFrame], T_world_link: Float64, boxes: Float64, reach: float
 ) -> Iterator[_View]:
-    """Yield frames, compared with the rendered robot, which explains pixels within the recording's noise.
-
-    Unexplained points within `reach` of the boxes (V, L, 2, 3) stay.
+    """Yield frames, compared with the rendered robot; unexplained points within `reach` of the boxes (V, L, 2, 3)
+    stay.
     """
     thinned, ratios = [], [np.zeros(1)]
     for frame, T in zip(frames, T_world_link, strict=True):
@@ -175,7 +174,6 @@ def _views(
 def _grow_link(
     surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
 ) -> list[LearnedLink]:
-    """`_learn_link`, with the reach doubled while parts extend that far."""
     found = _learn_link(surface, number, box, used, reach)
     if 2 * reach <= MOST_REACH and any(part.outside_most > reach - VOXEL for part in found):
         return _grow_link(surface, number, box, used, 2 * reach)
@@ -266,10 +264,7 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
 def _stays_in_world(
     cells: Float64, seen: Bool, shown: Sequence[tuple[_View, int]], poses: Float64
 ) -> tuple[Bool, Bool]:
-    """True for cells (N,) that stay in the world, and for cells that move enough.
-
-    A cell stays if views show a surface at its old place, `AWAY` from the new one, as often as they see through it.
-    """
+    """True for cells (N,) that stay in the world, and for cells that move enough."""
     places, votes = _move(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:
         for m in spread(range(len(poses)), MOST_ASKED):
@@ -295,7 +290,6 @@ def _landing(view: _View, points: Float64, numbers: Index) -> tuple[Index, Index
 def _is_on_other_link(
     surface: RobotSurface, number: int, cells: Float64, seen: Bool, gap: Float64, poses: Float64, reach: float
 ) -> Bool:
-    """True for cells nearer to a link against which they move less than `STEP`."""
     found = np.zeros(len(cells), bool)
     for other, link in enumerate(surface.links):
         places = _move(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
@@ -356,7 +350,6 @@ def _is_in(box: Float64, points: Float64, reach: float) -> Bool:
 
 
 def _configurations(placed: Float64, step: float) -> Index:
-    """A link's configuration by view (V,), -1: none; step [m] as `STEP`."""
     newest, num = np.full((8, 3), np.inf), 0
     found = np.full(len(placed), -1)
     for number, corners in enumerate(placed):

@@ -176,7 +176,6 @@ class SelfSurfaces:
         return surface_gap(a, b, invert_transform(T_world_a) @ T_world_b)
 
     def _never_apart(self, pairs: Sequence[LinkNames], recorded: Float64 | None) -> tuple[LinkNames, ...]:
-        """Pairs that overlap in SELF_TOUCHING random postures and all recorded ones."""
         postures = random_postures(self._model, SELF_TOUCHING, seed=0)
         if recorded is not None:
             postures = np.concatenate([recorded, postures])

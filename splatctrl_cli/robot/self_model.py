@@ -81,7 +81,6 @@ class SelfModel:
 
     @property
     def temporary(self) -> list[LearnedLink]:
-        """Temporary parts."""
         return [part for part in self.learned if not part.is_always and len(part.triangles)]
 
     def held_at(self, stamp_ns: int) -> list[tuple[str, Float64]]:

@@ -205,7 +205,6 @@ class _Link:
         return centers, np.ceil(radii * 10**DIGITS + 1e-3) / 10**DIGITS
 
     def _polish(self, centers: Float64) -> tuple[Float64, float]:
-        """Move centres by fractions of the lattice spacing while that lowers their patches' need."""
         offsets = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.float64)
         for step in FIT_STEPS:
             owner, worst = self._assign(centers)
@@ -225,7 +224,6 @@ class _Link:
         return np.asarray(cdist(centers, self._vertices)[:, self._faces].max(axis=2) + self._slack)
 
     def _lattice(self, patches: Float64) -> tuple[Float64, float]:
-        """Lattice points in the body; for a thin one also the patches' middles."""
         lower, upper = self._vertices.min(axis=0), self._vertices.max(axis=0)
         size, wanted = np.maximum(upper - lower, 1e-3), self._options.num_candidates
         spacing = float(np.cbrt(np.prod(size) / wanted))
@@ -245,10 +243,7 @@ class _Link:
 def _recentre(
     centers: Float64, owner: Index, places: Sequence[Float64] | Float64, costs: Sequence[Float64] | Float64
 ) -> Float64:
-    """Centres (n, 3), each moved to its best place for the patches that it owns.
-
-    places (K, 3), costs (K, patches): by centre.
-    """
+    """Centres (n, 3), each moved to the best of its places (K, 3) by costs (K, patches)."""
     moved = centers.copy()
     for ball in np.unique(owner):
         moved[ball] = places[ball][np.argmin(costs[ball][:, owner == ball].max(axis=1))]

@@ -143,7 +143,6 @@ class UrdfFile:
         )
 
     def _before(self, joint: Joint) -> Iterator[str]:
-        """Joints towards the root, nearest first."""
         by_child = {joint.child: joint for joint in self.joints}
         while joint.parent in by_child:
             joint = by_child[joint.parent]

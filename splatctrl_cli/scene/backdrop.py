@@ -49,10 +49,6 @@ def backdrop_seeds(frames: Sequence[RgbdFrame], opacities: Sequence[Float32], ba
 
 
 def _seeds_of(one: "_Cells", cells: Sequence["_Cells"], found: Seeds, background: Float32, depths: Float64) -> Seeds:
-    """Seeds of cells that `found` does not cover.
-
-    They lie at that of `depths` (D,) [m] where most views agree, else at the first.
-    """
     is_missing = one.is_blank & ~one.find_covered(found)
     is_missing &= np.abs(one.color - background).mean(axis=2) > SAME_COLOR
     v, u, size, color = (np.concatenate(parts) for parts in zip(*one.missing_squares(is_missing), strict=True))
@@ -116,7 +112,6 @@ class _Cells:
         return cells[:, 0], cells[:, 1], local[:, 2]
 
     def find_covered(self, seeds: Seeds) -> Bool:
-        """Cells (h, w) behind a seed of their colour."""
         h, w = self.depth.shape
         found = np.zeros((h, w), bool)
         u, v, z = self._locate(seeds.centers)

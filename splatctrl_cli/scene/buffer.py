@@ -82,7 +82,7 @@ class SplatBuffer:
         return np.asarray(np.exp(self.parameters[:, LOG_RADIUS]), np.float32)
 
     def kill(self, slots: Bool) -> int:
-        """Make slots of a mask (M,) dead: transparent, without moments, reusable; return their number."""
+        """Make slots of a mask (M,) dead and reusable; return their number."""
         self.is_alive[slots] = False
         self.parameters[slots, LOGIT] = DEAD_LOGIT
         self.labels[slots] = Label.OBJECT

@@ -26,10 +26,7 @@ FRAME_NAMES = tuple(field.name for field in fields(RgbdFrame))
 
 
 def fitter_state(fitter: SceneFitter) -> dict[str, Values]:
-    """Splats, moments, occupancy, frames and counters: views, not copies.
-
-    There is no random state: steps and blocks seed generators by number.
-    """
+    """Splats, moments, occupancy, frames and counters: views, not copies."""
     arrays: dict[str, Values] = dict(fitter.buffer.arrays())
     arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
     arrays["step_stamps_ns"] = np.array(fitter.occupancy.step_stamps_ns, np.int64)

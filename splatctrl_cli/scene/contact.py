@@ -68,8 +68,7 @@ def contact_seeds(
 ) -> Seeds:
     """Seeds on objects near the robot without a splat's centre within `contact_radius`.
 
-    Their radius is half of it: larger splats stand out of a plane. The surface is assumed to extend that far into
-    the hidden contact. mappable: pixels (H, W) of each frame.
+    Their radius is half of it: larger splats stand out of a plane. mappable: pixels (H, W) of each frame.
     """
     radius = config.contact_radius
     beside = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)
@@ -107,7 +106,7 @@ def lasts_at_fixed_links(
 
 
 def hidden_objects(buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig) -> Index:
-    """Slots (K,) of objects within `ROBOT_REACH` of the robot or base that no pixel shows.
+    """Slots (K,) of objects within `ROBOT_REACH` of robot or base that no pixel shows.
 
     Fitting would pull them out of their object.
     """

@@ -115,7 +115,7 @@ def find_contradicted(seen: Seen, *, is_drawn: bool, each: Each = map) -> Iterat
 def mask_frames(
     frames: Sequence[RgbdFrame], robot: RobotPosture | None, last: Seen, occupancy: OccupancyMap, each: Each
 ) -> tuple[list[RgbdFrame], list[SelfMask], list[Contradicted]]:
-    """Frames of a time step without mixed depth, their masks, and what other frames contradict.
+    """Frames of a time step without mixed depth, their masks and contradicted rays.
 
     last: frames and masks of the last time step; each: a `map` over frames.
     """
@@ -172,7 +172,6 @@ def mark_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
 
 
 def _least(image: NDArray[T], side: int) -> NDArray[T]:
-    """Least value (h, w) of each block of an image, without incomplete blocks at its ends."""
     height, width = image.shape
     least = cv2.erode(image, np.ones((side, side), np.uint8), anchor=(0, 0))
     return np.ascontiguousarray(least[: height - side + 1 : side, : width - side + 1 : side])
@@ -251,7 +250,6 @@ class _BlockView:
 
 
 def _side_by_side(depths: Float32, least: int) -> Float32:
-    """Depths (h, w) [m] of blocks and neighbours, in groups of at least `least`."""
     wide = cv2.dilate(depths, BESIDE)
     num, piece = cv2.connectedComponents((wide > 0).view(np.uint8), connectivity=8)
     counts = np.bincount(piece[depths > 0], minlength=num)

@@ -31,9 +31,9 @@ def unanswered_points(
 ) -> Iterator[Float64]:
     """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
-    Some repeat. Rays about a voxel apart end at the depth of the nearest pixel with depth. Holes up to `NARROW_HOLE`
-    voxels wide do not count, nor those that a still camera did not show before. robot_depth (H, W) [m]: rendered,
-    0 = none; before: the camera's last frame and its mask, whose kinds alone a resumed run still knows.
+    Rays about a voxel apart end at the depth of the nearest pixel with depth. Holes up to `NARROW_HOLE` voxels wide
+    do not count, nor those that a still camera did not show before. robot_depth (H, W) [m]: rendered, 0 = none;
+    before: the camera's last frame and its mask, whose kinds alone a resumed run still knows.
     """
     holes = _holes(frame, robot_depth > 0)
     if before is not None and holes.any() and np.array_equal(before[0].T_world_camera, frame.T_world_camera):
@@ -66,7 +66,6 @@ def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
 
 
 def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
-    """Robot pixels (H, W) and the stereo shadows that touch them, with their neighbours."""
     if not is_shadow.any():
         return is_robot
     _, groups = cv2.connectedComponents(is_shadow.view(np.uint8), connectivity=8)
@@ -161,11 +160,7 @@ def find_shadows(depth: Float32, focal: float) -> Bool:
 
 
 def _baseline(height: Float32, lost: Int32) -> float:
-    """Baseline [m] of shadows; 0 without any.
-
-    Each step (K,) nearer by `SHADOW_STEP` gives a baseline by its lost pixels. The median is over the higher half of
-    the steps, weighted by height.
-    """
+    """Baseline [m] of shadows, the median over higher depth steps (K,); 0 without any."""
     if not len(height):
         return 0.0
     higher = height >= _median(height, height)
@@ -179,7 +174,6 @@ def _median(values: Floats, weights: Floats) -> float:
 
 
 def _behind(depth: Float32) -> Float32:
-    """Largest depth (H, W) [m] around connected pixels without depth; 0 elsewhere."""
     is_blank = depth <= 0
     num, group = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     around = np.where(is_blank, cv2.dilate(depth, np.ones((3, 3), np.uint8)), np.float32(0.0))
@@ -204,7 +198,6 @@ def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture, eac
 
 
 def _explain_points(points: Float32, frame: RgbdFrame, mask: SelfMask) -> UInt16:
-    """Reason `Unseen` (K,) why a frame does not show points (K, 3) [m]."""
     pixel, z = pixels_at(frame, points)
     is_in_view = (pixel >= 0) & frame.is_in_view.reshape(-1)[pixel]
     robot = cv2.dilate(mask.robot_depth, OUTLINE).reshape(-1)[pixel]

@@ -267,7 +267,7 @@ class SceneFitter:
         return relabel(self.buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
-        """Remove what the optimiser moved off the robot, into air or out, or made faint; count it in `removed`."""
+        """Remove splats moved off the robot, into air or out, or made faint; count them."""
         buffer = self.buffer
         removed["robot"] += buffer.kill(self._relabel(robot, seen))
         removed["seen_through"] += buffer.kill(self._floating(views))
@@ -287,7 +287,7 @@ class SceneFitter:
         return {reason: self.buffer.kill(mask) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
-        """Fill dead slots at pixels of M_add; the first full view sets the density."""
+        """Fill dead slots at M_add's pixels; the first full view sets the density."""
         found: dict[Label, list[Seeds]] = {Label.OBJECT: [], Label.ROBOT: []}
         shown = [self.descent.rendering(view) for view in views]
         added = list(self._each(lambda v, its: add_mask(v.frame, its, v.mappable, self.config), views, shown))
@@ -372,7 +372,6 @@ class SceneFitter:
         return filled
 
     def _standing_for(self, label: int) -> Bool:
-        """Live splats (M,) of a label; people count as objects."""
         labels = np.where(self.buffer.labels == Label.HUMAN, np.uint8(Label.OBJECT), self.buffer.labels)
         return np.asarray(self.buffer.is_alive & (labels == label))
 

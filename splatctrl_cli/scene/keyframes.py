@@ -73,8 +73,7 @@ def seen_through(
 ) -> Bool:
     """Splats (N,) that float: nearer than every valid depth around their pixel in some view.
 
-    "Around" is as in `nearest_depth`, "nearer" by more than `tolerance` [m]. This is finer than voxels. label: of the
-    splats.
+    "Around" is as in `nearest_depth`, "nearer" by more than `tolerance` [m]. label: of the splats.
     """
     cameras = [view.camera for view in views]
     nearest = [view.nearest if label == Label.ROBOT else view.nearest_object for view in views]

@@ -41,10 +41,7 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
 
 
 def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tuple[float, float, float]:
-    """Median colour in [0, 1] of counted pixels (H, W) away from depth, else black.
-
-    Surroundings lose depth in whole areas; a hole has depth around it.
-    """
+    """Median colour in [0, 1] of counted pixels (H, W) away from depth, else black."""
     depth_near = [uniform_filter((f.depth > 0).astype(np.float32), fixed.MOUNTED_WINDOW) > 1e-4 for f in frames]
     away = [mask & ~is_near for mask, is_near in zip(counted, depth_near, strict=True)]
     colors = np.concatenate([frame.color[mask] for frame, mask in zip(frames, away, strict=True)])

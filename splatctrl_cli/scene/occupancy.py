@@ -72,7 +72,7 @@ class OccupancyMap:
             self._label_hits(frame, mask != 0, set_bits=Label.HUMAN)
 
     def _begin_step(self, frames: Sequence[RgbdFrame]) -> None:
-        """Count a time step by its earliest stamp; at `MAX_STEPS`, pairs of steps merge."""
+        """Count a time step; at `MAX_STEPS`, pairs of steps merge."""
         if len(self.step_stamps_ns) == MAX_STEPS:
             self.step_stamps_ns = self.step_stamps_ns[::2]
             is_step = self.last_seen < min(Unseen)
@@ -187,7 +187,7 @@ class OccupancyMap:
         return np.where(is_inside, self.entity[tuple(cells.T)], np.uint8(0))
 
     def entity_around(self, points_world: Float32) -> UInt8:
-        """Entity bits (N,) of the eight nearest voxels, ORed."""
+        """ORed entity bits (N,) of the eight nearest voxels."""
         bits = np.zeros(len(points_world), np.uint8)
         for corner in np.ndindex(2, 2, 2):
             offset = self.config.voxel * (np.array(corner, np.float32) - np.float32(0.5))
@@ -263,7 +263,7 @@ class PeopleMemory:
         self.stamps_ns: Index = np.zeros(0, np.int64)
 
     def take_in(self, occupancy: OccupancyMap, frames: Sequence[RgbdFrame]) -> None:
-        """Add a time step's depth images, and forget people unobserved for too long."""
+        """Add a time step's depth images; forget people."""
         num_updates, log_odds = occupancy.num_updates.reshape(-1), occupancy.log_odds.reshape(-1)
         entity = occupancy.entity.reshape(-1)
         before = num_updates[self.voxels]

@@ -52,7 +52,7 @@ class RobotPosture:
         )
 
     def is_within(self, points_world: Floats, reach: Floats | float, *, to_moving: bool = False) -> Bool:
-        """Points (N, 3) at a signed `distance` of at most `reach` (N,) [m]: much faster than the distance."""
+        """Points (N, 3) at a signed `distance` of at most `reach` (N,) [m]: much faster."""
         found = self.distance(points_world, to_moving=to_moving, within=np.maximum(reach, 0.0), enough=reach)
         return np.asarray(found <= reach)
 

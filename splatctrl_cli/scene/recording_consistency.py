@@ -36,7 +36,7 @@ class Agreement:
     def holds(self) -> bool:
         """False if median and detour exceed the limit, and the quartile half of it.
 
-        A thin object looks like one surface from both sides: still, a share of pixels or a third camera agrees.
+        Of thin objects, which look like one surface, a share of pixels agrees.
         """
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 

@@ -87,8 +87,8 @@ def room_for(
 ) -> tuple[Bool, Seeds]:
     """Slots (M,) of at most `num` splats to evict, and the seeds in order of service.
 
-    Only object splats go: redundant ones that show least, then, for seeds near the robot's path, far ones. shown
-    (M,): by slot; tolerance [m]: of `find_redundant`.
+    Object splats only: redundant ones that show least, then far ones. shown (M,): by slot; tolerance [m]: of
+    `find_redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_mapped)
     stands = splats.labels != Label.ROBOT
@@ -182,7 +182,6 @@ def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator)
 
 
 def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Filled:
-    """Copy splats drawn by their opacity, as 3DGS-MCMC does."""
     opacities = np.where(buffer.is_alive, buffer.opacities, 0.0).astype(np.float64)
     sources = clone_sources(opacities, num_clones, rng)
     count = 1 + np.bincount(sources, minlength=len(opacities))
@@ -241,7 +240,7 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
 def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> Index:
     """Draw `count` different indices in proportion to weight (K,), at least `count` of them positive.
 
-    Same as ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, but faster.
+    As ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, but faster.
     """
     left = weight / weight.sum()
     found = np.zeros(0, np.intp)
@@ -269,7 +268,6 @@ def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: Index) -
 
 
 def _apart(points: Float32, distances: Float32) -> Index:
-    """Indices of points (K, 3) not within the distance (K,) of earlier kept ones."""
     is_taken = np.zeros(len(points), bool)
     neighbours = cKDTree(points).query_ball_point(points, distances)
     kept = []

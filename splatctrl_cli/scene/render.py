@@ -122,7 +122,6 @@ def parameters_of(gaussians: GaussianSet) -> Float32:
 def render_gaussians(
     gaussians: GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0
 ) -> Rendering:
-    """Render as `render` does."""
     raster = GaussianRasteriser(num_threads(threads))
     raster.prepare(camera_array(intrinsics, T_world_camera), parameters_of(gaussians))
     planes = raster.forward()

@@ -60,8 +60,8 @@ def depth_noise(images: Sequence[Float32]) -> float:
     """Standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
     At depth z it is that times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
-    Residuals of linear fits to blocks are noise; a low quantile leaves out edges. Fits absorb noise that neighbours
-    share: blocks two or three times as wide may raise it, up to twice.
+    Residuals of linear fits to blocks are noise; a low quantile leaves out edges. Wider blocks may raise it, up to
+    twice, as fits absorb noise that neighbours share.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *fixed.NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))

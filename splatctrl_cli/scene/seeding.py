@@ -187,7 +187,7 @@ def seeds_at(
 ) -> Seeds:
     """One seed per standing cube over the candidates, finest cubes first.
 
-    None is within 0.7 edges of a live splat (L, 3). The paper's radius min(D/f, r_max) is one pixel; here r =
+    None is within 0.7 edges of a live splat (L, 3). The paper's radius is min(D/f, r_max), here
     min(max(radius_per_edge * edge, D/f), r_max).
     """
     found = sources[0].joined(*sources[1:])
@@ -211,9 +211,8 @@ def gap_seeds(
 ) -> Seeds:
     """Seeds where a measured surface is further than `max_gap` [m] from every sphere.
 
-    Every `stride`-th pixel and row of the views is checked (by default every third or fewer, about half of
-    `max_gap`). So are occupied centres (K, 3), which may be half a voxel off. `half` 0 or 1: only every second row.
-    `each`: a `map` over views.
+    Every `stride`-th pixel and row of the views is checked (default: about half of `max_gap` apart), and occupied
+    centres (K, 3), half a voxel off. `half` 0 or 1: only every second row. `each`: a `map` over views.
     """
     spheres = SplatTree(splats.centers, splats.radii, num_threads)
 

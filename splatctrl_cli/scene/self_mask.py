@@ -151,7 +151,7 @@ def is_occluded(offset: Float32, link: Int16) -> Bool:
     """True for pixels (H, W) of an object before a link (-1: none).
 
     offset: measured less rendered depth [m]. An object occludes a link if over `MASK_OCCLUDED` of the link's pixels
-    are more than `MASK_FAR_OFF` before it. Then all pixels more than `MASK_STEP` before the link show that object.
+    are more than `MASK_FAR_OFF` before it. Then pixels more than `MASK_STEP` before the link show it.
     """
     number = link.astype(np.int64) + 1
     num_before = np.bincount(number.ravel(), (offset < -fixed.MASK_FAR_OFF).ravel())
@@ -170,7 +170,6 @@ def is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, fx
 
 
 def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: Int16) -> Bool:
-    """Outermost robot pixels (H, W) of links that no joint moves."""
     still = [number for number, name in enumerate(surface.links) if name in surface.fixed]
     shown = (is_robot & np.isin(link, still)).view(np.uint8)
     return np.asarray((shown > 0) & (cv2.erode(shown, _window(1)) == 0))
@@ -276,7 +275,7 @@ def object_mask(frame: RgbdFrame) -> SelfMask:
 
 @lru_cache
 def _nothing_rendered(shape: tuple[int, int]) -> Float32:
-    """One image, shared by all masks without a robot."""
+    """One image for all masks without a robot."""
     image = np.zeros(shape, np.float32)
     image.flags.writeable = False
     return image

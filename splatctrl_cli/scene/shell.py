@@ -89,10 +89,7 @@ class Shell:
         return self.buffer.splats(self._num_threads)
 
     def _add(self, shown: Masked) -> None:
-        """Seed what the shell does not explain; restart coarser if too many are unmet.
-
-        A restart seeds all views and its own splats' places.
-        """
+        """Seed what the shell does not explain; restart coarser if too many are unmet."""
         asked = [(view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown]
         most = fixed.SHELL_UNMET * self.config.max_splats
         if self._density is not None and self._fill(_sources(asked), self._density) <= most:

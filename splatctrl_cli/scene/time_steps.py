@@ -41,7 +41,6 @@ class TimeStep:
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of the newest frame."""
         return max(frame.stamp_ns for frame in self.frames)
 
     @property

@@ -75,7 +75,7 @@ def bare_voxels(
 
 
 def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Bool:
-    """Voxels (X, Y, Z) within `reach` [m] of a sphere, wherever its centre is in its voxel."""
+    """Voxels (X, Y, Z) surely within `reach` [m] of a sphere."""
     voxel, shape = occupancy.config.voxel, occupancy.log_odds.shape
     cells = np.floor((splats.centers - occupancy.origin) / voxel + 0.5).astype(np.int64)
     is_inner = np.all((cells > 0) & (cells < np.array(shape) - 1), axis=1)  # keeps all neighbours inside

@@ -227,10 +227,7 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64,
 
 
 def _spines(shape: Capsule | Block) -> list[tuple[Float64, Float64, float]]:
-    """Segments (start, end) and tube radii, of a capsule or a box's bars.
-
-    Bars lie along the longest side and end half a step early.
-    """
+    """Segments (start, end) and tube radii, of a capsule or a box's bars."""
     if isinstance(shape, Capsule):
         return [(np.array(shape.start, dtype=float), np.array(shape.end, dtype=float), shape.radius)]
     size = np.array(shape.size)
@@ -249,7 +246,6 @@ def _spines(shape: Capsule | Block) -> list[tuple[Float64, Float64, float]]:
 
 
 def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]]:
-    """URDF (geometry, origin); a capsule is a cylinder and end spheres, once each."""
     balls: set[tuple[tuple[float, float, float], float]] = set()
     for shape in shapes:
         if isinstance(shape, Block):
@@ -271,7 +267,6 @@ def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]
 
 
 def _turn(axis: int, angle: float, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float64:
-    """The pose (4, 4) at xyz [m], rotated about x (0) or z (2)."""
     T, c, s = np.eye(4), np.cos(angle), np.sin(angle)
     i, j = ((1, 2), (2, 0), (0, 1))[axis]
     T[i, i], T[i, j], T[j, i], T[j, j] = c, -s, s, c

@@ -62,7 +62,6 @@ class StereoDepth:
 
 
 def _blur(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Float64:
-    """Gaussian-blurred noise (H, W) of unit variance."""
     impulse = np.zeros(min(shape))
     impulse[0] = 1.0
     kernel = gaussian_filter(impulse, sigma, mode="wrap")
@@ -70,7 +69,6 @@ def _blur(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Flo
 
 
 def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
-    """True where occluded from the second imager, right of the first."""
     columns = np.arange(depth.shape[1])
     shifted = np.where(depth > 0, columns - focal_baseline / np.where(depth > 0, depth, 1.0), np.inf)
     least = np.minimum.accumulate(shifted[:, ::-1], axis=1)[:, ::-1]
@@ -78,7 +76,6 @@ def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
 
 
 def _fatten(disparity: Float64, reach: np.ndarray) -> Float64:
-    """Disparities (H, W), each the largest within `reach` (H, W) [px] if beyond an edge."""
     out = disparity
     for radius in range(1, int(reach.max()) + 1):
         y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
@@ -122,7 +119,6 @@ class DepthNoise:
 
 
 def _enlarge(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Unit-variance noise (H, W), blended bilinearly from coarse noise."""
     v, u = np.arange(shape[0]) / factor, np.arange(shape[1]) / factor
     i, j = v.astype(int), u.astype(int)
     a, b = (v - i)[:, None], (u - j)[None]
@@ -133,7 +129,6 @@ def _enlarge(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.ndar
 
 
 def _is_at_edge(depth: Float32, step: float) -> Bool:
-    """True at both neighbours whose depths differ by over `step`."""
     across, down = (np.abs(np.diff(depth, axis=axis)) > step for axis in (1, 0))
     sides = [np.pad(across, ((0, 0), pad)) for pad in ((1, 0), (0, 1))]
     sides += [np.pad(down, (pad, (0, 0))) for pad in ((1, 0), (0, 1))]

@@ -238,5 +238,4 @@ def _add_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> Robot
 
 
 def _mark_shown(depth: Float32, without: Float32) -> UInt8:
-    """(H, W) 1 where `depth` [m] shows what `without` does not, else 0."""
     return np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)

@@ -84,7 +84,6 @@ class Renderer:
         return np.where(np.isfinite(depth[0]), depth[0], 0).astype(np.float32)
 
     def _cast(self, primitives: Sequence[Primitive], depth: Float64, color: Float64) -> None:
-        """Lower `depth` (5, H, W) and set `color` where a primitive is nearest."""
         origin = self.camera.T_world_camera[:3, 3]
         owner = self._nearest(primitives, depth)
         for index, primitive in enumerate(primitives):
@@ -144,7 +143,6 @@ class Renderer:
         return color
 
     def _window(self, primitive: Primitive) -> tuple[slice, slice, slice]:
-        """Conservative pixel rectangle of the primitive's bounding ball."""
         k = self.camera.intrinsics
         middle = (invert_transform(self.camera.T_world_camera) @ primitive.T_world_shape[:, 3])[:3]
         radius = primitive.bounding_radius

@@ -128,14 +128,14 @@ def check_finite(name: str, grid: DistanceGrid) -> None:
 
 
 def slabs(values: Values) -> Iterator[Values]:
-    """Yield x layers in runs of `CHUNK` bytes, or one layer."""
+    """Yield x layers in runs of `CHUNK` bytes."""
     step = max(1, CHUNK // max(1, values.nbytes // len(values)))
     for start in range(0, len(values), step):
         yield np.ascontiguousarray(values[start : start + step])
 
 
 def x_fastest(values: Values) -> Iterator[Values]:
-    """Yield z planes, (z, y, x[, 3]), in runs of `CHUNK` bytes or one plane."""
+    """Yield z planes, (z, y, x[, 3]), in runs of `CHUNK` bytes."""
     x, y, z = values.shape[:3]
     step = max(1, CHUNK // max(1, values.nbytes // z))
     for start in range(0, z, step):
@@ -202,7 +202,6 @@ def summary_of(path: Path, kind: str, grid: DistanceGrid) -> Summary:
 
 
 def json_value(text: object) -> object:
-    """Parse JSON text; return another value as it is."""
     try:
         return json.loads(text) if isinstance(text, str) else text
     except ValueError:

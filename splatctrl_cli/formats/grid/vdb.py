@@ -81,7 +81,6 @@ def openvdb() -> Any:
 
 
 def _above(values: Any) -> float:
-    """The float above the largest value: no cell is background."""
     largest = max((float(np.nanmax(layers)) for layers in slabs(values) if not np.isnan(layers).all()), default=0.0)
     return float(np.nextafter(np.float32(largest), np.float32(np.inf)))
 

@@ -194,7 +194,6 @@ class SceneFolder:
 
     @property
     def has_clock(self) -> bool:
-        """False if the stamps are made up."""
         return self._metric("has_clock", bool)
 
     @property
@@ -221,7 +220,7 @@ class SceneFolder:
         return run_value(self.run, ("metrics", name), kind, default, where=str(self.path / "run.json"))
 
     def gaussians(self) -> GaussianSet:
-        """The Gaussians. Raises InputError if there are none."""
+        """The Gaussians. Raises InputError without any."""
         gaussians = read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
         refuse_if(
             not len(gaussians),
@@ -328,7 +327,6 @@ class SplatFile(SceneFolder):
 
     @cached_property
     def run(self) -> dict[str, Any]:
-        """An empty record: the origin is unknown."""
         return {"metrics": {"cameras": [], "has_clock": False, "stamp_ns": 0}, "inputs": {}, "config": {}}
 
     @cached_property

@@ -67,7 +67,6 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> Values:
 
 
 def _evidence(known: KnownVoxels) -> dict[str, Values]:
-    """Arrays of both files."""
     balls = known.unrepresented
     return {
         "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < FIRST_REASON else np.uint16),
@@ -173,10 +172,7 @@ def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 
 
 def _last_seen(stored: Array, header: Mapping[str, Any], num_steps: int) -> Array:
-    """`last_seen` in one byte or two; the largest numbers give reasons for never.
-
-    Raises ValueError for another shape, or too many time steps.
-    """
+    """`last_seen` in one byte or two; the largest numbers give reasons for never."""
     is_short = stored.dtype == np.uint8
     stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
     is_old = "unseen" not in header  # then only the largest number is no time step, and means `UNANSWERED`

@@ -125,7 +125,6 @@ def _pad(harmonics: Float32) -> Float64:
 
 
 def _angles(a: Float32, b: Float32) -> Float64:
-    """Angle [deg] by the chord, precise where a cosine is not."""
     one, two = a.astype(np.float64), b.astype(np.float64)
     chord = np.minimum(np.linalg.norm(one - two, axis=1), np.linalg.norm(one + two, axis=1))
     return np.asarray(np.degrees(4.0 * np.arcsin(np.minimum(chord / 2.0, 1.0))))
@@ -152,7 +151,6 @@ class SplatFormat:
 
     @property
     def is_rounded(self) -> bool:
-        """True if coarser than float32."""
         return self.bound is not float32_bound
 
 
@@ -332,7 +330,6 @@ def check_gaussians(where: str, gaussians: GaussianSet) -> None:
 
 
 def _harmonics(ply: PlyFile) -> Float32:
-    """(N, K, 3); f_rest has each channel's in a row."""
     num_rest = sum(name.startswith("f_rest_") for name in ply.names)
     names = [f"f_rest_{index}" for index in range(num_rest)]
     refuse_if(

@@ -34,7 +34,6 @@ PROPERTIES = {
 
 
 def _write(path: Path, document: Mapping[str, Any], tables: Sequence[Array]) -> None:
-    """Write a document and tables (N, 1 | 3 | 4)."""
     views, accessors, binary = list[dict[str, Any]](), list[dict[str, Any]](), bytearray()
     for table in tables:
         is_float, content = table.dtype == np.float32, np.ascontiguousarray(table).tobytes()
@@ -89,7 +88,6 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, width: int) -> Float32:
-    """An accessor's numbers (N, width)."""
     accessor, where = document["accessors"][index], f"{path}: accessor {index}"
     dtype = np.dtype(COMPONENTS[accessor["componentType"]])
     refuse_if(

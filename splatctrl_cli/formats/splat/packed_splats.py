@@ -257,7 +257,6 @@ def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
 
 
 def _fraction_bits(centers: Float32) -> int:
-    """The most fraction bits, up to 12, that fit coordinates in 24 bits."""
     largest = float(np.abs(centers).max(initial=0.0))
     bits = FRACTION_BITS
     while largest * 2.0**bits > 2**23 - 1:
@@ -284,7 +283,6 @@ def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
 
 
 def _quaternions(table: UInt8) -> Float32:
-    """(N, 4) unit quaternions w x y z of 3 bytes (version 2) or 4."""
     if table.shape[1] == 3:
         xyz = table / 127.5 - 1.0
         quats = np.column_stack([xyz, np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1)))])

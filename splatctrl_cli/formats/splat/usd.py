@@ -129,7 +129,6 @@ def _gaussians(path: Path, prim: Any, geometry: Any) -> GaussianSet:
 
 
 def _array(path: Path, prim: Any, name: str, width: int) -> Float32:
-    """Float32 (N, width) of an attribute or its half-precision twin, named with an h."""
     for candidate in (name, f"{name}h"):
         values = prim.GetAttribute(candidate).Get()
         if values is not None and len(values):

@@ -67,7 +67,6 @@ def _fault(what: str) -> DeviceError:
 
 @contextmanager
 def _named_faults() -> Iterator[None]:
-    """Turn errors of cuda-core, without a public class, into DeviceError."""
     try:
         yield
     except DeviceError:

@@ -74,7 +74,6 @@ def usable_card(index: int = 0) -> Card:
 
 
 def _driver_version() -> str:
-    """Version, such as 580.159.04, or an empty string."""
     with suppress(OSError):
         if found := re.search(r"\b\d{3,}\.\d+(\.\d+)?\b", VERSION_FILE.read_text()):
             return found[0]
@@ -82,7 +81,6 @@ def _driver_version() -> str:
 
 
 def _release(number: int) -> tuple[int, int]:
-    """13020 is 13.2."""
     return number // 1000, number % 1000 // 10
 
 

@@ -206,7 +206,6 @@ class DeviceFit:
         }  # fmt: skip
 
     def _room(self, name: str, num_bytes: int) -> int:
-        """Address of named memory; growing loses its content."""
         if self._sizes.get(name, -1) < num_bytes:
             if name in self._addresses:
                 self.device.free(self._addresses.pop(name))
@@ -271,7 +270,6 @@ class DeviceFit:
         self._room("terms", max(8 * NUM_TERMS * len(self.views), LEAST_TABLE))
 
     def _fits(self) -> bool:
-        """True if all lists had room; else grow them."""
         counters = self._read("counters", (), COUNTERS)
         longest, most = int(counters["longest_list"]), int(counters["most_parts"])
         if longest:

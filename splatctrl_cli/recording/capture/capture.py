@@ -131,7 +131,7 @@ _UNREADABLE = (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError)
 
 
 class FrameRows:
-    """Some cameras' rows of frames.csv, in order, read again at each iteration."""
+    """Some cameras' rows of frames.csv, read again at each iteration."""
 
     def __init__(self, file: Path, cameras: Collection[str]) -> None:
         """Raises InputError for an invalid row, or a file outside the capture."""
@@ -202,7 +202,6 @@ class FileSums:
 
 
 def _key(name: bytes) -> int:
-    """64 bits of a name: good files may not collide."""
     return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")
 
 

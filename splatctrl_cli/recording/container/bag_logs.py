@@ -1,8 +1,7 @@
 """The messages of ROS 1 and ROS 2 (sqlite3) bags; damage is skipped and counted.
 
-A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body, read in order in bounded
-memory. Tables of rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions. rosbags refuses a damaged
-file.
+A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body. Tables of
+rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions. rosbags refuses a damaged file.
 """
 
 import os
@@ -144,7 +143,6 @@ class Bag1Log(RawLog):
                 yield record
 
     def _record(self, stream: BinaryIO, offset: int) -> Part | None:
-        """Read a record; the stream is left after it."""
         head = self._head(stream)
         if head is None:
             return None
@@ -156,7 +154,7 @@ class Bag1Log(RawLog):
         return Part(offset, kind, body, is_cut, fields)
 
     def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
-        """Read a head; the stream is left at the body."""
+        """Read a head, up to the body."""
         length = self._length(stream)
         if length is None or length > min(1 << 20, self._size - stream.tell()):  # those of connections hold a name
             return None
@@ -194,7 +192,7 @@ class Bag1Log(RawLog):
 
 
 def fields_of(header: bytes) -> dict[str, bytes] | None:
-    """A header's named fields; None if its lengths do not fit."""
+    """A header's named fields; None if invalid."""
     found: dict[str, bytes] = {}
     at = 0
     while at < len(header):
@@ -273,7 +271,6 @@ class Db3Log(RawLog):
             raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
 
     def _copy(self, size: int) -> None:
-        """Copy the files; size [bytes]: of the database."""
         folder = Path(tempfile.mkdtemp(prefix="splatctrl-", dir=scratch_folder()))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         what = f"cannot be copied to {folder.parent} to read {' and '.join(file.name for file in self.files)}"

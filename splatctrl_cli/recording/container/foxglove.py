@@ -131,7 +131,7 @@ def _header(message: Any, frame_id: str | None = None) -> Any:
 
 
 def _either(message: Any, *names: str) -> Any:
-    """The first present field; 0 if none, as JSON omits zeros."""
+    """The first present field; 0 if none (JSON omits zeros)."""
     return next((getattr(message, name) for name in names if hasattr(message, name)), 0)
 
 
@@ -171,7 +171,6 @@ def _transform(message: Any) -> Any:
 
 
 def _sdk_text(message: Any) -> Any:
-    """Parse an SDK text. Raises KeyError or ValueError for a missing field."""
     said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
     fields = ("fx", "fy", "ppx", "ppy", "coeffs", "rotation", "translation")
     values = {key: np.array(said[key].split(","), np.float64) for key in fields if key in said}

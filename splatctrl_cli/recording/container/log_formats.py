@@ -92,7 +92,7 @@ class SessionLog(JoinedLog):
         )
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of all parts by log time.
+        """Yield all parts' messages by log time.
 
         If parts share a topic, all are read: skipping would reorder its messages between passes.
         """

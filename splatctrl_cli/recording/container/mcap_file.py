@@ -219,7 +219,7 @@ class _Walk:
         return None
 
     def _chunks_in(self, block: bytes, base: int) -> Iterator[int]:
-        """Yield places in `block` (the file from `base`) of chunks with consistent lengths."""
+        """Yield chunks with consistent lengths in `block` (the file from `base`)."""
         for name in _COMPRESSIONS:
             at = block.find(name)
             while at >= 0:

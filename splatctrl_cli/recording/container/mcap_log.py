@@ -134,7 +134,7 @@ class McapLog(RawLog):
     def messages_of(
         self, chunks: Collection[ChunkIndex], damage: Damage, names: Collection[str] | None = None
     ) -> Iterator[RawMessage]:
-        """Yield these chunks' messages, anywhere in the file."""
+        """Yield these chunks' messages."""
         self._forget_changed()
         for index in chunks:
             yield from self._chunk_messages(

@@ -56,7 +56,7 @@ class McapLog:
         self._counts: Counter[str] = Counter()  # messages by topic
 
     def add_joint_state(self, state: JointState, joint_names: Sequence[str]) -> None:
-        """Add a /joint_states message, effort empty."""
+        """Add a /joint_states message."""
         message = self._new(
             "sensor_msgs/msg/JointState",
             header=self._header(state.stamp_ns, ""),

@@ -188,7 +188,6 @@ def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
 
 
 def write_png(path: Path, image: UInt8) -> None:
-    """Write an image, BGR if coloured."""
     path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
 
 
@@ -236,7 +235,6 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
 
 
 def _mask_file(folder: Path, number: int) -> Path:
-    """``007.png`` or the like in the folder (RegNeRF) or ``mask`` (IDR)."""
     files = (path for place in (folder, folder / "mask") for path in sorted(place.glob("*.png")))
     found = next((path for path in files if path.stem.isdecimal() and int(path.stem) == number), None)
     return require(
@@ -346,7 +344,6 @@ def _camera_text(view: DtuView) -> str:
 
 
 def _pairs(views: Sequence[DtuView]) -> str:
-    """Nearest cameras first; the score falls with distance [mm]."""
     centers = np.array([view.T_world_camera[:3, 3] for view in views]) * MILLIMETRES
     lines = [str(len(views))]
     for number in range(len(views)):

@@ -79,7 +79,7 @@ class PosesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class StampsTable:
-    """``[stamps]``: rate [1/s] of frame numbers; names: file names are seconds."""
+    """``[stamps]``: rate [1/s] of frame numbers; names: as seconds."""
 
     rate: float | None = None
     names: bool = False

@@ -128,7 +128,6 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
 
 
 def _present(description: Description, loss: LossReport) -> list[ListedView]:
-    """Keep views with files; others count as unpaired."""
     root, present, absent = description.root.absolute(), [], []
     for view in description.listed:
         files = [whole_file(path) for path in (view.color, view.depth, view.valid) if path is not None]
@@ -257,7 +256,6 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
 
 
 def _holdout(description: Description, names: list[str], options: SourceOptions) -> set[str]:
-    """Held-out names; an entry is a name, else a position."""
     entries = description.split.holdout if options.holdout is None else options.holdout
     held = set()
     for entry in entries:

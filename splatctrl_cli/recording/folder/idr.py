@@ -332,7 +332,6 @@ def shrink_view(view: DtuView, factor: int) -> DtuView:
 
 
 def _factor(view: DtuView, protocol: ScoreProtocol | None) -> int:
-    """Shrink factor to the protocol's published size; 1 if not whole."""
     if protocol is None or protocol.size is None:
         return 1
     width, height = protocol.size

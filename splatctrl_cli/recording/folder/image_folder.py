@@ -92,7 +92,6 @@ class ImageFolderSource(FrameSource):
 
     @property
     def loss(self) -> LossReport:
-        """Unpaired and unposed images, and those that the last pass could not decode."""
         loss = self._loss
         return replace(
             loss,
@@ -188,7 +187,6 @@ class ImageFolderSource(FrameSource):
         )
 
     def _depth_file(self, view: View) -> bytes | None:
-        """The PNG, if its counts are the depth."""
         table = self._description.depth
         if (
             view.depth is None
@@ -212,7 +210,6 @@ class ImageFolderSource(FrameSource):
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
-        """Pixels that the lens saw and the mask keeps (None: all)."""
         seen = lens.valid
         if view.valid is None:
             return seen
@@ -347,7 +344,7 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
 
 
 def unknown_folder(folder: Path, what: str, remedy: str) -> InputError:
-    """The error for an unread folder: it names readable parts, else missing depth."""
+    """An error that names readable parts, else missing depth."""
     inside = _readable_in(folder)
     if not inside and (found := _bare_images(folder)):
         return InputError(

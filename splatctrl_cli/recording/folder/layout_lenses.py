@@ -57,7 +57,6 @@ TRAJECTORY = "lowres_wide.traj"
 
 
 def read_arkit(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder; different lenses become separate cameras."""
     options.refuse(("intrinsics",), "a video of ARKitScenes", folder)
     root = _frames(folder)
     assert root is not None
@@ -91,12 +90,10 @@ def _list_by_stamp(folder: Path) -> list[tuple[int, Path]]:
 
 
 def _stamp_ns(path: Path) -> int | None:
-    """Stamp of ``41069021_305.367.png``."""
     return stamp_of_text(path.stem.rpartition("_")[2])
 
 
 def _poses(path: Path) -> dict[str, Float64]:
-    """T_world_camera by stamp [s] as written."""
     poses = {}
     for where, words, values in read_rows(path):
         refuse_if(

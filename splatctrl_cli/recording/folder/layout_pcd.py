@@ -201,7 +201,6 @@ def _refuse_damage(path: Path) -> AbstractContextManager[None]:
 
 
 def _viewpoint(said: Any) -> Float64:
-    """T_world_camera (4, 4) of x, y, z, qw, qx, qy, qz."""
     x, y, z, qw, qx, qy, qz = said.viewpoint
     return transform_from((x, y, z), (qx, qy, qz, qw))
 

@@ -75,7 +75,6 @@ class _Sens:
 
 
 def read_sens(path: Path, options: SourceOptions) -> Description:
-    """Describe the file, or a folder's only one; depth is registered to colour."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"))
     refuse_if(len(files) > 1, f"{path}: {len(files)} files *{SUFFIX}", remedy=f"give one of them, such as {files[0]}")
     file, root = files[0], files[0].parent

@@ -70,7 +70,6 @@ _NOTE = (
 
 
 def read_frames(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder, or all its sequences."""
     sequence = next(s for s in _SEQUENCES if next(folder.glob(f"{s}frame-*.pose.txt"), None) is not None)
     colors = _files(folder, f"{sequence}frame-*.color.*", ".color")
     depths = _files(folder, f"{sequence}frame-*.depth.*", ".depth")

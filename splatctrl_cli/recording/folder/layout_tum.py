@@ -77,7 +77,6 @@ _BONN_NOTE = (
 
 
 def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
-    """Describe pairs within the tolerance, with interpolated poses."""
     colors, depths = list_files(folder / "rgb.txt"), list_files(folder / "depth.txt")
     series = _series(folder)
     file = folder / "groundtruth.txt"
@@ -146,7 +145,6 @@ def marker_to_camera(T_ground_truth: Float64) -> Float64:
 
 
 def read_sun3d(folder: Path, options: SourceOptions) -> Description:
-    """Describe images within the tolerance of a depth image."""
     colors, depths = _list_by_stamp(folder / "image"), _list_by_stamp(folder / "depth")
     extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
     poses = _poses(extrinsics[-1]) if extrinsics else []

@@ -155,7 +155,6 @@ def _type_store(topic: Topic) -> Any:
 
 @lru_cache(maxsize=32)
 def _store_of(definition: str, form: str, type_name: str) -> Any:
-    """Cached types: compiling takes some ten milliseconds."""
     store = get_typestore(Stores.EMPTY)
     if form == "idl":
         for part in filter(str.strip, definition.split("=" * 80 + "\n")):
@@ -176,7 +175,6 @@ def _names(description: Any) -> list[str]:
 
 
 def _check_fields(store: Any) -> None:
-    """Raise ValueError for a missing standard field."""
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}

@@ -283,7 +283,6 @@ def raw_pixels(message: Any) -> NDArray[Any]:
 
 
 def _nv24(message: Any, name: str) -> UInt8:
-    """RGB (H, W, 3), BT.601 limited range, as OpenCV's nv12."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
     refuse_if(

@@ -144,7 +144,7 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
 
 
 def _rectify(calibration: Calibration) -> Calibration:
-    """The rectified camera: P if set, without distortion; valid if the lens is known."""
+    """The rectified camera: P if set, without distortion."""
     pinhole = replace(
         calibration,
         K=calibration.projection if calibration.projection[0, 0] > 0 else calibration.K,
@@ -195,7 +195,6 @@ class _Builder:
         self._is_registered = is_registered(survey, topics.color, topics.depth, topics.info, topics.depth_info)
 
     def build(self) -> Camera:
-        """Build the camera. Raises InputError for the first problem."""
         topics = self._topics
         self._check_depth()
         self._check_clock()
@@ -316,7 +315,6 @@ class _Builder:
         )
 
     def _check_clock(self) -> None:
-        """Raise InputError if a clock went back."""
         for name in (self._topics.color, self._topics.depth):
             clock = self._survey.topics[name].clock
             refuse_if(

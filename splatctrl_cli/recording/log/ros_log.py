@@ -241,7 +241,6 @@ class RosLogSource(FrameSource):
 
     @property
     def loss(self) -> LossReport:
-        """The loss, with the undecodable images of the pass that met most."""
         loss, most = self._loss, max(self._passes, key=lambda one: (one.count, one.num_invalid))
         return replace(
             loss,

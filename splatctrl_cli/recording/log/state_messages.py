@@ -100,7 +100,6 @@ def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
 
 
 def _franka(message: Any) -> _Read:
-    """franka_ros2's FrankaRobotState (named states, PoseStamped), or the older bare arrays."""
     fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
     if "measured_joint_state" in fields:
         measured, desired, pose = fields["measured_joint_state"], fields["desired_joint_state"], fields["o_t_ee"].pose
@@ -115,7 +114,6 @@ def _franka(message: Any) -> _Read:
 
 
 def _controller(message: Any) -> _Read:
-    """Filled `feedback` and `reference`, else the older `actual` and `desired` (control_msgs)."""
     names = message.joint_names
 
     def filled(*fields: str) -> Any:
@@ -129,7 +127,6 @@ def _controller(message: Any) -> _Read:
 
 
 def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
-    """Every point of a planned motion."""
     names = tuple(str(name) for name in message.joint_names)
     start_ns = stamp_ns(message.header) or log_time_ns
     states = []

@@ -132,7 +132,6 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
 
 
 def _tracks(topics: Sequence[TopicSurvey]) -> list[RawTrack]:
-    """A track per topic and set of joints."""
     found = []
     for topic in topics:
         for stream in topic.joints.streams.values():
@@ -145,7 +144,6 @@ def _tracks(topics: Sequence[TopicSurvey]) -> list[RawTrack]:
 
 
 def _base(tracks: Sequence[RawTrack], wanted: Sequence[str]) -> RawTrack:
-    """The track with most `wanted`; ties prefer end-effector poses, then /joint_states."""
     return max(
         tracks,
         key=lambda track: (
@@ -197,7 +195,6 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
 
 
 def _apart(base: RawTrack, other: RawTrack, shared: Sequence[str]) -> float:
-    """Median distance [rad or m] of shared joints; 0 without overlap."""
     stamps, its = base.stamp_ns, other.stamp_ns
     at, at_other = np.argsort(stamps, kind="stable"), np.argsort(its, kind="stable")
     its = its[at_other]
@@ -213,7 +210,6 @@ def _apart(base: RawTrack, other: RawTrack, shared: Sequence[str]) -> float:
 
 
 def _num_turns(track: RawTrack, names: Sequence[str]) -> int:
-    """Count states far from both neighbours, which are close."""
     columns = [track.names.index(name) for name in names]
     num, order = 0, np.argsort(track.stamp_ns, kind="stable")
     seconds = track.stamp_ns[order] * 1e-9

@@ -59,7 +59,6 @@ def smoothed_seconds(stamp_ns: Stamps) -> Float64:
 
 
 def _numbers(seconds: Float64, period: float) -> Float64:
-    """Number (T,) of each state since the first, lost ones counted."""
     numbers = np.zeros(len(seconds))
     clock, number = 0.0, 0
     for first, last in ranges(len(seconds)):
@@ -221,7 +220,7 @@ def _add_velocity(raw: RawTrack, loss: LossReport) -> Table:
 
 
 def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
-    """Number of states to differentiate, joints (J,) that move at velocity 0, a note."""
+    """Number of states to differentiate, moving joints (J,) of velocity 0, a note."""
     num, num_joints = raw.position.shape[:2]
     low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
     is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))

@@ -111,7 +111,7 @@ def _decoded_topic(topic: Topic) -> Topic:
 
 
 def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[RawMessage]:
-    """Yield whole images that a packet releases, perhaps earlier ones; without data, the rest."""
+    """Yield whole images that a packet releases; without data, the rest."""
     frames, is_broken = _decode(stream.context, data, number)
     if is_broken:
         stream.broken.append(number)
