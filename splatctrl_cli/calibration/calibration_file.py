@@ -2,7 +2,6 @@
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.errors import refuse_faults, refuse_if
 from splatctrl_cli.files.summary import Grid, Summary
-from splatctrl_cli.formats.unpacking import read_text
+from splatctrl_cli.formats.unpacking import read_toml
 from splatctrl_cli.geometry import quat_from_rotation, transform_from
 from splatctrl_cli.records import Float64
 
@@ -113,8 +112,7 @@ def calibration_text(calibration: Calibration) -> str:
 
 def read_calibration(path: Path) -> Calibration:
     """Read a calibration. Raises InputError for a missing, another or a damaged file."""
-    with refuse_faults(f"{path}: not TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=AGAIN):
-        content = tomllib.loads(read_text(path, "give what calibrate wrote"))
+    content = read_toml(path, AGAIN)
     refuse_if(
         content.get("format") != FORMAT,
         f"{path}: expected a calibration, got another file",

@@ -20,6 +20,8 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Index, JointState, LossReport, spread
 from splatctrl_cli.robot.model import RobotModel
 
+JOINT_STATES = "joint states"
+"""The place of a finding on them."""
 DEGREES = 6 * np.pi  # [rad] that no joint of an arm turns to: three turns
 
 
@@ -249,9 +251,9 @@ def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) 
             refuse_contradiction(topics, wanted)
         names, states = joint_records(found, options, loss, wanted)
     except (InputError, NotEvaluableError) as wrong:
-        findings.append(error("joints", "joint states", wrong.message, wrong.remedy))
+        findings.append(error("joints", JOINT_STATES, wrong.message, wrong.remedy))
         return RobotStates(model=model, lack=str(wrong), findings=findings)
-    findings += [note("joints", "joint states", text) for text in loss.notes]
+    findings += [note("joints", JOINT_STATES, text) for text in loss.notes]
     if not len(states):
         return RobotStates(
             model=model,
@@ -273,12 +275,10 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
         states = states.convert_joints(*model.joint_columns(names))
     except InputError as wrong:
         return RobotStates(
-            model=model, lack=str(wrong), findings=[error("joints", "joint states", wrong.message, wrong.remedy)]
+            model=model, lack=str(wrong), findings=[error("joints", JOINT_STATES, wrong.message, wrong.remedy)]
         )
-    of_fingers = [note("joints", "joint states", model.held_words)] if model.held else []
-    return RobotStates(
-        model=model, states=states, findings=[*of_fingers, *robot_findings(model, states, "joint states")]
-    )
+    of_fingers = [note("joints", JOINT_STATES, model.held_words)] if model.held else []
+    return RobotStates(model=model, states=states, findings=[*of_fingers, *robot_findings(model, states)])
 
 
 def stream_findings(where: str, stream: JointStream) -> Iterator[Finding]:
@@ -326,20 +326,20 @@ def stream_findings(where: str, stream: JointStream) -> Iterator[Finding]:
         yield warning("joints-velocity", where, text, "let the driver fill them in")
 
 
-def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) -> list[Finding]:
+def robot_findings(model: RobotModel, states: Sequence[JointState]) -> list[Finding]:
     """Findings of states (model order) against limits, and of logged poses against FK."""
     try:
-        check_angles(model, states, where)
+        check_angles(model, states, JOINT_STATES)
     except InputError as wrong:
-        return [error("joints-degrees", where, wrong.message, wrong.remedy)]
+        return [error("joints-degrees", JOINT_STATES, wrong.message, wrong.remedy)]
     agreement = pose_agreement(model, states)
     if agreement is None or agreement.verdict == "still":
-        return _limits(model, states, where)
+        return _limits(model, states, JOINT_STATES)
     severity = NOTE if agreement.verdict in {"agree", "tool"} else ERROR
     remedy = "" if severity is NOTE else "give the URDF of this very robot, and its --base"
     value = 1e3 * agreement.difference.median_position
-    found = judge(severity, "end-effector", where, agreement.sentence, remedy, value=value, unit="mm")
-    return [*_limits(model, states, where), *found]
+    found = judge(severity, "end-effector", JOINT_STATES, agreement.sentence, remedy, value=value, unit="mm")
+    return [*_limits(model, states, JOINT_STATES), *found]
 
 
 def _limits(model: RobotModel, states: Sequence[JointState], where: str) -> list[Finding]:

@@ -1,7 +1,9 @@
 """File reads, and bounded decompression to no more than announced."""
 
 import bz2
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import lz4.frame
 import zstandard
@@ -30,6 +32,12 @@ def read_text(path: Path, remedy: str) -> str:
     """Read UTF-8 text. Raises InputError with the remedy if unreadable, UnicodeDecodeError for other bytes."""
     with refuse_faults(lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy=remedy):
         return path.read_text(encoding="utf-8")
+
+
+def read_toml(path: Path, remedy: str) -> dict[str, Any]:
+    """Read TOML. Raises InputError with the remedy if unreadable or other text."""
+    with refuse_faults(f"{path}: not valid TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=remedy):
+        return tomllib.loads(read_text(path, remedy))
 
 
 class BadBlockError(ValueError):

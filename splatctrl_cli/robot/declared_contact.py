@@ -1,6 +1,5 @@
 """Declared contact: carried objects and intended touches, from a TOML file (`--declare`)."""
 
-import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
-from splatctrl_cli.formats.unpacking import read_text
+from splatctrl_cli.errors import InputError, refuse_if
+from splatctrl_cli.formats.unpacking import read_toml
 from splatctrl_cli.records import Bool, Box, Floats
 
 REMEDY = "see splatctrl help declare for the keys of a declaration"
@@ -100,8 +99,7 @@ def read_declarations(path: Path, links: Collection[str] | None = None) -> Decla
 
     Raises InputError for an unreadable file, unknown tables, keys or links, or an invalid box or time.
     """
-    with refuse_faults(f"{path}: not valid TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=REMEDY):
-        document = tomllib.loads(read_text(path, "give --declare a TOML file"))
+    document = read_toml(path, REMEDY)
     unknown = sorted(set(document) - {"carried", "expected_contact"})
     refuse_if(
         unknown, f"{path}: expected [[carried]] and [[expected_contact]], got {''.join(unknown[:1])}", remedy=REMEDY
@@ -128,15 +126,17 @@ def _entries(
         where = f"{path}: {table} {index + 1}"
         for key in sorted(set(entry) ^ set(kinds)):
             raise InputError(f"{where}: {'unknown' if key in entry else 'missing'} key '{key}'", remedy=REMEDY)
-        if links is not None and entry["link"] not in links:
-            raise InputError(
-                f"{where}: link: expected a link of the robot, got {entry['link']!r}",
-                remedy=f"its links: {', '.join(links)}",
-            )
-        if kinds.get("reason") and not (isinstance(entry["reason"], str) and entry["reason"].strip()):
-            raise InputError(
-                f"{where}: reason: expected words, got {entry['reason']!r}", remedy="say why it is meant"
-            )
+        refuse_if(
+            links is not None and entry["link"] not in links,
+            f"{where}: link: expected a link of the robot, got {entry['link']!r}",
+            remedy=f"its links: {', '.join(links or ())}",
+        )
+        reason = entry.get("reason", "none")
+        refuse_if(
+            not isinstance(reason, str) or not reason.strip(),
+            f"{where}: reason: expected words, got {reason!r}",
+            remedy="say why it is meant",
+        )
         start, end = (_number(where, key, entry[key]) for key in ("start", "end"))
         refuse_if(not start < end, f"{where}: expected start < end, got {start:g} and {end:g} s", remedy=REMEDY)
         yield {**entry, "box": _box(where, entry["box"]), "start": start, "end": end}

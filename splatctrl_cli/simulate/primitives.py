@@ -68,10 +68,9 @@ def _hash(lattice: np.ndarray, seed: int) -> Float64:
     x, y, z = (lattice[:, i].astype(np.uint64) for i in range(3))
     key = x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)
     key ^= np.uint64(seed * 0x27D4EB2F + 0x85EBCA6B)
-    key ^= key >> np.uint64(33)
-    key *= np.uint64(0xFF51AFD7ED558CCD)
-    key ^= key >> np.uint64(33)
-    key *= np.uint64(0xC4CEB9FE1A85EC53)
+    for factor in (0xFF51AFD7ED558CCD, 0xC4CEB9FE1A85EC53):
+        key ^= key >> np.uint64(33)
+        key *= np.uint64(factor)
     key ^= key >> np.uint64(33)
     return np.asarray((key >> np.uint64(11)).astype(np.float64) / 2.0**53)
 

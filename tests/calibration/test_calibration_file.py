@@ -70,7 +70,7 @@ def test_a_calibration_reads_back_as_it_was_written(written: Path) -> None:
         ("depth_scale = 1.02", "depth_scale = nan", "damaged"),
         ("depth_scale = 1.02", "depth_scale = 1000.0", "damaged"),
         ("depth_scale", "depth_scalf", "damaged"),
-        ("[clock]", "[clock", "not TOML"),
+        ("[clock]", "[clock", "not valid TOML"),
     ],
 )
 def test_another_or_damaged_file_is_refused(written: Path, old: str, new: str, says: str) -> None:

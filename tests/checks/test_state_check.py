@@ -123,9 +123,9 @@ def test_degrees_are_refused_and_radians_are_not(model: RobotModel) -> None:
 
 def test_states_beyond_the_limits_are_a_warning_with_the_joint(model: RobotModel) -> None:
     q = motion(model)
-    assert robot_findings(model, states_with(q, lambda _: None), "joint states") == []
+    assert robot_findings(model, states_with(q, lambda _: None)) == []
     q[7, 3] = model.upper[3] + 0.2
-    (finding,) = robot_findings(model, states_with(q, lambda _: None), "joint states")
+    (finding,) = robot_findings(model, states_with(q, lambda _: None))
     assert (finding.code, finding.severity, finding.stamp_ns) == ("joints-limits", Severity.WARNING, 7)
     assert finding.value == pytest.approx(0.2)
     assert f"1 of 60 states are beyond the URDF's limits, {model.joint_names[3]}" in finding.what
@@ -133,10 +133,10 @@ def test_states_beyond_the_limits_are_a_warning_with_the_joint(model: RobotModel
 
 def test_end_effector_poses_of_another_robot_are_an_error(model: RobotModel) -> None:
     q = motion(model)
-    (good,) = robot_findings(model, states_with(q, lambda q: in_base(model, q, "hand")), "joint states")
+    (good,) = robot_findings(model, states_with(q, lambda q: in_base(model, q, "hand")))
     assert (good.code, good.severity, good.value) == ("end-effector", Severity.NOTE, pytest.approx(0, abs=0.01))
     poses = iter([in_base(model, row, "hand") for row in q[::-1]])
-    (other,) = robot_findings(model, states_with(q, lambda _: next(poses)), "joint states")
+    (other,) = robot_findings(model, states_with(q, lambda _: next(poses)))
     assert (other.code, other.severity) == ("end-effector", Severity.ERROR)
     assert other.value > 100
     assert other.remedy == "give the URDF of this very robot, and its --base"

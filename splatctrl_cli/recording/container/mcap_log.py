@@ -131,15 +131,12 @@ class McapLog(RawLog):
                 self._declare(part.opcode, part.content, damage)
         self._whole = state if damage.count == count else None
 
-    def messages_of(
-        self, chunks: Collection[ChunkIndex], damage: Damage, names: Collection[str] | None = None
-    ) -> Iterator[RawMessage]:
+    def messages_of(self, chunks: Collection[ChunkIndex], damage: Damage) -> Iterator[RawMessage]:
         """Yield these chunks' messages."""
         self._forget_changed()
         for index in chunks:
-            yield from self._chunk_messages(
-                self._file.chunk_at(index), index.chunk_start_offset, damage, names, is_cut=False
-            )
+            content = self._file.chunk_at(index)
+            yield from self._chunk_messages(content, index.chunk_start_offset, damage, None, is_cut=False)
 
     def _forget_changed(self) -> tuple[int, int]:
         stat = self.path.stat()
