@@ -190,8 +190,8 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
     """T_recorded_camera (4, 4) by camera, from sightings of a board.
 
     Without a robot or a moving camera, the board ties all others to the `held` cameras. Otherwise hand-eye
-    calibration places a moving camera by a stationary board, or a stationary camera by a board on a link, first.
-    Raises NotEvaluableError for too few sightings, other squares, or cameras that this does not reach.
+    calibration first places a moving camera by a stationary board, or a stationary one by a board on a link. Raises
+    NotEvaluableError for too few sightings, other squares, or cameras that this does not reach.
     """
     by_camera = {camera: [s for s in sightings if s.camera == camera] for camera in rig.recorded}
     _check_seen(board, by_camera)

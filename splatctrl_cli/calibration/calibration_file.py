@@ -26,8 +26,8 @@ class CalibratedCamera:
     T (4, 4): T_world_camera if stationary, T_recorded_camera if moving. recorded (4, 4): the recording's
     T_world_camera, None if moving. scale, bias [m]: the true depth is ``scale depth + bias``. sigma_position (3,)
     [m], sigma_rotation (3,) [rad]: in the world's axes, or a moving camera's own. sigma_depth: of scale and bias.
-    depth_noticed: the least |scale - 1| and |bias| [m] that would be noticed, inf if not looked for. held: parts not
-    solved for. unobserved: directions kept as recorded.
+    depth_noticed: the least noticeable |scale - 1| and |bias| [m], or inf. held: parts not solved for. unobserved:
+    directions kept as recorded.
     """
 
     T: Float64

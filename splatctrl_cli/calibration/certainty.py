@@ -59,9 +59,9 @@ def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> 
     """The certainty of a solved estimate.
 
     ``A^-1 M A^-T`` (the sandwich of White, 1980): M sums products of clusters' gradients, to count correlated errors;
-    A is the gradient's derivative. Noise tilts normals of flat surfaces, which the normal equations mistake for
-    shape. Between views, A therefore uses differences with points projected anew, where that cancels. Raises
-    NotEvaluableError where no view measures a surface that another view or the robot has.
+    A is the gradient's derivative. Noise tilts normals of flat surfaces: between views, A uses differences with
+    points projected anew, where that cancels. Raises NotEvaluableError where no view measures a surface that another
+    view or the robot has.
     """
     whole = adjustment.normal(estimate, widths)
     refuse_if(

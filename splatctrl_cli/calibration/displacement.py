@@ -30,8 +30,8 @@ def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[s
     """Rows of `displacement_of` by camera, without those that show too little of the robot.
 
     A stationary camera is corrected if the arm moves and the correction puts each link in place. Its row then has
-    `T_recorded_camera`, 16 numbers by row, and `left_mm`, the last step. If one displaced camera cannot be corrected,
-    none is: the robot may be off.
+    `T_recorded_camera`, 16 numbers by row, and `left_mm`, the last step. If one cannot be corrected, none is: the
+    robot may be off.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
     found = {camera: _correct_camera(arm, its) for camera, its in by_camera.items()}
@@ -102,7 +102,7 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, An
 
     Two Gauss-Newton steps on point-to-plane distances, with Huber's weight from two sigma. Neighbouring pixels err
     alike: `DISPLACED_ALIKE` count as one. The distance is `DISPLACED_WIDTH` if fewer than `DISPLACED_SHARE` of the
-    pixels that should show the robot do so within it.
+    expected pixels show the robot within it.
     """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     T, prior = np.eye(4), np.eye(POSE) / DISPLACED_PRIOR**2

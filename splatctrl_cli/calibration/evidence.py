@@ -31,8 +31,8 @@ HELD = -1
 class Estimate:
     """Poses, depth corrections and clock offset.
 
-    ``T_world_camera = T_world_recorded @ T_recorded_camera``, with corrections (4, 4). depth: scale and bias [m], the
-    true depth is ``scale depth + bias``. clock [s]: a frame's stamp minus the joint state's at that instant.
+    ``T_world_camera = T_world_recorded @ T_recorded_camera``, with corrections (4, 4). depth: scale and bias [m];
+    clock [s], as in `Calibration`.
     """
 
     corrections: Mapping[str, Float64]

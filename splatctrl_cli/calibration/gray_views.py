@@ -18,8 +18,8 @@ EVERY = slice(None)
 class GrayView:
     """A view with lengths divided by the recording's scale, and its grey values.
 
-    gray (h, w) in [0, 1]; slope (h, w, 2) per pixel; points_gray (K,): at the view's points. tiles (K,): number of
-    each point's tile, in a checkerboard; poses are solved from points in even tiles, and judged in odd ones.
+    gray (h, w) in [0, 1]; slope (h, w, 2) per pixel; points_gray (K,): at the view's points. tiles (K,): each point's
+    tile, in a checkerboard: even ones solve poses, odd ones judge.
     """
 
     depth: DepthView
@@ -165,7 +165,7 @@ def hit_surface(
 def misfits_of(a: GrayView, b: GrayView, T: Float64) -> tuple[Float64, Index]:
     """Squared differences (2, K) [sigma^2] of depth and grey value, and tiles (K,), of view a's judging points.
 
-    T (4, 4) apart. Differences are cut as in the last round, and nan without a common surface.
+    T (4, 4) apart. Differences are cut, and nan without a common surface.
     """
     number = np.flatnonzero(~a.is_solved)
     there, lands, _, _, distance = hit_surface(a, b, T, ~a.is_solved)

@@ -4,9 +4,9 @@ Gauss-Newton in float64, with Tukey's biweight, on point-to-plane distances and 
 Medioni, Object modelling by registration, 1992; Park, Zhou and Koltun, Colored point cloud registration revisited,
 2017.
 
-With imperfect lenses, a triangulating camera errs in disparity by a smooth offset, constant per camera: surfaces
-bend. Its part in (1, u, v), which poses would absorb, stays. After Zhou and Koltun, Simultaneous localization and
-calibration (2014), whose lattice lies in space.
+A triangulating camera errs in disparity by a smooth offset, constant per camera: surfaces bend. Its part in (1, u,
+v), which poses absorb, stays. After Zhou and Koltun, Simultaneous localization and calibration (2014), whose lattice
+lies in space.
 """
 
 from collections.abc import Mapping, Sequence

@@ -20,7 +20,7 @@ FREED = tuple((reach, np.inf) for reach in fixed.CALIBRATION_FREED)
 class Solution:
     """The estimate, its certainty, and its residuals within `widths`.
 
-    noticed: by camera, the least |scale - 1| and |bias| [m] that would be noticed.
+    noticed: `depth_noticed` by camera.
     """
 
     estimate: Estimate
@@ -169,8 +169,8 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
 def _add_depths(solution: Solution) -> Solution:
     """Solve again with clearly supported depth scales and biases.
 
-    All are tried together, as others compensate for a wrong fixed one. The least certain are fixed one by one, until
-    all left differ by `CALIBRATION_DEPTH_SURE[0]` sigmas.
+    All are tried together; the least certain are fixed one by one, until all left differ by
+    `CALIBRATION_DEPTH_SURE[0]` sigmas.
     """
     unknowns = solution.adjustment.unknowns
     tried = _free_depths(solution, replace(unknowns, scales=unknowns.poses, biases=unknowns.cameras))
@@ -189,10 +189,7 @@ def _add_depths(solution: Solution) -> Solution:
 
 
 def _narrow_depths(tried: Solution) -> tuple[Float64, Float64, list[int]]:
-    """Depth unknowns' offsets (P,) from 1 or 0, covariance (P, P), and free columns.
-
-    If a scale and a bias explain the same, the likelier stays (`CALIBRATION_DEPTH_USUAL`).
-    """
+    """Depth unknowns' offsets (P,) from 1 or 0, covariance (P, P), and free columns."""
     unknowns, covariance = tried.adjustment.unknowns, tried.certainty.covariance
     off, free, usual = np.zeros(unknowns.size), [], []
     for camera in unknowns.cameras:
@@ -225,7 +222,7 @@ def _positive(covariance: Float64) -> Float64:
 
 
 def _find_noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """Least |scale - 1| and |bias| [m] that would be noticed, by camera, or inf."""
+    """`CalibratedCamera.depth_noticed` by camera."""
     unknowns = tried.adjustment.unknowns
     held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
     found = {}

@@ -53,8 +53,7 @@ class DepthView:
 def _balance_directions(normals: Float64, most: int) -> Index:
     """Numbers, in order, of at most `most` normals (N, 3), balanced over directions.
 
-    A table outnumbers its objects, which alone constrain the camera along it. Normal-space sampling after
-    Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm (2001).
+    Normal-space sampling after Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm (2001).
     """
     side = np.argmax(np.abs(normals), axis=1)
     largest = np.take_along_axis(normals, side[:, None], axis=1)[:, 0]
@@ -127,8 +126,8 @@ def derive_by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64
     """Derivatives (K, 12) of a value at `there` (K, 3) by two cameras' motions.
 
     The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. gradient (K, 3): by the point.
-    Motions are a rotation and translation in own frames. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T
-    exp(x) p`` changes by ``(p x R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
+    Motions are in own frames. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T exp(x) p`` changes by ``(p x
+    R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
     """
     along = gradient @ T[:3, :3]
     return np.hstack([np.cross(own, along), along, -np.cross(there, gradient), -gradient])

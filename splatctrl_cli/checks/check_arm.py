@@ -22,9 +22,9 @@ LATE = "synchronise the clocks, or shift the stamps: robot labels and replay com
 class ArmAgreement:
     """Measured minus rendered depth on the robot's pixels, in one camera's frames.
 
-    median [m]: within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance from it (from 0
-    if negative, from `ARM_COVER` if more), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR` behind.
-    num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one fits most.
+    median [m]: within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance from it (within
+    0 and `ARM_COVER`), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR` behind. num_pixels: with
+    depth; num_frames: with joint states. scale: measured over rendered depth, if one fits most.
     """
 
     median: float

@@ -56,8 +56,8 @@ def judge_frames(
     """Add findings on frames, and on frames against states, to a report.
 
     frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
-    of the first images. states: in the model's order. cut: says that not all was read. is_guessed: the unit of
-    lengths is. only_errors: skip checks that yield only notes and warnings.
+    of the first images. states: in the model's order. cut: why not all was read. is_guessed: the unit of lengths is.
+    only_errors: skip checks that yield only notes and warnings.
     """
     findings = [*report.findings, *alignment_findings(frames)]
     usable, is_still = usable_frames(frames, findings), report.start_ns is None
@@ -73,7 +73,7 @@ def judge_frames(
 
 
 def usable_frames(frames: Sequence[RgbdFrame], findings: Sequence[Finding]) -> list[RgbdFrame]:
-    """Frames of cameras with correct lens and depth; others would seem misplaced."""
+    """Frames of cameras with correct lens and depth."""
     wrong = {f.where for f in findings if f.severity is ERROR and f.code in {"alignment", "principal-point"}}
     return [frame for frame in frames if f"camera {frame.camera}" not in wrong]
 

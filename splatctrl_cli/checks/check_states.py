@@ -149,8 +149,7 @@ def _unit_remedy(names: Sequence[str]) -> str:
 def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgreement | None:
     """Agreement of logged poses in `states` (model order) with the best link; None without poses.
 
-    A constant difference in a link's frame is a tool, in the world a wrong base. Any other grows with motion: another
-    robot.
+    A constant difference in a link's frame is a tool, in the world a wrong base, any other another robot.
     """
     posed = _posed(states)
     if not len(posed):

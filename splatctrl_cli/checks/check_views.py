@@ -75,10 +75,7 @@ def are_far(frames: Sequence[RgbdFrame]) -> bool:
 
 
 def wrong_scales(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
-    """Depth factor by camera that makes views fit, if any.
-
-    A common factor is tried first, then one per camera.
-    """
+    """Depth factor by camera that makes views fit, if any; a common one first."""
     cameras = sorted({view.camera for view in views})
     together = _best_scale(views, pairs, cameras)
     if together is not None:

@@ -91,7 +91,7 @@ def predicted_change(depth_a: Float32, depth_b: Float32) -> Float32:
 
 
 def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Pearson correlation; 0 if one is constant. Sums, since dot products would vary with threads."""
+    """Pearson correlation, by sums (same at any thread count); 0 if one is constant."""
     x, y = np.asarray(a, dtype=np.float64).ravel(), np.asarray(b, dtype=np.float64).ravel()
     x, y = x - x.mean(), y - y.mean()
     length = float(np.sqrt(np.sum(x * x)) * np.sqrt(np.sum(y * y)))
@@ -132,8 +132,8 @@ def estimate_clock_offset(
     """The offset at which robot and image motion correlate best.
 
     states: by stamp. With `robot` and stationary cameras, pixel changes are compared with the spheres' silhouette;
-    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras; it is
-    unknown without motion, at low correlation, with a rival peak, or at the end of the search.
+    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras; unknown
+    without motion, at low correlation, with a rival peak, or at the search's end.
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]
     num = sum(len(camera.changes) for camera in cameras)
@@ -165,10 +165,7 @@ def estimate_clock_offset(
 
 
 def select_states(stamp_ns: Stamps, motion: ImageMotion) -> Index:
-    """Indices (K,) of states, with ascending stamps (T,), that suffice for `estimate_clock_offset`.
-
-    A long or dense log needs few.
-    """
+    """Indices (K,) of states, with ascending stamps (T,), that suffice for `estimate_clock_offset`."""
     cameras = [camera for camera in motion.cameras.values() if camera.changes]
     if not cameras:
         return np.zeros(0, dtype=np.int64)

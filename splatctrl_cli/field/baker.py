@@ -29,8 +29,8 @@ T = TypeVar("T", bound=np.generic)
 class Baker:
     """Channels of a field over splats at the cells of `layout`.
 
-    Planes and threads change no bit. counts: ``se_without_value``, cells with exact distance instead of the kernel's;
-    ``se_over_estimates``, cells where it exceeds the exact one by more than `RESOLUTION`; likewise gpdf.
+    Planes and threads change no bit. counts: ``se_without_value``, cells with exact distance instead;
+    ``se_over_estimates``, cells above the exact one by over `RESOLUTION`; likewise gpdf.
     """
 
     def __init__(

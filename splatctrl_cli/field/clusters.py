@@ -35,9 +35,8 @@ class Spheres:
     def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
         """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
 
-        Anchor and curve follow `frame`, by default the centres' box: with one frame, centres of two sets keep order
-        and coordinates. Raises NotEvaluableError without any, InputError for a wrong shape, a non-finite value, or a
-        negative radius.
+        Anchor and curve follow `frame`, by default the centres' box. Raises NotEvaluableError without any, InputError
+        for a wrong shape, a non-finite value, or a negative radius.
         """
         points, radius_array = _check(centers, radii)
         lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)

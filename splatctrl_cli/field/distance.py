@@ -235,9 +235,9 @@ def march(
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
     Returns points reached (Q, 3) [m], the field there (Q,) [m], and length walked plus that (Q,) [m]. Each of the
-    `steps` goes against the local gradient, as far as the field reads, at most the `exact` distance: it crosses no
-    sphere. Points at or behind the zero level, which Matern's field has before the spheres
-    (`slabs.planar_zero_level`), stay. Raises UsageError for less than one step.
+    `steps` goes against the gradient, by the field, at most the `exact` distance: it crosses no sphere. Points at or
+    behind the zero level, which Matern's field has before the spheres (`slabs.planar_zero_level`), stay. Raises
+    UsageError for less than one step.
     """
     refuse_if(steps < 1, f"marching: expected at least 1 step, got {steps}", error=UsageError)
     hit = np.array(points, dtype=np.float64)

@@ -156,8 +156,8 @@ def observed_planes(
 class GridField:
     """Trilinear interpolation between cell centres.
 
-    Outside their box it reads the value at the box's nearest point minus the distance to it, a lower bound. Next to a
-    NaN cell (policy ``nan``), this and the certified distance are NaN.
+    Outside their box: the value at the box's nearest point minus the distance, a lower bound. Next to a NaN cell
+    (policy ``nan``), this and the certified distance are NaN.
     """
 
     def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
@@ -187,8 +187,8 @@ class GridField:
     def certified(self, points: Float64) -> Float64:
         """Lower bound (Q,) [m] of the exact distance to splats, not to objects.
 
-        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding. It holds for obstacle cells, too.
-        NaN where `query` is. Raises InputError without the channel bound.
+        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding. NaN where `query` is. Raises
+        InputError without the channel bound.
         """
         bound = require(self._bound, "distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
         # The channel bounds a whole cell: at its centre the exact distance is half a diagonal more.

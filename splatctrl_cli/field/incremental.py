@@ -28,8 +28,7 @@ class Changes:
 def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) -> Changes:
     """Blocks where bakes of `before` and `after` can differ by a bit.
 
-    Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
-    culling bounds, or where weights differ.
+    A block can differ where a splat of one set alone matters, by the bake's culling bounds, or weights differ.
     """
     shape = tuple(-(-cells // BLOCK) for cells in new.layout.shape)
     num_blocks = int(np.prod(shape))

@@ -24,9 +24,8 @@ def grid_statistics(grid: DistanceGrid) -> dict[str, Any]:
     sdf [m]; observed: cells by state; hard_share: of cells whose sdf is exact; never_seen_share: neither seen nor
     swept. excess, by kernel field: count and share of cells where it exceeds the exact distance, and the largest [m].
 
-    gradient: its lengths, 1 for a distance (Eikonal equation), less where a kernel field is flat. histogram: bin k
-    counts lengths within half a `bin_width` of k times that, the last also longer ones; share_near_one: within 0.05
-    of 1.
+    gradient: its lengths, 1 for a distance (Eikonal equation). histogram: bin k counts lengths within half a
+    `bin_width` of k times that, the last also longer ones; share_near_one: within 0.05 of 1.
     """
     sums, most = dict[str, Any](), dict[str, float]()
     for part in _parts(grid):

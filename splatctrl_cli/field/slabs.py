@@ -205,7 +205,7 @@ class UnknownSpace:
 
     ``nan``: no sdf, gradient or probability there. ``obstacle``: solid cubes of probability 1; sdf, gradient and
     bound are of the nearer of splats and cubes. Cells that only the robot swept are known
-    (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
+    (`VoxelState.SWEPT_BY_ROBOT`).
 
     num_never_seen, num_changed: cells so far.
     """

@@ -219,8 +219,8 @@ def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: 
 class Kernel:
     """A stationary kernel of the paper, of length scale l [m], with k(0) = 1.
 
-    Matern 1/2: ``k(d) = exp(-d / l)``, its inverse is ``r(o) = -l log o``. Else Gaussian: ``k(d) = exp(-d^2 / (2
-    l^2))``, ``r(o) = sqrt(-2 l^2 log o)``.
+    Matern 1/2: ``k(d) = exp(-d / l)``, ``r(o) = -l log o``. Else Gaussian: ``k(d) = exp(-d^2 / (2 l^2))``, ``r(o) =
+    sqrt(-2 l^2 log o)``.
     """
 
     length: float

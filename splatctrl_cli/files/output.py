@@ -83,8 +83,8 @@ _WITHOUT_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.
 def lock_output(partial: Path, *, is_folder: bool) -> Iterator[None]:
     """Lock a partial output for the block; create it if missing.
 
-    The lock follows a rename, ends with the process, and leaves nothing. Without flock(2) nothing is locked. Raises
-    UsageError if another run has the lock.
+    The lock follows a rename, and ends with the process. Without flock(2) nothing is locked. Raises UsageError if
+    another run has the lock.
     """
     descriptor = _taken(partial, is_folder=is_folder)
     try:
@@ -181,10 +181,10 @@ def output_path(
     """Yield ``NAME.partial`` (an empty folder, or a file name); rename it to `path` on success.
 
     A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
-    card leaves it, too. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
-    its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind.
-    Also for a foreign folder, another writer, or an unwritable parent. Raises WriteError if `is_write_failure`; other
-    errors pass.
+    card leaves it, too. `resume` yields such a folder, and no failure removes it. A link `path` stays, and its target
+    is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind. Also for a
+    foreign folder, another writer, or an unwritable parent. Raises WriteError if `is_write_failure`; other errors
+    pass.
     """
 
     def can_go_on() -> bool:
@@ -344,8 +344,7 @@ def write_run(
 ) -> None:
     """Write ``run.json``: command, settings, sha256 of inputs, times, metrics and verdict.
 
-    Write it last: for WITH_PARTS it has the sha256 of every file, checked on opening. It omits ``--resume``, so that
-    an interrupted run leaves what an uninterrupted one does.
+    Write it last: for WITH_PARTS it has the sha256 of every file, checked on opening. It omits ``--resume``.
     """
     run = {
         "command": command,

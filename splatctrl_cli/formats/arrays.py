@@ -1,4 +1,4 @@
-"""Arrays in ``.npz`` without timestamps (same arrays, same bytes), read within a size limit.
+"""Arrays in ``.npz`` (same arrays, same bytes), read within a size limit.
 
 NPZ, HDF5 and Parquet (extra `tables`: h5py, pyarrow) are read in blocks of rows. HDF5 names arrays by path
 (``observations/qpos``), Parquet by column; equal lists make an array (T, K).

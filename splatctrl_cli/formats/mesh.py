@@ -36,7 +36,7 @@ def load_mesh(path: Path) -> TriangleMesh:
     """Load a mesh with trimesh (OBJ, STL, PLY, OFF, GLB, COLLADA), all parts as one.
 
     Vertices at one place are merged. COLLADA is scaled by its unit; its up axis is ignored, as in RViz. Bytes after a
-    binary STL's faces are ignored, with a note. Raises InputError if unreadable, without triangles, or not finite.
+    binary STL's faces are noted. Raises InputError if unreadable, without triangles, or not finite.
     """
     refuse_if(not path.is_file(), f"{path}: expected a mesh, got no such file")
     kind = path.suffix.lower()

@@ -126,8 +126,8 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
 def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
     """Write `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
 
-    Comments follow the properties: some readers want the vertex count in line three. Non-ASCII is escaped. Raises
-    UsageError for a comment of several lines, or a key with a colon.
+    Comments follow the properties, for some readers. Non-ASCII is escaped. Raises UsageError for a comment of several
+    lines, or a key with a colon.
     """
     fields: Mapping[str, Any] = rows.dtype.fields or {}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]

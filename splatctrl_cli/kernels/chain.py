@@ -131,7 +131,7 @@ class EdgeRoom:
         only_whole: bool,
         threads: int = 1,
     ) -> tuple[Float64, Int64]:
-        """Share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,).
+        """Share (E,) proved free of edges start (E, J) to end (E, J), and checks (E,).
 
         A row whose value less `rounding` is below `contact` [m] collides; one that an edge does not move loses
         `still` [m] over it. Less than `give_up` [rad] before a collision stays unproved. With only_whole, other edges

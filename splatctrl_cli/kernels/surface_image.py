@@ -122,7 +122,7 @@ def better(
     """Lower signed distances (N,) [m] of points (N, 3), in place, where triangles are nearer.
 
     poses (4, 4): from points to each tree. Triangles beyond `within` (N,) [m] do not count, nor the inside for points
-    `outside` (N,). If `enough` (N,) [m] >= 0, any distance on the same side of both will do.
+    `outside` (N,). With `enough` (N,) [m] >= 0, any distance on the same side of both.
     """
     num = len(distance)
     native.signed_distance(

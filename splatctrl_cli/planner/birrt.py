@@ -151,8 +151,8 @@ class _Search:
 def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig, *, seed: int = 0) -> Plan:
     """Plan a path from start (J,) to one of goals (G, J) or (J,) [rad].
 
-    The same seed gives the same path. Running out of iterations or time is an outcome, not an error. Raises
-    InputError for a start or goal outside the limits, NotEvaluableError for one in collision.
+    The same seed gives the same path. Raises InputError for a start or goal outside the limits, NotEvaluableError for
+    one in collision.
     """
     began = time.perf_counter()
     roots = check_postures(clearance, start, goals, config)

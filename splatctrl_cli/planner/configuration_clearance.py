@@ -245,7 +245,7 @@ ROUNDING = 1e-9  # [m] subtracted from every clearance: far above rounding
 class EdgeCheck:
     """Proofs of E edges: each is free to `free_share` (E,) of its length.
 
-    The share is 0 if not even the start was proved. num_checks: postures checked.
+    num_checks: postures checked.
     """
 
     free_share: Float64
@@ -268,8 +268,8 @@ def check_edges(
 ) -> EdgeCheck:
     """Prove edges start (E, J) to end (E, J) free.
 
-    Less than `contact` [m] counts as collision, which bounds the checks. Less than `give_up` [rad] before a collision
-    stays unproved. With `only_whole`, a collision sets an edge's free_share to 0.
+    Less than `contact` [m] counts as collision. Less than `give_up` [rad] before a collision stays unproved. With
+    `only_whole`, a collision sets an edge's free_share to 0.
     """
     if clearance.compiled is None or not isinstance(clearance.scene, Solids):
         return check_sampled_edges(clearance, start, end, contact=contact, give_up=give_up, only_whole=only_whole)

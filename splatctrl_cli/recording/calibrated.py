@@ -128,7 +128,7 @@ def read_correction(options: SourceOptions, where: str) -> Correction | None:
 
 
 def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
-    """The source, corrected and then perturbed as the options ask.
+    """The source, corrected, then perturbed by the options.
 
     Raises InputError for another recording's calibration, UsageError as `Perturbation.of`.
     """
@@ -158,8 +158,7 @@ class ChangedSource(FrameSource):
     """Another source's records, corrected by a calibration or perturbed, in memory.
 
     A calibrated clock moves joint states. A moving camera then takes its pose at the frame's time on the robot's
-    clock, from a log's transforms or interpolated between frames. Frames without a pose within `tolerance_ns` are
-    left out and counted.
+    clock. Frames without a pose within `tolerance_ns` are left out and counted.
     """
 
     def __init__(self, source: FrameSource, change: "Correction | Perturbation", tolerance_ns: int) -> None:
@@ -236,10 +235,10 @@ LIMITS = {"depth-noise": 1.0, "pose-error": 10.0, "pose-turn": 180.0, "seed": 2*
 
 @dataclass(frozen=True, kw_only=True)
 class Perturbation:
-    """Errors drawn from `seed`: twice the size is twice the same error.
+    """Errors drawn from `seed`, proportional to their size.
 
-    depth_noise: standard deviation at 1 m [m]; it grows with depth squared, as for stereo. pose_error [m], pose_turn
-    [degrees]: a shift and a turn of each camera, drawn once for all frames.
+    depth_noise: standard deviation at 1 m [m]; grows with depth squared. pose_error [m], pose_turn [degrees]: a shift
+    and a turn of each camera.
     """
 
     depth_noise: float = 0.0

@@ -82,7 +82,7 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
 
 
 def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, str, str]]:
-    """Path, topic or node, and text of logs' and captures' URDFs, each once; skips other inputs."""
+    """Path, topic or node, and text of logs' and captures' URDFs, each once."""
     found: dict[str, tuple[Path, str, str]] = {}
     for path in paths:
         said = []

@@ -1,9 +1,9 @@
 """Coverage of a robot's collision surface by its spheres, with proven bounds.
 
-phi(p) = min_i |p - c_i| - r_i is positive exactly outside a union of balls, and is then the distance to it. Each term
-is convex, so over a triangle it is largest at a corner:
+phi(p) = min_i |p - c_i| - r_i is the distance outside a union of balls. Each term is convex, so over a triangle it is
+largest at a corner:
 
-    max over the triangle of phi  <=  min_i max_k |v_k - c_i| - r_i,
+max over the triangle of phi <= min_i max_k |v_k - c_i| - r_i,
 
 exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest corner phi agree.
 Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
@@ -44,8 +44,8 @@ class LinkCoverage:
     """Coverage of one link's collision surface by its spheres and those fixed to it.
 
     area [m2]; uncovered_area [m2], proven bounds; deficit: None without spheres; protrusion [m]: bound of spheres
-    beyond the body, exact for a convex one; worst_sphere: its index in the sphere set, -1 without spheres; is_closed:
-    False if a hull replaced an open surface.
+    beyond the body; worst_sphere: its index in the sphere set, -1 without spheres; is_closed: False if a hull
+    replaced an open surface.
     """
 
     link: str
@@ -186,8 +186,7 @@ def uncovered_area(
 ) -> tuple[float, float, float]:
     """Area [m2] with phi > 0: best guess, proven lower and upper bound.
 
-    Triangles are halved until in one sphere, outside all, or no longer than `resolution` [m], where the middle
-    decides.
+    Triangles are halved until in one sphere, outside all, or `resolution` [m] long.
     """
     outside = unsure = guess = 0.0
     pending = triangles

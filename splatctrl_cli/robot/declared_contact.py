@@ -18,8 +18,8 @@ REMEDY = "see splatctrl help declare for the keys of a declaration"
 class DeclaredContact:
     """A carried box or an intended contact of `link`, `start` to `end` [s after the first state].
 
-    box [m]: of what is carried, in the link's frame; or in world, around the contact, which has a `reason`.
-    is_learned: from an observed grasp, not a file.
+    box [m]: carried, in the link's frame; or in world, around a contact, which has a `reason`. is_learned: from an
+    observed grasp, not a file.
     """
 
     link: str

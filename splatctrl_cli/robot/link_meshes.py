@@ -81,8 +81,8 @@ UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 class Solid:
     """A piece of a link's collision geometry, in the frame of `link` [m].
 
-    slack: the true surface's largest distance from the triangles. body: closed mesh for inside tests, or the convex
-    hull, None if flat. ball: centre (3,), radius.
+    slack: largest distance of the true surface. body: closed mesh for inside tests, or the convex hull, None if flat.
+    ball: centre (3,), radius.
     """
 
     link: str
@@ -150,7 +150,7 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
 class SolidDistance:
     """A bound on the signed distance (Q,) [m] of points (Q, 3), link frame, to solids.
 
-    The least to each: outside exact, inside no deeper than the truth. Unsigned for an open, flat surface.
+    Outside exact, inside no deeper than the truth; unsigned for an open, flat surface.
     """
 
     def __init__(self, solids: Sequence[Solid]) -> None:

@@ -271,7 +271,7 @@ class RobotModel:
     ) -> dict[str, Float64]:
         """Signed gap (T,) [m] of each meshed link to the nearest ball.
 
-        Balls (N, 3), (N,) [m], world; positions (T, J). Carried boxes count.
+        Balls (N, 3), (N,) [m], world; positions (T, J).
         """
         surface = self.surface
         return {

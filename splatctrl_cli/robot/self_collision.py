@@ -91,7 +91,7 @@ def self_collision_pairs(
 
     Omitted: links of one rigid body or joined by one joint, and `disabled` (an SRDF). Without `disabled`, pairs
     always in contact over `num_postures` uniform postures are omitted. With `drop_never` also those never nearer than
-    NEVER_MARGIN: a guess from a sample.
+    NEVER_MARGIN.
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)

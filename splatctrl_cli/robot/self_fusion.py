@@ -81,7 +81,7 @@ def learn(
     link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
     `NUM_CONFIGURATIONS` show it as a surface, at most `FREE_SHARE` see through it (most views of one decide), it
     leaves its place in the world with the link, and moves against each nearer link. A link that moves too little gets
-    configurations half as far apart, for parts that move by `AWAY`. Raises InputError where no link can be learned.
+    configurations half as far apart. Raises InputError where no link can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]

@@ -88,9 +88,8 @@ def _runs(fused: Fused) -> tuple[Index, Index]:
 def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> list[Interval]:
     """Whole recording, and intervals shared by the runs of enough connected cells.
 
-    Configurations that see through a cell before or after its run bound it. At a part's begin or end, some
-    configuration sees through `GONE` of it. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's own surface;
-    stamps (K,) [ns].
+    Configurations that see through a cell bound its run. At a part's begin or end, some configuration sees through
+    `GONE` of it. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's own surface; stamps (K,) [ns].
     """
     num, rows = len(stamps), np.arange(len(stamps))[:, None]
     first, last = _runs(fused)
@@ -134,7 +133,7 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
     """Number (N,) of the interval in which each cell is robot, -1 for none.
 
-    Votes of robot cells around it decide. In the whole recording, the first, cells next to robot need fewer
+    Votes of robot cells around it decide. In the first, the whole recording, cells next to robot need fewer
     configurations.
     """
     runs = [slice(interval.first, interval.last + 1) for interval in intervals]

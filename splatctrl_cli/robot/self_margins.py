@@ -82,8 +82,8 @@ def depth_in(solid: Solid) -> Depth:
 def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
     """Gap [m] of two surfaces, b at T_a_b (4, 4); negative where they overlap.
 
-    Exact between triangles, a lower bound for round shapes. A link inside the other overlaps it. The depth is the
-    deepest vertex's, at least LEAST_OVERLAP.
+    Exact between triangles, a lower bound for round shapes. An overlap is the deepest vertex's, at least
+    LEAST_OVERLAP.
     """
     here, there = coal.Transform3s(), coal.Transform3s(T_a_b[:3, :3], T_a_b[:3, 3])
     request, result = coal.DistanceRequest(), coal.DistanceResult()
@@ -98,8 +98,8 @@ def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
 class SelfSurfaces:
     """Pairs of links that may collide, judged by surfaces; without surfaces, by spheres.
 
-    pairs: links neither on one body nor joined by a joint, not in an SRDF, and apart in some posture; fused: never
-    apart. names (K + P): of these and of P pairs of spheres on bodies without geometry.
+    pairs: links that may collide, and are apart in some posture; fused: never apart. names (K + P): of these and of P
+    pairs of spheres on bodies without geometry.
     """
 
     def __init__(
@@ -227,8 +227,7 @@ def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None
 
     Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are within the
     lesser of the margin and half their largest gap. The pair keeps the largest sphere gap of the near postures if
-    most others keep more. With too coarse spheres it keeps what nearly all other postures keep; with unknown
-    surfaces, at least 0.
+    most others keep more. Else it keeps what nearly all other postures keep; with unknown surfaces, at least 0.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]

@@ -95,9 +95,9 @@ def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:
     """Bounds (S, J) on a centre's travel per radian (or metre) within the limits.
 
-    About its own joint the centre keeps to a circle, inside a ball about the circle's middle. Each joint towards the
-    base carries that middle on a circle; the ball grows by its distance from the axis. 0 where the joint does not
-    move the sphere.
+    About its own joint the centre moves on a circle, inside a ball about its middle. Each joint towards the base
+    moves that middle on a circle; the ball grows by its distance from the axis. 0 where the joint does not move the
+    sphere.
     """
     levers = np.zeros((len(chain.sphere_body), len(chain.parent) - 1))
     for s, (start, offset) in enumerate(zip(chain.sphere_body, chain.offset, strict=True)):

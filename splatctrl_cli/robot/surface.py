@@ -223,7 +223,7 @@ class RobotSurface:
         """Signed distances (Q,) [m] of points (Q, 3), negative inside.
 
         Infinite to triangles beyond `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0, any distance on the same
-        side of both bounds. Points `outside` (Q,) of all triangles skip the inside test.
+        side of both. Points `outside` (Q,) skip the inside test.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)

@@ -132,7 +132,7 @@ class UrdfFile:
     def fingers(self, moved: Collection[str]) -> tuple[str, ...]:
         """`grippers` that stand still while the `moved` joints move.
 
-        On the moved arm, but neither before a moved joint nor in step with one.
+        Neither before a moved joint nor in step with one.
         """
         by_name = {joint.name: joint for joint in self.joints}
         busy = set(moved).union(*(self._before(by_name[name]) for name in moved if name in by_name))

@@ -1,7 +1,4 @@
-"""The backdrop: splats at pixels without depth, where views agree on a colour.
-
-They are trained and rendered, but show neither surface nor free space.
-"""
+"""The backdrop: splats at pixels without depth, for rendering only."""
 
 from collections.abc import Iterator, Sequence
 

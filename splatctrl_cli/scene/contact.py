@@ -92,10 +92,7 @@ def lasts_at_fixed_links(
     config: OccupancyConfig,
     points: Float32,
 ) -> Bool:
-    """True for points (K, 3) [m], world, away from fixed links or on `lasting` pixels (H, W).
-
-    Stereo gives pixels outside a link's outline the link's depth in some frames.
-    """
+    """True for points (K, 3) [m], world, away from fixed links or on `lasting` pixels (H, W)."""
     distance = robot.distance(points)
     is_kept = (distance > fixed.ROBOT_REACH) | (distance >= robot.distance(points, to_moving=True))
     for frame, pixels in zip(frames, lasting, strict=True):

@@ -1,4 +1,4 @@
-"""Evidence of a time step: masks of its frames, rays that frames contradict, and what the occupancy takes in.
+"""Evidence of a time step: masks of its frames, and rays that another frame contradicts.
 
 Rays go through a surface that another camera measures if an object is shiny or dark: its depth is far too large, or
 missing.
@@ -85,10 +85,10 @@ class Contradicted:
 def find_contradicted(seen: Seen, *, is_drawn: bool, each: Each = map) -> Iterator[Contradicted]:
     """Yield what other frames or the drawn robot contradict in each frame of a step.
 
-    All rays of a contradicted block and its neighbours cross another frame's surface. They end more than
-    `CONTRADICTED` [m] behind it, or have no return, in range and outside stereo shadows, or none from the drawn
-    robot. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks that
-    others' rays cross prove no space free. each: a `map` over frames.
+    All rays of a contradicted block and its neighbours cross another frame's surface. They end over `CONTRADICTED`
+    [m] behind it, or have no return, in range and outside stereo shadows, or from the drawn robot. Fewer than
+    `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks that others' rays cross
+    prove no space free. each: a `map` over frames.
     """
     views = list(each(_BlockView.of, *zip(*seen, strict=True)))
     through = [np.zeros_like(view.surely) for view in views]

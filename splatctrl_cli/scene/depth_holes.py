@@ -1,7 +1,7 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
 An object in a hole is on its rays, until other rays clear them. At depth edges without depth, the nearer surface may
-extend. Voxels near the robot that no camera ever saw get a reason.
+extend.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,8 +32,8 @@ def unanswered_points(
     """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
     Rays about a voxel apart end at the depth of the nearest pixel with depth. Holes up to `NARROW_HOLE` voxels wide
-    do not count, nor those that a still camera did not show before. robot_depth (H, W) [m]: rendered, 0 = none;
-    before: the camera's last frame and its mask, whose kinds alone a resumed run still knows.
+    do not count, nor new ones of a still camera. robot_depth (H, W) [m]: rendered, 0 = none; before: the camera's
+    last frame and its mask (only kinds, if resumed).
     """
     holes = _holes(frame, robot_depth > 0)
     if before is not None and holes.any() and np.array_equal(before[0].T_world_camera, frame.T_world_camera):

@@ -341,8 +341,7 @@ class SceneFitter:
     ) -> Filled:
         """Add splats where measured surfaces are far from all spheres, in alternate halves per step.
 
-        The robot's surface has its own spheres. For missing slots, splats are evicted every EVICT_EVERY steps, and
-        counted in `removed`.
+        For missing slots, splats are evicted every EVICT_EVERY steps, and counted in `removed`.
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
@@ -378,10 +377,7 @@ class SceneFitter:
     def _show_contact(
         self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, steady: Sequence[Bool]
     ) -> Filled:
-        """Give objects near moving links splats of half `contact_radius`, at most that radius apart.
-
-        Only `steady` pixels (H, W) count.
-        """
+        """Give objects near moving links splats of half `contact_radius`, at most that radius apart."""
         if robot is None:
             return Filled()
         radius, is_object = 0.5 * self.config.contact_radius, self._standing_for(Label.OBJECT)
@@ -398,10 +394,7 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
-        """Put object splats near the robot on measured depth, and shrink those that stand out.
-
-        They shrink to no less than half of `contact_radius`; hidden splats get at most that at once.
-        """
+        """Put object splats near the robot on measured depth, and shrink those that stand out."""
         if robot is None:
             return
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius

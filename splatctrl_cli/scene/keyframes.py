@@ -84,7 +84,7 @@ def move_to_surface(centers: Float32, views: Sequence[View], most: float) -> Flo
     """Move centres (N, 3) [m], world, floating up to `most` [m], onto the measured surface.
 
     A centre floats if all views that see it measure more depth at and around its pixel. It moves to the least of
-    these depths, along the ray with the smallest step. Views with depth more than `most` before it do not see it.
+    these depths, along the ray with the smallest step. Views with depth over `most` before it do not count.
     """
     least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
     for view in views:
@@ -104,8 +104,8 @@ def shrink_radii(
 ) -> Float32:
     """Radii (N,) [m] that keep spheres within measured depth, `least` [m] or more.
 
-    A sphere shrinks while, in some view, a point of its edge floats by more than `tolerance` [m] before depth around
-    its pixel, or its nearest point before its pixel's depth.
+    A sphere shrinks while, in some view, its edge floats by over `tolerance` [m] before depth around, or its nearest
+    point before its pixel's depth.
     """
     cameras = [view.camera for view in views]
     depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]

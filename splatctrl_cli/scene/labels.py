@@ -20,8 +20,8 @@ def relabel(
 ) -> Bool:
     """Relabel the splats; return trails (M,): robot or human before, object now.
 
-    Without a posture, robot splats keep their label. Robot pixels overrule human masks. A robot splat that depth
-    shows to be an object is no trail; its radius becomes at most `least` [m].
+    Without a posture, robot splats keep their label. Robot pixels overrule human masks. A robot splat shown to be an
+    object is no trail; its radius becomes at most `least` [m].
     """
     labels = np.where(human_splats(buffer, occupancy), np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     if robot is None:
@@ -43,7 +43,7 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
     """Splats (M,) of the robot, and those that a pixel shows to be an object.
 
     The pixel whose depth a splat explains best decides. Hidden splats keep their label; the robot's must be within
-    `see_through` of its body. Others well inside the body become robot, in solid voxels only if all of it is drawn.
+    `see_through` of its body. Others well inside the body become robot (in solid voxels, if all is drawn).
     """
     alive, config = buffer.is_alive, occupancy.config
     kind = shown_kinds(buffer.centers, seen, config)

@@ -1,7 +1,4 @@
-"""Pixels of what is mounted on a moving camera, such as a gripper.
-
-They are neither seeded nor compared. A known robot has a model instead (`labels`).
-"""
+"""Pixels of what is mounted on a moving camera, such as a gripper: neither seeded nor compared."""
 
 from collections.abc import Sequence
 
@@ -25,7 +22,7 @@ def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None:
     """Pixels (H, W) of what moves with one camera, by `spread_views`; None for fewer than six.
 
-    They keep their colour, are not flat, and rarely have depth of `min_range` [m] or more.
+    They keep their colour, are not flat, and rarely have depth over `min_range` [m].
     """
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None

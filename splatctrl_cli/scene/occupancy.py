@@ -84,7 +84,7 @@ class OccupancyMap:
 
         A voxel with a pixel's point is a hit, else a miss if its centre is before its pixel's depth. A pixel without
         depth takes the nearest one's, while their rays are within half a voxel. Depth below min_range does not count;
-        beyond max_range it is no hit, but frees nearer voxels.
+        beyond max_range it only frees.
         """
         config = self.config
         native.integrate_depth(
@@ -139,9 +139,8 @@ class OccupancyMap:
         self._hide_beside(arrived, math.ceil(len(self.edges) / max(len(seen), 1)))
 
     def _hide_beside(self, arrived: Index, num_steps: int) -> None:
-        """Forget views of space within `HIDDEN` of voxels (K,), before the last `num_steps` steps.
-
-        The unseen side of an object that arrived may fill that space.
+        """Forget views of space within `HIDDEN` of voxels (K,) of an arrived object, before the last `num_steps`
+        steps.
         """
         reach = math.ceil(fixed.HIDDEN / self.config.voxel)
         cells = np.stack(np.unravel_index(arrived, self.entity.shape), axis=1)
@@ -197,7 +196,7 @@ class OccupancyMap:
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
         """Largest occupancy (N,) of the eight nearest voxels; True (N,) if any was seen.
 
-        Never-seen voxels do not count; if all eight are never seen, the occupancy is one half.
+        Never-seen voxels do not count; one half if all are.
         """
         base = np.floor((points_world - self.origin) / self.config.voxel).astype(np.int64)
         limit = np.array(self.log_odds.shape) - 1

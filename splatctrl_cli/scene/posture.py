@@ -92,7 +92,7 @@ POSTURE_NAMES = ("centers", "radii", "T_world_link")  # kept for the next time s
 def carry_splats(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
     """Move points (N, 3) [m], world, with the link of the nearest sphere surface.
 
-    Splats left behind would become trails. The paper does not move them.
+    The paper does not move them.
     """
     gap = np.linalg.norm(points[:, None] - before.centers[None], axis=2) - before.radii
     sphere = np.argmin(np.abs(gap), axis=1)

@@ -34,10 +34,7 @@ class Agreement:
 
     @property
     def holds(self) -> bool:
-        """False if median and detour exceed the limit, and the quartile half of it.
-
-        Of thin objects, which look like one surface, a share of pixels agrees.
-        """
+        """False if median and detour exceed the limit, and the quartile half of it."""
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 
 

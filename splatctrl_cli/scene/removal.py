@@ -50,8 +50,8 @@ def removals(
 
     broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
     seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: no longer
-    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail). Splats in
-    never-seen surroundings stay, unless the rule is "literal". counts_time: towards the patience.
+    robot or human. Set elsewhere: robot, evicted, weak. Splats in never-seen space stay, unless the rule is
+    "literal". counts_time: towards the patience.
     """
     config = occupancy.config
     centers = buffer.centers
@@ -118,7 +118,7 @@ def find_redundant(
     """The first splats of `order`, at most `num_wanted`, that the others together can replace.
 
     splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within `tolerance`
-    [m] of its sphere, among the eight nearest centres. It may go if all its voxels keep another.
+    [m] of its sphere, among the eight nearest centres. It may go if its voxels keep another.
     """
     if not len(order) or not len(voxels) or num_wanted < 1:
         return np.zeros(0, np.intp)

@@ -61,7 +61,7 @@ def depth_noise(images: Sequence[Float32]) -> float:
 
     At depth z it is that times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
     Residuals of linear fits to blocks are noise; a low quantile leaves out edges. Wider blocks may raise it, up to
-    twice, as fits absorb noise that neighbours share.
+    twice.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *fixed.NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))
@@ -88,7 +88,7 @@ def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) 
 
     Lengths scale by `scene.scale`, or if 0, by the median depth over a table's at arm's length. min_radius becomes at
     most a pixel, min_range at most half the nearest depth, max_range at least the farthest. With a robot, scale 0
-    scales nothing, and a larger recorded error replaces the default.
+    scales nothing; a larger recorded error counts.
     """
     least = OccupancyConfig().depth_error
     if has_robot and depth.noise > least == config.occupancy.depth_error:

@@ -1,7 +1,7 @@
 """Seeds of new splats, from first frames and unexplained pixels (M_add, eq. 5).
 
-The paper seeds every pixel. Here nested cubes over coloured points get one splat each: a cube splits in eight while
-its points differ in colour or lie off a plane.
+The paper seeds every pixel. Here nested cubes get one splat each: a cube splits while its points differ in colour or
+lie off a plane.
 """
 
 import math
@@ -53,8 +53,8 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
     """M_add (H, W): pixels to seed, eq. 5 with a term for holes.
 
     Holes are mappable pixels with opacity below `hole_opacity`. Others are seeded if closer than the map by more than
-    lambda_MDE times the median depth error. The median is over explained mappable pixels; the threshold has a floor
-    and a ceiling. The map's depth is normalised by opacity.
+    lambda_MDE times the median depth error. The median is over explained mappable pixels; the threshold is bounded,
+    the map's depth normalised by opacity.
     """
     images = (rendering.depth, rendering.opacity, frame.depth)
     error, sizes = np.empty(frame.depth.shape, np.float32), np.empty(frame.depth.size, np.float32)
@@ -166,7 +166,7 @@ class SeedDensity:
 def density_for(sources: Sequence[Seeds], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
     """Density that spends at most `count` seeds on the candidates.
 
-    The edge starts at what the largest splats cover, and grows by 5 % while cubes are too many.
+    The edge starts at the largest splats, and grows by 5 % while cubes are too many.
     """
     everything = sources[0].joined(*sources[1:])
     points = everything.centers

@@ -41,9 +41,9 @@ class PixelKind(IntEnum):
 class SelfMask:
     """The self-mask of a frame.
 
-    kinds (H, W): `PixelKind`; robot_depth (H, W) [m]: rendered, 0 = none; residuals: by link, measured minus
-    rendered depth (K,) [m] inside the outline, up to `MASK_FAR_OFF`; num_inside: by link, unexplained points inside
-    its body; reach [m]: an object this close before the robot, at its median depth, counts as robot.
+    kinds (H, W): `PixelKind`; robot_depth (H, W) [m]: rendered, 0 = none; residuals: by link, measured minus rendered
+    depth (K,) [m] inside the outline, up to `MASK_FAR_OFF`; num_inside: by link, unexplained points inside its body;
+    reach [m]: an object this close before the robot counts as robot.
     """
 
     kinds: UInt8
@@ -57,7 +57,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     """Self-mask of a frame, with the robot's pose at its stamp.
 
     A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths in as
-    many pixels as the tolerance spans. So is a point this near to a triangle, or inside one, a ball or a carried box.
+    many pixels as the tolerance spans. So is a point this near to a triangle, or inside the robot or a carried box.
     Other depth is object, if `_judge` agrees.
 
     The image is widened by 1 / `MASK_BORDER`.
@@ -150,8 +150,8 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
 def is_occluded(offset: Float32, link: Int16) -> Bool:
     """True for pixels (H, W) of an object before a link (-1: none).
 
-    offset: measured less rendered depth [m]. An object occludes a link if over `MASK_OCCLUDED` of the link's pixels
-    are more than `MASK_FAR_OFF` before it. Then pixels more than `MASK_STEP` before the link show it.
+    offset: measured less rendered depth [m]. An object occludes a link if over `MASK_OCCLUDED` of its pixels are over
+    `MASK_FAR_OFF` before it. Then pixels more than `MASK_STEP` before the link show it.
     """
     number = link.astype(np.int64) + 1
     num_before = np.bincount(number.ravel(), (offset < -fixed.MASK_FAR_OFF).ravel())
@@ -193,8 +193,8 @@ def settle_pieces(
 ) -> SelfMask:
     """Mask with each doubted piece decided: object or mixed.
 
-    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` (of other cameras, and
-    settled ones of the last step) measured half of it, or without any.
+    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` (other cameras', settled
+    ones of the last step) measured half of it, or without any.
     """
     box = find_outline(mask.kinds == PixelKind.DOUBTED)
     if box is None:

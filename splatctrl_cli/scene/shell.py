@@ -1,7 +1,4 @@
-"""The shell: coarse splats beyond the workspace, for rendering only.
-
-It has its own budget; the map's bytes do not depend on it.
-"""
+"""The shell: coarse splats beyond the workspace, for rendering only, with their own budget."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

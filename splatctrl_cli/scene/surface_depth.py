@@ -19,8 +19,8 @@ def steady_depth(
     """Frame with a running mean of its depth, and its steady pixels (H, W).
 
     An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2, and depths
-    around it by `STEADY_MOVED` `depth_error` z^2 on average. Only what was an object before is averaged. Without
-    `before`, no pixel is steady; if the camera moved, depth stays, and all are.
+    around it by `STEADY_MOVED` `depth_error` z^2 on average. Only objects are averaged. Without `before`, no pixel is
+    steady; if the camera moved, all are, unaveraged.
     """
     if before is None or before[1].shape != frame.depth.shape:
         return frame, np.zeros(frame.depth.shape, bool)

@@ -15,7 +15,7 @@ from splatctrl_cli.scene.seeding import thin_mask, thinning, world_points
 
 @dataclass(frozen=True, kw_only=True)
 class TimeStep:
-    """Frames taken together (with a clock, at most one per camera), and the joint positions then.
+    """Frames taken together (with a clock, one per camera), and joint positions.
 
     position (J,) at the last frame, in the source's joint order, None without a near joint state; velocity (J,)
     [1/s].

@@ -92,8 +92,8 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 class GridAgreement:
     """Agreement of splats with a grid; NaN without any.
 
-    on_surface: share of object and human splats in or next to a voxel that is not free, among those not at never-seen
-    voxels. represented: share of num_voxels occupied voxels with a splat or ball.
+    on_surface: share of object and human splats, not at never-seen voxels, in or next to a voxel that is not free.
+    represented: share of num_voxels occupied voxels with a splat or ball.
     """
 
     on_surface: float

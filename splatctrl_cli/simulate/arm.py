@@ -211,7 +211,7 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64,
     """Spheres (center (3,), radius) [m], link frame, whose union contains every shape.
 
     At steps h along a segment, radius sqrt(R^2 + (h/2)^2) covers a tube of radius R (of a box's bar: half its
-    section's diagonal). Spheres inside others are dropped.
+    section's diagonal).
     """
     spheres: list[tuple[Float64, float]] = []
     for start, end, radius in (spine for shape in shapes for spine in _spines(shape)):

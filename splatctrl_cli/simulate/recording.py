@@ -36,8 +36,8 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 class RecordingOptions:
     """Duration [s], frames per second per camera, image size [px], depth noise and seed.
 
-    with_person: a walking person with masks, instead of the cylinder. is_free: floor and walls alone. visitor: x, y,
-    radius [m] of the cylinder. color_rays: 0 to 4 per pixel, besides depth's.
+    with_person: a person with masks, instead of the cylinder. is_free: floor and walls alone. visitor: x, y, radius
+    [m] of the cylinder. color_rays: 0 to 4 per pixel, besides depth's.
     """
 
     duration_s: float = 7.0

@@ -48,8 +48,8 @@ class Meshes:
 class Renderer:
     """Renderer of one camera; static solids are cast once.
 
-    Rays have unit length along the optical axis: t is depth [m]. `color_rays` rays give a pixel's colour; with 0,
-    depth's ray does.
+    Rays have unit length along the optical axis: t is depth [m]. `color_rays` rays give a pixel's colour (0: depth's
+    ray).
     """
 
     def __init__(self, camera: Camera, static: Sequence[Primitive], *, color_rays: int = 4) -> None:

@@ -21,7 +21,7 @@ NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """Obstacles over time, cameras and robot of a simulated log; world frame, m, ns.
+    """Obstacles over time, cameras and robot of a simulated log; world, m, ns.
 
     clearance (T,) [m]: of moving collision spheres and `unmodelled` parts, at stamps (T,) int64 [ns] of joint states.
     luminance_std: by camera, the least (0 to 1).

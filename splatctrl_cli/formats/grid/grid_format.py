@@ -153,8 +153,8 @@ class GridFormat:
 
     `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
     `describe`: from a path and its first bytes; None for another kind. `needs`: one of these channels.
-    `holds_unknown`: cells can be without a distance. `bytes_per_cell`: on disk, None for all channels'. `check`
-    raises UsageError without its library. `docs`: row in docs/artefacts.md: name | file | who opens it.
+    `holds_unknown`: cells without a distance. `bytes_per_cell`: on disk, None for all channels'. `check` raises
+    UsageError without its library. `docs`: row in docs/artefacts.md: name | file | who opens it.
     """
 
     name: str

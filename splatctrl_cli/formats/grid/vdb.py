@@ -35,8 +35,8 @@ _NUMBERS = {"int32": "<i", "int64": "<q", "float": "<f", "double": "<d", "bool":
 def write_vdb(path: Path, grid: DistanceGrid) -> None:
     """Write the grid; inactive voxels read as the float above the channel's largest.
 
-    That is positive: a planner must query active voxels only. A gradient's is zero. Raises UsageError without
-    OpenVDB, InputError for an invalid layout.
+    Positive: query active voxels only. A gradient's is zero. Raises UsageError without OpenVDB, InputError for an
+    invalid layout.
     """
     check_grid(grid)
     vdb = openvdb()

@@ -60,7 +60,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 class SceneWriter:
     """A writer of a scene during fitting, into an empty or checkpoint's folder.
 
-    An empty folder may have `SELF_MODEL`. Snapshots are written in the background; the next call raises their errors.
+    Snapshots are written in the background; the next call raises their errors.
     """
 
     def __init__(self, folder: Path, comments: Mapping[str, str], checkpoint: Checkpoint | None = None) -> None:

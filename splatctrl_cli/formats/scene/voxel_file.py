@@ -97,7 +97,7 @@ def read_states(path: Path) -> OccupancyGrid:
 def read_seen(path: Path) -> SeenVoxels | None:
     """Read voxels' last views and lost edges alone.
 
-    None for an older file. Raises InputError for another one.
+    None if older. Raises InputError for another file.
     """
     with _refuse(path, _OURS):
         header = _read_header(path)

@@ -96,7 +96,7 @@ class Differences:
 def float32_bound(gaussians: GaussianSet) -> Differences:
     """A float32 format's bound: centres exact, one rounding of the rest.
 
-    A log sigma is at most 88 in size: half a unit of its last place is 5e-6 of sigma.
+    A log sigma is at most 88: half a unit of its last place is 5e-6 of sigma.
     """
     largest_color = float(np.abs(gaussians.harmonics[:, 0]).max(initial=1.0))
     return Differences(center=0.0, sigma=6e-6, rotation=1e-4, color=1e-6 * largest_color, opacity=1e-6, harmonics=0.0)
@@ -269,7 +269,7 @@ def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
 def log_sigmas(ply: PlyFile) -> Float64:
     """(N, 3) log(sigma [m]). Raises InputError for two scales, or scales that are no logarithms.
 
-    They are none if no scale is below 0 and 95 % of splats are over SPARSEST times as large as their spacing.
+    They are none if no scale is below 0 and 95 % of splats exceed SPARSEST times their spacing.
     """
     found = [name for name in SCALES if name in ply.names]
     refuse_if(

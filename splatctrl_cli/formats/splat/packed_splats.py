@@ -42,8 +42,7 @@ ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("
 def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write what `.splat` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    A quaternion's largest component is made negative: -1 has a byte, +1 has none. Raises InputError for an invalid
-    value.
+    A quaternion's largest component is negative: -1 has a byte. Raises InputError for an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
@@ -160,8 +159,8 @@ def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
 def spz_bound(gaussians: GaussianSet) -> Differences:
     """Half a step of each value, with a margin for float32.
 
-    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511 are 1.2e-3 together. The fourth is
-    at least 1/2, which at most doubles it; a rotation turns by twice that: 0.28 degrees.
+    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511 are 1.2e-3 together, twice with the
+    fourth, and twice that as an angle: 0.28 degrees.
     """
     return Differences(
         center=0.5001 * (2.0 ** -_fraction_bits(gaussians.centers)),

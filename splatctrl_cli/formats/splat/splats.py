@@ -77,10 +77,7 @@ def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
 
 
 def nearest_splats(gaussians: GaussianSet) -> SplatSet:
-    """Splats of the Gaussians' volume (geometric mean of sigmas), opacity and mean colour.
-
-    Loses orientation, flatness and view-dependent colour.
-    """
+    """Splats of the Gaussians' volume (geometric mean of sigmas), opacity and mean colour."""
     return _round_splats(
         gaussians, np.exp(np.log(gaussians.scales.astype(np.float64)).mean(axis=1)).astype(np.float32)
     )

@@ -1,6 +1,6 @@
 """Iterations of the fit on a device, which keeps splats, Adam's state and views.
 
-N splats, (H, W) pixels, K tiles of 16 x 16 pixels. If a list is too short, it grows, and the run repeats.
+N splats, (H, W) pixels, K tiles of 16 x 16 pixels. Lists that are too short grow.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,7 +1,4 @@
-"""A writer of capture folders (docs/capture.md) by frame, in bounded memory.
-
-A journal of written frames lets a killed run continue.
-"""
+"""A writer of capture folders (docs/capture.md), in bounded memory. A journal lets a killed run continue."""
 
 import hashlib
 import json
@@ -117,8 +114,8 @@ def write_capture(
 
     JPEG and PNG colour with the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded unit,
     or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the log's
-    URDF, or "". Returns frames by camera, joint_states and loss, as in run.json, and the number of frames of an
-    earlier run. Raises InputError without a frame, UsageError if existing frames differ.
+    URDF, or "". Returns frames by camera, joint_states and loss, as in run.json, and the number of earlier frames.
+    Raises InputError without a frame, UsageError if existing frames differ.
     """
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}

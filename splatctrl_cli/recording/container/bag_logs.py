@@ -240,8 +240,8 @@ _PAGE_SIZE, _FILE_FORMAT = slice(16, 18), slice(18, 20)  # of its header (sqlite
 class Db3Log(RawLog):
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal, so both are copied. It reads missing bytes of the last page as zeros, so a
-    cut file is copied up to that page. Raises InputError for other tables, or an unreadable file.
+    SQLite writes while it reads a journal, so both are copied, a cut file up to its last page. Raises InputError for
+    other tables, or an unreadable file.
     """
 
     container = "ROS 2 bag (sqlite3)"

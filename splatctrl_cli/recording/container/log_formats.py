@@ -1,6 +1,6 @@
 """Recorded logs opened by content: files, ROS 2 bag folders, logs of one session.
 
-Files or messages may be compressed with zstd. Recordings of unsupported tools are known by their marks.
+Files or messages may be compressed with zstd.
 """
 
 import heapq
@@ -94,7 +94,7 @@ class SessionLog(JoinedLog):
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield all parts' messages by log time.
 
-        If parts share a topic, all are read: skipping would reorder its messages between passes.
+        If parts share a topic, all are read, for one order.
         """
         pushed = None if names is None or self._share(names) else names
         messages = (part.messages(damage, pushed) for part in self._parts)
@@ -279,10 +279,7 @@ FOREIGN = (
 
 
 def refuse_foreign(path: Path) -> None:
-    """Raise InputError for a known unsupported format, with its name and export.
-
-    Some are supported containers with other contents (.svo2).
-    """
+    """Raise InputError for a known unsupported format, with its name and export."""
     ends, names = (b"", []) if path.is_dir() else (_ends(path), _entries(path))
     for kind in FOREIGN:
         is_named = path.suffix.lower() in kind.suffixes

@@ -188,7 +188,7 @@ class _Walk:
         return Part(offset, opcode, b"", opcode <= DATA_END)
 
     def _beyond(self, offset: int, opcode: int) -> Part | None:
-        """Go to the next readable place, or return what is left of a cut chunk."""
+        """Go to the next readable place, or return the rest of a cut chunk."""
         start = self._next_place(offset)
         if start is not None:
             self._add(f"bytes {offset} to {start} are damaged and were left out")
@@ -299,7 +299,7 @@ class _Walk:
 
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
-    """The footer before the closing mark; later additions would hide it."""
+    """The footer before the closing mark."""
     if size < 2 * len(MAGIC) + _FOOTER_SIZE:
         return None
     stream.seek(size - len(MAGIC) - _FOOTER_SIZE)

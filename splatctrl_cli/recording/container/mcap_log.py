@@ -1,7 +1,6 @@
 """An MCAP file's messages by its own records, and its index without a full read.
 
-Damage is skipped and counted. The `mcap` package allocates what records announce; its indexed reader raises on valid
-files without summary.
+Damage is skipped and counted. The `mcap` package allocates what records announce, and needs a summary.
 """
 
 import struct
@@ -118,7 +117,7 @@ class McapLog(RawLog):
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.
 
-        Checksums are compared until one full pass finds them right.
+        Checksums are compared until one full pass is right.
         """
         self._budget = Budget(self._file.size)
         state, count = self._forget_changed(), damage.count

@@ -54,7 +54,7 @@ class Part(NamedTuple):
 
 @dataclass(kw_only=True)
 class Damage:
-    """A record of what a pass over a log could not read.
+    """Losses of a pass over a log.
 
     remarks: counts of what is no damage, such as unsupported forms. num_invalid: depth pixels that measure nothing.
     """

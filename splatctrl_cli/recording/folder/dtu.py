@@ -61,8 +61,8 @@ def read_dtu(
     """Read scan `scan` (default: the only one) of a DTU folder; `masks` has NNN.png.
 
     `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or a
-    quarter). Depth of another size is sampled, not blended; a smaller one sets only the pixels it was made for. Drops
-    views without depth. Raises InputError naming the file.
+    quarter). Depth of another size is sampled, not blended. Drops views without depth. Raises InputError naming the
+    file.
     """
     scan, folder = choose_scan(root, scan_folders(root), scan)
 
@@ -109,7 +109,7 @@ def read_views(
     shrink: Shrink,
     keeps_without_depth: bool,
 ) -> DtuScan:
-    """Read views by number, one at a time in memory before `shrink`.
+    """Read views by number, one at a time before `shrink`.
 
     A view without a depth file has depth 0 if `keeps_without_depth`, else it is left out. camera: intrinsics and
     T_world_camera by number and (width, height).
@@ -274,8 +274,7 @@ def fit_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     """Fit K to an image of `size` (width, height), whichever common size it is for.
 
     Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves it to (u + 0.5) scale -
-    0.5, as in `shrink_view`. MVSNet's cameras for 640x512, and for a quarter, are multiples of those for 1600x1200
-    (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders agree.
+    0.5, as in `shrink_view`. MVSNet's cameras for 640x512, and for a quarter, are multiples of those for 1600x1200.
     """
     width, height = size
     ratio = width / RAW[0]

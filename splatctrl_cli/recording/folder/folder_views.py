@@ -62,8 +62,7 @@ class View:
 def length_unit(median: float, apart: float) -> float:
     """Metres per length of a recording with this median depth and camera distance.
 
-    1 unless depth is too large for metres and the cameras have the same unit. If depth alone is too large, its scale
-    is wrong.
+    1 unless depth is too large for metres and the cameras have the same unit.
     """
     if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
         return 1.0

@@ -81,7 +81,7 @@ def read_idr(
 def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
     """Write views as one scan folder, with their masks; returns it.
 
-    The object's sphere is centred nearest to the cameras' axes; its radius is half the nearest camera's distance.
+    The object's sphere is nearest to the cameras' axes, with half the nearest camera's distance.
     """
     folder = root / scan
     (folder / "image").mkdir(parents=True)
@@ -208,9 +208,8 @@ class DtuSource:
     """A scan's views by number (view 0 is ``rect_001``), which is also the stamp.
 
     The scene is static, without a clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``,
-    unless a `protocol` assigns or drops them. masks, depths: folders of what the layout lacks. downscale: shrink
-    factor; None: to the protocol's size, if that is a whole factor. layout: ``MVSNet`` or ``IDR``; split: training
-    and held-out views.
+    unless a `protocol` assigns or drops them. masks, depths: folders, if elsewhere. downscale: shrink factor; None:
+    to the protocol's size, if a whole factor. layout: ``MVSNet`` or ``IDR``; split: training and held-out views.
     """
 
     joint_names: tuple[str, ...] = ()

@@ -194,7 +194,7 @@ def number_key(name: str) -> tuple[list[int], str]:
 
 
 def pose_or_none(matrix: Float64) -> Float64 | None:
-    """The matrix, None if not finite: how trackers write a loss."""
+    """The matrix, None if not finite (lost)."""
     return matrix if np.isfinite(matrix).all() else None
 
 

@@ -138,9 +138,8 @@ def read_numbers(path: Path) -> list[float]:
 
 
 def trajectory(poses: Mapping[str, Float64 | None]) -> Callable[[int], Float64 | None]:
-    """A camera's T_world_camera (4, 4) at any stamp [ns], from poses by stamp [s, as text]; None where unknown.
-
-    Poses are interpolated like tf, never across None.
+    """A camera's T_world_camera (4, 4) at any stamp [ns], interpolated from poses by stamp [s, as text]; None where
+    unknown.
     """
     tree, known, lost = TfTree(), list[int](), list[int]()
     for text, T in poses.items():

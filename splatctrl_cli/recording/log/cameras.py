@@ -42,7 +42,7 @@ _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
     """Topics whose first image is color, depth, other or ``unlike``.
 
-    ``unlike``: the name contradicts the image, such as 16-bit infrared or depth in a JPEG.
+    ``unlike``: the name contradicts the image, such as 16-bit infrared.
     """
     topics = [(t, t.first_image) for t in survey.select_types(IMAGE, COMPRESSED_IMAGE)]
     return [t for t, image in topics if image is not None and kind == ("unlike" if _unlike(t) else image.kind)]
@@ -60,8 +60,7 @@ def _unlike(topic: TopicSurvey) -> str:
 def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraTopics, ...]:
     """Pair colour and depth topics that share a namespace, deepest first, into named cameras.
 
-    /cam0/color/image_raw and /cam0/depth/image_raw make `cam0`. Prefers registered depth, colour to grey, rectified
-    to raw, uncompressed images.
+    Prefers registered depth, colour to grey, rectified to raw, uncompressed images.
     """
     colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
     depths = image_topics(survey, "depth")
@@ -120,8 +119,7 @@ def _family(name: str) -> tuple[str, ...]:
 def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | None = None) -> str:
     """The CameraInfo topic of an image topic, "" if none.
 
-    It shares more path than the namespace, is in the image's or namespace's folder, or has the image's frame and
-    size.
+    It shares more path than the namespace, is in either's folder, or has the image's frame and size.
     """
     folder, its = _parts(image.topic.name)[:-1], image.first_image
     view = ("", 0, 0) if its is None else (its.frame_id, its.width, its.height)
@@ -316,8 +314,8 @@ def join_pose_topics(
     """Add pose topics to a survey's tf tree; those used unasked are noted.
 
     Options name topics by camera. Otherwise an odometry is used if tf misses its child, a camera's frame, or if its
-    parent is the requested world frame. only_first: one pose, enough to see connections. Raises InputError if a topic
-    cannot place its camera, or several odometries could.
+    parent is the world frame. only_first: one pose, enough to see connections. Raises InputError if a topic cannot
+    place its camera, or several odometries could.
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}

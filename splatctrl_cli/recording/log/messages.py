@@ -235,7 +235,7 @@ def _decode(packed: _Packed, *, color: bool) -> NDArray[Any]:
 def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
     """Convert `raw_pixels` to colour (H, W, 3) uint8; Bayer mosaics are interpolated linearly.
 
-    Of 16 bits, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp), whatever the sensor's depth.
+    Of 16 bits, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp).
     """
     code = COLOR_CONVERSIONS[encoding]
     converted = pixels if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)
@@ -324,10 +324,7 @@ def convert_floats(depth: NDArray[Any], scale: float) -> Float32:
 
 
 def metres(counts: NDArray[Any], scale: float) -> Float32:
-    """Convert depth counts (H, W) to float32 [m], 0 at `NO_RETURN`.
-
-    The only such formula: re-reading gives the same bits.
-    """
+    """Convert depth counts (H, W) to float32 [m], 0 at `NO_RETURN`."""
     depth = counts.astype(np.float32)
     depth[counts == NO_RETURN] = 0.0
     depth *= np.float32(scale)
@@ -457,8 +454,7 @@ _CAMERAS = frozenset({"camera", "cam"})  # words of parts that name a device, wh
 def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
     """The kind word in a topic's last part that has one; "" if none.
 
-    In ``a_to_b`` the first counts: ``aligned_depth_to_infra1`` is depth. is_device: parts such as ``depth_camera``
-    count too.
+    In ``a_to_b`` the first counts. is_device: parts such as ``depth_camera`` count too.
     """
     for part in reversed(parts):
         words = re.findall("[a-z]+", part.lower())

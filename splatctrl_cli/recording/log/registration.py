@@ -106,8 +106,8 @@ class TfTree:
         """Add T_parent_child at a time; one that `holds` is valid always while alone.
 
         A frame keeps its first parent; edges that would close a loop are left out. Differing static transforms are
-        valid from their stamps on, the first also before; of one stamp the last. All is noted. Raises ValueError if
-        not rigid (a zero quaternion, NaN).
+        valid from their stamps on, the first also before. All is noted. Raises ValueError if not rigid (a zero
+        quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
         refuse_if(
@@ -331,7 +331,7 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 def correct_lens(lens: Intrinsics, model: str, coefficients: Float64, valid: Bool | None = None) -> Lens:
     """A lens's corrections: none for a pinhole, whose mask is `valid`. Raises InputError for an impossible lens.
 
-    It keeps focal lengths; an equidistant lens's are shortened to show all on the image's axes, up to `WIDEST_RAY`.
+    It keeps focal lengths; an equidistant lens's are shortened, up to `WIDEST_RAY`.
     """
     if not is_distorted(model, coefficients):
         return Lens(intrinsics=lens, valid=valid)

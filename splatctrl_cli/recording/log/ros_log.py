@@ -1,7 +1,7 @@
 """A ROS log as records: paired images, poses from tf, joints in one order.
 
 The first pass skips images, as transforms may follow them, and plans every frame. The second takes planned images in
-plan order, as few at once as the log's order allows. For `ingest`, files that a capture can keep stay undecoded.
+plan order. For `ingest`, files that a capture can keep stay undecoded.
 """
 
 import tempfile

@@ -38,8 +38,8 @@ def joint_records(
 ) -> tuple[tuple[str, ...], StateColumns]:
     """Joint names and states by stamp; both empty if the log has none.
 
-    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states that do not name the
-    same joints as its fullest are left out with a note.
+    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states of other joints than its
+    fullest are left out with a note.
     """
     topics = state_topics(survey, options, loss)
     if not topics:
@@ -96,7 +96,7 @@ def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
 
 
 def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
-    """States with the most joints; others (a gripper that publishes alone) are noted."""
+    """States with the most joints; others are noted."""
     chosen = max(_tracks([topic]), key=lambda track: (len(track.names), len(track), sorted(track.names)))
     others = topic.joints.num - len(chosen)
     if others:

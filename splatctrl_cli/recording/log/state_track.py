@@ -31,7 +31,7 @@ def smoothed_seconds(stamp_ns: Stamps) -> Float64:
     """Times (T,) [s] since the first stamp, without the sender's jitter.
 
     A line is fitted through neighbouring stamps over their numbers, lost ones counted. Stamps without a fixed rate
-    (residuals above a quarter period), or that would not rise, are unchanged.
+    (residuals above a quarter period) are unchanged.
     """
     seconds = np.asarray((stamp_ns - stamp_ns[0]) * 1e-9, dtype=np.float64)
     if len(seconds) < 3:
@@ -127,8 +127,8 @@ class RawTrack(StateColumns):
 def clean_states(raw: RawTrack, loss: LossReport) -> StateColumns:
     """Sort states by stamp, each stamp once, each with velocities; changes are noted in `loss`.
 
-    States with a position that is not finite are damage, and left out. Velocities that are absent, NaN, or always
-    zero for a moving joint become position differences.
+    States with a position that is not finite are damage, and left out. Absent or NaN velocities, and zeros of a
+    moving joint, become position differences.
     """
     ordered = unwrap(_sort(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)

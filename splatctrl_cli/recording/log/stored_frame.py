@@ -177,7 +177,7 @@ class StoredFrame:
 
     read_color, read_depth: the image, or UndecodableMessageError. color_file: JPEG or PNG bytes of exactly the color.
     depth_file: 16-bit PNG whose ``counts * float32(depth_unit)`` is exactly the depth. depth_unit: [m] of which every
-    depth is a uint16 multiple. Each is None if there is none. origin: the source in words. places: of the messages.
+    depth is a uint16 multiple. Each may be None. origin: the source in words. places: of the messages.
     """
 
     stamp_ns: int

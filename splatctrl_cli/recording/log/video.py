@@ -2,7 +2,7 @@
 
 Reads H.264 and H.265 of foxglove.CompressedVideo (Annex B, an image per message; docs.foxglove.dev, CompressedVideo)
 and ffmpeg_image_transport's FFMPEGPacket. Images without a prior key frame, or after a missing image, are dropped and
-counted until the next key frame: FFmpeg shows them with wrong blocks.
+counted until the next key frame.
 """
 
 import re
