@@ -103,9 +103,9 @@ class Adjustment:
             (scale, bias), (scale_0, bias_0) = estimate.depth_of(camera), start.depth_of(camera)
             moved = twist_between(start.corrections[camera], estimate.corrections[camera])
             values = np.concatenate([moved, [scale - scale_0, bias - bias_0]])
-            held = columns < 0
-            sigma[columns[~held]] = np.repeat(fixed.CALIBRATION_PRIOR[:3], (3, 3, DEPTH))[~held]
-            offset[columns[~held]] = values[~held]
+            is_fixed = columns < 0
+            sigma[columns[~is_fixed]] = np.repeat(fixed.CALIBRATION_PRIOR[:3], (3, 3, DEPTH))[~is_fixed]
+            offset[columns[~is_fixed]] = values[~is_fixed]
         if self.unknowns.has_clock:
             sigma[-1], offset[-1] = fixed.CALIBRATION_PRIOR[3], estimate.clock - start.clock
         return 1 / np.square(sigma), offset
@@ -206,11 +206,11 @@ class Adjustment:
         (scale_a, bias_a), (scale_b, bias_b) = estimate.depth_of(a.camera), estimate.depth_of(b.camera)
         points = a.points * (scale_a + bias_a / a.points[:, 2])[:, None]
         T = invert_transform(T_b) @ T_a
-        there = transform_points(T, points)
-        lands, recorded, normals = landed(there, b)
+        projected = transform_points(T, points)
+        lands, recorded, normals = landed(projected, b)
         surface = recorded * (scale_b + bias_b / np.where(lands, recorded[:, 2], 1.0))[:, None]
-        behind, turned = there[:, 2] - surface[:, 2], a.point_normals @ T[:3, :3].T
-        lands &= (behind < 3 * reach) & (np.einsum("ki,ki->k", turned, there) < 0)  # else b cannot see them
+        behind, turned = projected[:, 2] - surface[:, 2], a.point_normals @ T[:3, :3].T
+        lands &= (behind < 3 * reach) & (np.einsum("ki,ki->k", turned, projected) < 0)  # else b cannot see them
         lands &= np.any(normals != 0, axis=1)
         num_laid = int(lands.sum())
         lands &= (behind > -3 * reach) & (np.einsum("ki,ki->k", turned, normals) > fixed.CALIBRATION_ALIKE)
@@ -240,7 +240,7 @@ class Adjustment:
                 ]
             ),
             columns=np.concatenate([self.unknowns.columns(a.camera), self.unknowns.columns(b.camera), self._clock]),
-            clusters=_cells(transform_points(T_b, there[which]), self.evidence.scale),
+            clusters=_cells(transform_points(T_b, projected[which]), self.evidence.scale),
         )
 
     def _robot(self, frame: RgbdFrame, estimate: Estimate, reach: float) -> Rows | None:
@@ -248,29 +248,29 @@ class Adjustment:
         scale, bias = estimate.depth_of(frame.camera)
         depth = np.where(frame.depth > 0, scale * frame.depth + bias, 0.0).astype(np.float32)
         T, twist = self._find_pose(frame, estimate)
-        found = self.evidence.arm.rows(
+        rows = self.evidence.arm.rows(
             depth, frame.intrinsics, T, twist, frame.stamp_ns - round(estimate.clock * 1e9), reach
         )
-        if found is None:
+        if rows is None:
             return None
-        step = max(1, len(found.residual) // fixed.CALIBRATION_ARM_POINTS)
+        step = max(1, len(rows.residual) // fixed.CALIBRATION_ARM_POINTS)
         some = slice(None, None, step)
-        z = found.points[some, 2]
-        slope = np.einsum("ki,ki->k", found.normals[some], found.points[some]) / z
+        z = rows.points[some, 2]
+        slope = np.einsum("ki,ki->k", rows.normals[some], rows.points[some]) / z
         jacobian = np.zeros((len(z), 2 * OF_CAMERA + 1))
-        jacobian[:, :POSE] = found.jacobian[some]
+        jacobian[:, :POSE] = rows.jacobian[some]
         jacobian[:, POSE], jacobian[:, POSE + 1] = slope * (z - bias) / scale, slope
-        jacobian[:, -1] = found.clock[some]
+        jacobian[:, -1] = rows.clock[some]
         return Rows(
             between=(frame.camera, ROBOT),
             alike=frame.camera,
-            num_laid=found.num_seen // step,
-            residual=found.residual[some],
+            num_laid=rows.num_seen // step,
+            residual=rows.residual[some],
             sigma=np.hypot(slope * depth_sigma(z), fixed.CALIBRATION_NOISE[0]),
             jacobian=jacobian,
             columns=np.concatenate([self.unknowns.columns(frame.camera), np.full(OF_CAMERA, -1), self._clock]),
-            clusters=found.links[some] * int(np.prod(fixed.CALIBRATION_TILES)) + found.tiles[some],
-            num_hidden=found.num_hidden // step,
+            clusters=rows.links[some] * int(np.prod(fixed.CALIBRATION_TILES)) + rows.tiles[some],
+            num_hidden=rows.num_hidden // step,
         )
 
 

@@ -122,8 +122,8 @@ def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
                 if i in middles]  # fmt: skip
         if len(seen) < FEWEST_MARKERS:
             continue
-        there = np.array([middle[:2] for middle, _ in seen]) - board.square
-        H, used = cv2.findHomography(there, np.array([pixel for _, pixel in seen]), cv2.RANSAC, 3.0)
+        positions = np.array([middle[:2] for middle, _ in seen]) - board.square
+        H, used = cv2.findHomography(positions, np.array([pixel for _, pixel in seen]), cv2.RANSAC, 3.0)
         if H is None or 2 * int(np.sum(used)) < len(seen):
             continue
         pixels = cv2.perspectiveTransform(board.points[None, :, :2], H)[0]

@@ -34,8 +34,8 @@ def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[s
     robot may be off.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
-    found = {camera: _correct_camera(arm, its) for camera, its in by_camera.items()}
-    rows = {camera: row for camera, row in found.items() if row is not None}
+    displacements = {camera: _correct_camera(arm, its) for camera, its in by_camera.items()}
+    rows = {camera: row for camera, row in displacements.items() if row is not None}
     if any(is_displaced(row) and not is_corrected(row) for row in rows.values()):
         return {
             camera: {name: row[name] for name in ("distance_mm", "sigma_mm", "num_pixels")}
@@ -64,19 +64,19 @@ def _move(frame: RgbdFrame, T_recorded_camera: Float64) -> RgbdFrame:
 
 
 def _correct_camera(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
-    found = displacement_of(arm, frames)
-    if found is None:
+    displacement = displacement_of(arm, frames)
+    if displacement is None:
         return None
-    row, T = found
+    row, T = displacement
     is_observed = arm.travel([f.stamp_ns for f in frames]) >= CALIBRATION_TRAVEL and not moving_cameras(frames)
     if not is_displaced(row) or not is_observed:
         return row
     left = row
     for _ in range(2):
-        found = displacement_of(arm, [_move(frame, T) for frame in frames])
-        if found is None:
+        displacement = displacement_of(arm, [_move(frame, T) for frame in frames])
+        if displacement is None:
             return row
-        left, T = found[0], T @ found[1]
+        left, T = displacement[0], T @ displacement[1]
     if left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED or not _sees_links_in_place(
         arm, [_move(frame, T) for frame in frames]
     ):
@@ -87,8 +87,10 @@ def _correct_camera(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | N
 def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
     """True if two links or more are clearly visible, each within half of `MISPLACED`."""
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
-    found = [rows for frame in shown if (rows := _rows(arm, frame, np.eye(4))) is not None]
-    links, residual = (np.concatenate([getattr(rows, name) for rows in found]) for name in ("links", "residual"))
+    rows_by_frame = [rows for frame in shown if (rows := _rows(arm, frame, np.eye(4))) is not None]
+    links, residual = (
+        np.concatenate([getattr(rows, name) for rows in rows_by_frame]) for name in ("links", "residual")
+    )
     by_link = [residual[links == link] for link in np.unique(links)]
     medians = [abs(np.median(each)) for each in by_link if len(each) >= DISPLACED_PIXELS]
     return len(medians) > 1 and max(medians) <= 0.5 * MISPLACED
@@ -106,21 +108,21 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, An
     """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     T, prior = np.eye(4), np.eye(POSE) / DISPLACED_PRIOR**2
-    found: list[ArmRows] = []
+    parts: list[ArmRows] = []
     information = prior
     for _ in range(DISPLACED_ROUNDS):
-        found = [rows for frame in shown if (rows := _rows(arm, frame, T)) is not None]
-        visible = sum(rows.num_seen - rows.num_hidden for rows in found)
+        parts = [rows for frame in shown if (rows := _rows(arm, frame, T)) is not None]
+        visible = sum(rows.num_seen - rows.num_hidden for rows in parts)
         if visible < DISPLACED_PIXELS:
             return None
         information, pull = prior.copy(), np.zeros(POSE)
-        for rows in found:
+        for rows in parts:
             sigma = depth_sigma(rows.points[:, 2])
             weight = 1.0 / (DISPLACED_ALIKE * sigma * np.maximum(sigma, 0.5 * np.abs(rows.residual)))
             information += rows.jacobian.T @ (weight[:, None] * rows.jacobian)
             pull += rows.jacobian.T @ (weight * rows.residual)
         T = T @ transform_of(np.asarray(np.linalg.solve(information, -pull)))
-    points = np.concatenate([rows.points for rows in found])
+    points = np.concatenate([rows.points for rows in parts])
     if len(points) < DISPLACED_SHARE * visible:
         return {"distance_mm": 1e3 * DISPLACED_WIDTH, "sigma_mm": 0.0, "num_pixels": len(points)}, T
     moved = points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]

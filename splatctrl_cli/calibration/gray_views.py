@@ -62,9 +62,9 @@ def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
 
 def scaled(T: Float64, factor: float) -> Float64:
     """A pose (4, 4) with scaled lengths."""
-    there = T.copy()
-    there[:3, 3] *= factor
-    return there
+    T_scaled = T.copy()
+    T_scaled[:3, 3] *= factor
+    return T_scaled
 
 
 def overlapping(
@@ -114,18 +114,18 @@ class Rows:
 def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
     """Rows of view a's solved points on view b, T (4, 4) apart."""
     number = np.flatnonzero(a.is_solved)
-    there, lands, surface, normals, distance = hit_surface(a, b, T, a.is_solved)
-    sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
+    points, lands, surface, normals, distance = hit_surface(a, b, T, a.is_solved)
+    sigma = np.hypot(depth_sigma(points[:, 2]), depth_sigma(a.depth.points[number, 2]))
     lands &= np.abs(distance) < width * sigma
-    number, there, normals, surface = number[lands], there[lands], normals[lands], surface[lands]
+    number, points, normals, surface = number[lands], points[lands], normals[lands], surface[lands]
     own, sigma, distance = a.depth.points[number], sigma[lands], distance[lands]
     weight = (1 - np.square(distance / (width * sigma))) / sigma
-    lens, z = b.depth.lens, there[:, 2]
-    exact = project(lens, there)
+    lens, z = b.depth.lens, points[:, 2]
+    exact = project(lens, points)
     u, v = np.round(exact).astype(np.int64).T
     depth = Rows(
         residuals=distance * weight,
-        by_twists=derive_by_twists(own, there, normals, T) * weight[:, None],
+        by_twists=derive_by_twists(own, points, normals, T) * weight[:, None],
         own=number,
         by_own=np.einsum("ki,ki->k", normals @ T[:3, :3], own) * weight,  # a farther point moves along its ray
         other=v * b.gray.shape[1] + u,
@@ -135,13 +135,13 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
         return depth
     difference, slope = _gray_differences(a, b, number, exact)
     along = slope * [lens.fx, lens.fy] / z[:, None]
-    gradient = np.column_stack([along, -np.einsum("ki,ki->k", along, there[:, :2]) / z])
+    gradient = np.column_stack([along, -np.einsum("ki,ki->k", along, points[:, :2]) / z])
     deviation = difference / fixed.REFINE_COLOR
     counts = np.abs(deviation) < fixed.REFINE_CUT
     weight = np.where(counts, 1 - np.square(deviation / fixed.REFINE_CUT), 0.0) / fixed.REFINE_COLOR
     return Rows(
         residuals=np.concatenate([depth.residuals, difference * weight]),
-        by_twists=np.vstack([depth.by_twists, derive_by_twists(own, there, gradient, T) * weight[:, None]]),
+        by_twists=np.vstack([depth.by_twists, derive_by_twists(own, points, gradient, T) * weight[:, None]]),
         own=np.tile(depth.own, 2),
         by_own=np.concatenate([depth.by_own, np.einsum("ki,ki->k", gradient @ T[:3, :3], own) * weight]),
         other=np.tile(depth.other, 2),
@@ -156,10 +156,10 @@ def hit_surface(
 
     Arrays are (K, 3) or (K,). A hit's surface faces like the point's own.
     """
-    there = transform_points(T, a.depth.points[which])
-    lands, surface, normals = landed(there, b.depth)
+    points = transform_points(T, a.depth.points[which])
+    lands, surface, normals = landed(points, b.depth)
     lands &= np.einsum("ki,ki->k", a.depth.point_normals[which] @ T[:3, :3].T, normals) > fixed.REFINE_ALIKE
-    return there, lands, surface, normals, np.asarray(np.einsum("ki,ki->k", there - surface, normals))
+    return points, lands, surface, normals, np.asarray(np.einsum("ki,ki->k", points - surface, normals))
 
 
 def misfits_of(a: GrayView, b: GrayView, T: Float64) -> tuple[Float64, Index]:
@@ -168,16 +168,16 @@ def misfits_of(a: GrayView, b: GrayView, T: Float64) -> tuple[Float64, Index]:
     T (4, 4) apart. Differences are cut, and nan without a common surface.
     """
     number = np.flatnonzero(~a.is_solved)
-    there, lands, _, _, distance = hit_surface(a, b, T, ~a.is_solved)
-    sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
+    points, lands, _, _, distance = hit_surface(a, b, T, ~a.is_solved)
+    sigma = np.hypot(depth_sigma(points[:, 2]), depth_sigma(a.depth.points[number, 2]))
     widest = fixed.REFINE_WIDTHS[-1]
-    found = np.full((2, len(number)), np.nan)
-    found[0, lands] = np.minimum(np.square(distance / sigma), widest**2)[lands]
+    misfits = np.full((2, len(number)), np.nan)
+    misfits[0, lands] = np.minimum(np.square(distance / sigma), widest**2)[lands]
     lands &= np.abs(distance) < widest * sigma
     if lands.sum() >= fixed.REFINE_FEWEST:
-        difference, _ = _gray_differences(a, b, number[lands], project(b.depth.lens, there[lands]))
-        found[1, lands] = np.minimum(np.square(difference / fixed.REFINE_COLOR), fixed.REFINE_CUT**2)
-    return found, a.tiles[number]
+        difference, _ = _gray_differences(a, b, number[lands], project(b.depth.lens, points[lands]))
+        misfits[1, lands] = np.minimum(np.square(difference / fixed.REFINE_COLOR), fixed.REFINE_CUT**2)
+    return misfits, a.tiles[number]
 
 
 def _gray_differences(a: GrayView, b: GrayView, number: Index, pixels: Float64) -> tuple[Float64, Float64]:
@@ -253,11 +253,11 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
     views = [gray_view(frame, scale) for frame in frames]
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     colors = [_small(frame, view.gray.shape[0]) for frame, view in zip(frames, views, strict=True)]
-    found: list[tuple[int, int, int, float, float]] = []
+    rows: list[tuple[int, int, int, float, float]] = []
     for i, j in overlapping(views, poses, np.ones(len(frames), np.bool_), is_free):
-        there, lands, _, _, distance = hit_surface(views[i], views[j], invert_transform(poses[j]) @ poses[i])
-        lands &= np.abs(distance) < fixed.EXPOSURE_NEAR * depth_sigma(there[:, 2])
-        u, v = np.round(project(views[j].depth.lens, there[lands])).astype(np.int64).T
+        points, lands, _, _, distance = hit_surface(views[i], views[j], invert_transform(poses[j]) @ poses[i])
+        lands &= np.abs(distance) < fixed.EXPOSURE_NEAR * depth_sigma(points[:, 2])
+        u, v = np.round(project(views[j].depth.lens, points[lands])).astype(np.int64).T
         own_u, own_v = np.round(project(views[i].depth.lens, views[i].depth.points[lands])).astype(np.int64).T
         own, other = colors[i][own_v, own_u], colors[j][v, u]
         low, high = fixed.EXPOSURE_LEVELS
@@ -272,8 +272,8 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
                 if len(some) >= fixed.REFINE_FEWEST:
                     ratio = float(np.median(some))
                     spread = 1.4826 * float(np.median(np.abs(some - ratio)))
-                    found.append((channel, a, b, ratio, 1 / (fixed.EXPOSURE_ERROR**2 + spread**2 / len(some))))
-    numbers, values = np.array([row[:3] for row in found], np.int64), np.array([row[3:] for row in found])
+                    rows.append((channel, a, b, ratio, 1 / (fixed.EXPOSURE_ERROR**2 + spread**2 / len(some))))
+    numbers, values = np.array([row[:3] for row in rows], np.int64), np.array([row[3:] for row in rows])
     numbers, values = numbers.reshape(-1, 3), values.reshape(-1, 2)
     return BandRatios(
         num_images=len(frames),

@@ -204,12 +204,12 @@ def refined_poses(
     """
     views = [gray_view(frame, scale) for frame in frames]
     recorded = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
-    wanted = np.ones(len(views), np.bool_) if free is None else free
+    is_movable = np.ones(len(views), np.bool_) if free is None else free
     is_held, stays = np.zeros((2, len(views)), np.bool_)
     while True:
-        pairs = overlapping(views, recorded, ~is_held, wanted & ~is_held)
-        is_held |= wanted & (np.bincount(np.ravel(pairs).astype(np.int64), minlength=len(views)) == 0)
-        is_free = wanted & ~is_held & ~stays
+        pairs = overlapping(views, recorded, ~is_held, is_movable & ~is_held)
+        is_held |= is_movable & (np.bincount(np.ravel(pairs).astype(np.int64), minlength=len(views)) == 0)
+        is_free = is_movable & ~is_held & ~stays
         poses = _solved(views, recorded, pairs, is_free)
         twists = np.array([twist_between(a, b) for a, b in zip(recorded, poses, strict=True)]).reshape(-1, POSE)
         moved, turned = np.linalg.norm(twists[:, 3:], axis=1), np.degrees(np.linalg.norm(twists[:, :3], axis=1))
@@ -253,15 +253,15 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
     `BEND_GAIN` over poses alone. Cameras need `BEND_VIEWS` views, and halves that agree by `BEND_ALIKE`.
     """
     views = [replace(f, T_world_camera=T) for f, T in zip(frames, refined.T_world_camera, strict=True)]
-    views = [view for view, held in zip(views, refined.is_held, strict=True) if not held]
+    views = [view for view, is_held in zip(views, refined.is_held, strict=True) if not is_held]
     names = [view.camera for view in views]
     rank = np.array([names[:k].count(name) for k, name in enumerate(names)])
     chosen = [name for name in dict.fromkeys(names) if names.count(name) >= fixed.BEND_VIEWS]
     if not chosen or refined.after < fixed.BEND_FROM * fixed.SCALE_DEPTH * scale:
         return FoundBends()
     halves = [[view for view, of_half in zip(views, rank % 2 == k, strict=True) if of_half] for k in (0, 1)]
-    told = [_joint(half, chosen, scale) for half in halves]
-    both = {name: (told[0][name], told[1][name]) for name in chosen}
+    bends = [_joint(half, chosen, scale) for half in halves]
+    both = {name: (bends[0][name], bends[1][name]) for name in chosen}
     alike = {
         name: float(np.vdot(a, b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
         for name, (a, b) in both.items()
@@ -271,7 +271,7 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
     if not chosen:
         return FoundBends(unlike=unlike)
     gains = []
-    for half, grids in zip(halves, reversed(told), strict=True):
+    for half, grids in zip(halves, reversed(bends), strict=True):
         without, with_ = (
             refined_poses(part, scale, must_gain=False).after
             for part in (half, freed(half, {name: grids[name] for name in chosen}))
@@ -381,11 +381,11 @@ def _gain(before: Float64, after: Float64, tiles: Float64) -> tuple[float, float
 
 
 def _distance(views: Sequence[GrayView], poses: Sequence[Float64], pairs: Sequence[tuple[int, int]]) -> float:
-    found = [np.zeros(0)]
+    distances = [np.zeros(0)]
     for i, j in pairs:
         _, lands, _, _, distance = hit_surface(
             views[i], views[j], invert_transform(poses[j]) @ poses[i], ~views[i].is_solved
         )
-        found.append(np.minimum(np.abs(distance[lands]), fixed.REFINE_FARTHEST[0]))
-    every = np.concatenate(found)
+        distances.append(np.minimum(np.abs(distance[lands]), fixed.REFINE_FARTHEST[0]))
+    every = np.concatenate(distances)
     return float(np.median(every)) if len(every) else 0.0

@@ -83,9 +83,9 @@ def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution
     solution = _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
     unknowns = adjustment.unknowns
     if unknowns.has_clock and solution.certainty.sigma_clock > fixed.CALIBRATION_CLOCK:
-        held = replace(solution.estimate, clock=start.clock)
+        fixed_clock = replace(solution.estimate, clock=start.clock)
         still = Adjustment(adjustment.evidence, replace(unknowns, has_clock=False))
-        solution = _solution(still, still.solved(held, [solution.widths]))
+        solution = _solution(still, still.solved(fixed_clock, [solution.widths]))
     return _add_depths(solution)
 
 
@@ -182,10 +182,10 @@ def _add_depths(solution: Solution) -> Solution:
         [camera for camera in some if tried.adjustment.unknowns.columns(camera)[POSE + number] in free]
         for number, some in enumerate((unknowns.poses, unknowns.cameras))
     )
-    found = _free_depths(solution, replace(unknowns, scales=scales, biases=biases))
+    freed = _free_depths(solution, replace(unknowns, scales=scales, biases=biases))
     most_scale, most_bias = fixed.CALIBRATION_DEPTH_MOST
-    depths = map(found.estimate.depth_of, unknowns.cameras)
-    return solution if any(abs(scale - 1) > most_scale or abs(bias) > most_bias for scale, bias in depths) else found
+    depths = map(freed.estimate.depth_of, unknowns.cameras)
+    return solution if any(abs(scale - 1) > most_scale or abs(bias) > most_bias for scale, bias in depths) else freed
 
 
 def _narrow_depths(tried: Solution) -> tuple[Float64, Float64, list[int]]:
@@ -224,21 +224,21 @@ def _positive(covariance: Float64) -> Float64:
 def _find_noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
     """`CalibratedCamera.depth_noticed` by camera."""
     unknowns = tried.adjustment.unknowns
-    held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
-    found = {}
+    columns = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
+    noticed = {}
     for camera in unknowns.cameras:
         least = [np.inf, np.inf]
         for number, at in enumerate(unknowns.columns(camera)[POSE:].tolist()):
             covariance = tried.certainty.covariance
-            for other in held if at >= 0 else ():
+            for other in columns if at >= 0 else ():
                 if other != at:
                     covariance = _hold(np.zeros(unknowns.size), covariance, other)[1]
             if at >= 0:
                 per_metre = 1.0 if number else max(_far(tried, camera), 1e-3)
                 sure = fixed.CALIBRATION_DEPTH_SURE[1] * float(np.sqrt(max(covariance[at, at], 0.0)))
                 least[number] = max(sure, fixed.CALIBRATION_DEPTH_LEAST / per_metre)
-        found[camera] = (least[0], least[1])
-    return found
+        noticed[camera] = (least[0], least[1])
+    return noticed
 
 
 def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:

@@ -122,7 +122,7 @@ def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
     return lands & (surface[:, 2] > 0), surface, view.normals[v, u]
 
 
-def derive_by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Float64:
+def derive_by_twists(own: Float64, projected: Float64, gradient: Float64, T: Float64) -> Float64:
     """Derivatives (K, 12) of a value at `there` (K, 3) by two cameras' motions.
 
     The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. gradient (K, 3): by the point.
@@ -130,7 +130,7 @@ def derive_by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64
     R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
     """
     along = gradient @ T[:3, :3]
-    return np.hstack([np.cross(own, along), along, -np.cross(there, gradient), -gradient])
+    return np.hstack([np.cross(own, along), along, -np.cross(projected, gradient), -gradient])
 
 
 def overlap_rows(
@@ -140,8 +140,10 @@ def overlap_rows(
 
     points (K, 3): of the other view, at T (4, 4); which (K,): those that land (`landed`).
     """
-    there, normal = transform_points(T, points[which]), normals[which]
-    return np.einsum("ki,ki->k", there - surface[which], normal), derive_by_twists(points[which], there, normal, T)
+    projected, normal = transform_points(T, points[which]), normals[which]
+    return np.einsum("ki,ki->k", projected - surface[which], normal), derive_by_twists(
+        points[which], projected, normal, T
+    )
 
 
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:

@@ -120,23 +120,25 @@ class Baker:
         where = None if mask is None else _cells(mask, span)
         if where is not None and not where.any():
             return
-        made = self._make_channels(span, where)
+        channels = self._make_channels(span, where)
         for name in self.channels:
-            out[name][... if where is None else where] = made[name]
+            out[name][... if where is None else where] = channels[name]
 
     def _make_channels(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
         cells = None if where is None else np.flatnonzero(where)
-        made, entry = self._bake_on_processor(span, cells) if self.on_device is None else self._bake_on_device(span)
+        channels, entry = (
+            self._bake_on_processor(span, cells) if self.on_device is None else self._bake_on_device(span)
+        )
         if self.probability is not None:
             whole = np.zeros(span.shape_of_channel, np.float32)
-            whole[... if where is None else where] = made["sdf"]
-            made["probability"] = _pick(self.probability.baked(span, whole, threads=self.threads), cells)
+            whole[... if where is None else where] = channels["sdf"]
+            channels["probability"] = _pick(self.probability.baked(span, whole, threads=self.threads), cells)
         if entry is not None:
-            made["label"] = self.labels[self.spheres.source[entry]]
+            channels["label"] = self.labels[self.spheres.source[entry]]
         if "observed" in self.channels:
             observed = observed_planes(self._occupancy, self.layout, self._thresholds, span.first, span.last)
-            made["observed"] = _pick(observed, cells)
-        return made
+            channels["observed"] = _pick(observed, cells)
+        return channels
 
     def _bake_on_processor(self, span: GridSpan, cells: Index | None) -> _Made:
         hard, gradient, entry = self._hard(span, cells)
@@ -145,25 +147,30 @@ class Baker:
             self.counts[f"{name}_without_value"] += int(np.count_nonzero(np.isnan(distance)))
             self.counts[f"{name}_over_estimates"] += int(np.count_nonzero(distance > hard + RESOLUTION))
         sdf, gradient = self._choose(hard, gradient, kernels)
-        made: Planes = {"sdf": sdf, "hard": hard}
+        channels: Planes = {"sdf": sdf, "hard": hard}
         if gradient is not None:
-            made["gradient"] = gradient
+            channels["gradient"] = gradient
         if "bound" in self.channels:
-            made["bound"] = (hard.astype(np.float64) - self.bound_margin).astype(np.float32)
+            channels["bound"] = (hard.astype(np.float64) - self.bound_margin).astype(np.float32)
         for name, (distance, _) in kernels.items():
-            made[name] = np.where(np.isnan(distance), hard, distance)
-        return made, entry
+            channels[name] = np.where(np.isnan(distance), hard, distance)
+        return channels, entry
 
     def _bake_on_device(self, span: GridSpan) -> _Made:
         assert self.on_device is not None
-        wanted = {*self.channels, "entry"} if "label" in self.channels else set(self.channels)
-        found = self.on_device.bake(span, wanted, margin=self.bound_margin)
-        for name, (without_value, over_estimates) in found.counts.items():
+        names = {*self.channels, "entry"} if "label" in self.channels else set(self.channels)
+        answers = self.on_device.bake(span, names, margin=self.bound_margin)
+        for name, (without_value, over_estimates) in answers.counts.items():
             self.counts[f"{name}_without_value"] += without_value
             self.counts[f"{name}_over_estimates"] += over_estimates
-        channels = {"sdf": found.distance, "hard": found.hard, "gradient": found.gradient, "bound": found.bound}
-        made: Planes = {name: values for name, values in channels.items() if values is not None}
-        return {**made, **found.kernels}, found.entry
+        channels = {
+            "sdf": answers.distance,
+            "hard": answers.hard,
+            "gradient": answers.gradient,
+            "bound": answers.bound,
+        }
+        planes: Planes = {name: values for name, values in channels.items() if values is not None}
+        return {**planes, **answers.kernels}, answers.entry
 
     def _hard(self, span: GridSpan, cells: Index | None) -> tuple[Float32, Float32 | None, NDArray[np.int32] | None]:
         hard = np.zeros(span.shape_of_channel, np.float32)

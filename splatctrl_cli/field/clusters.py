@@ -191,17 +191,17 @@ def obstacle_spheres(
     """Splats and balls with one of `labels`. Raises as `field_splats` without such balls."""
     values = [int(label) for label in labels]
     is_chosen = np.isin(splats.labels, values)
-    kept = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)
-    if balls is None or not kept.any():
+    is_obstacle = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)
+    if balls is None or not is_obstacle.any():
         return ObstacleSpheres(splats=field_splats(splats, labels), index=np.flatnonzero(is_chosen))
     check_labels(splats)
-    count, chosen = int(kept.sum()), splats.select(is_chosen)
+    count, chosen = int(is_obstacle.sum()), splats.select(is_chosen)
     added = SplatSet(
-        centers=balls.centers[kept],
+        centers=balls.centers[is_obstacle],
         radii=np.full(count, balls.radius, np.float32),
         colors=np.full((count, 3), 0.5, np.float32),
         opacities=np.ones(count, np.float32),
-        labels=balls.labels[kept],
+        labels=balls.labels[is_obstacle],
         density=np.zeros(count, np.float32),
     )
     return ObstacleSpheres(
@@ -215,14 +215,14 @@ def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -
     Raises NotEvaluableError without any, InputError for an unknown label.
     """
     check_labels(splats)
-    kept = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
-    if not len(kept):
+    chosen = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
+    if not len(chosen):
         names = ", ".join(label.name.lower() for label in sorted(labels))
         raise NotEvaluableError(
             f"splats: none of {len(splats)} is labelled {names}",
             remedy="give a scene that has some; --include takes other labels",
         )
-    return kept
+    return chosen
 
 
 def check_labels(splats: SplatSet) -> None:

@@ -159,8 +159,8 @@ class SeField(LogSumExpField):
 
     def query_safe(self, points: Float64) -> tuple[Float64, Float64]:
         """Return what `SafeField` returns, in one walk."""
-        asked = shaped_points(points)
-        found = native.safe(
+        shaped = shaped_points(points)
+        answer = native.safe(
             self.spheres.clusters,
             self._offsets,
             self.radii,
@@ -169,12 +169,12 @@ class SeField(LogSumExpField):
             self.kernel.length,
             self.tolerance,
             self.spheres.anchor,
-            asked,
+            shaped,
             threads=self._threads,
         )
-        if found is None:
-            raise not_finite(asked)
-        return found
+        if answer is None:
+            raise not_finite(shaped)
+        return answer
 
     def terms(self) -> LogSumExp:
         log_size = self.weights.log_size
@@ -265,9 +265,9 @@ class OnDevice:
         """Distance and gradient, as in `DistanceField.query`."""
         if not len(points):
             return np.zeros(0), np.zeros((0, 3))
-        found = self._answer(points, "gradient")
-        assert found.gradient is not None
-        return found.distance.astype(np.float64), found.gradient.astype(np.float64)
+        answer = self._answer(points, "gradient")
+        assert answer.gradient is not None
+        return answer.distance.astype(np.float64), answer.gradient.astype(np.float64)
 
     def distance(self, points: Float64) -> Float64:
         return self._answer(points).distance.astype(np.float64) if len(points) else np.zeros(0)
@@ -276,12 +276,12 @@ class OnDevice:
         """Index (Q,) of the sphere that gives the exact distance at points (Q, 3) [m]."""
         if not len(points):
             return np.zeros(0, np.int64)
-        found = self._answer(points, "entry")
-        assert found.entry is not None
-        return self.spheres.source[found.entry]
+        answer = self._answer(points, "entry")
+        assert answer.entry is not None
+        return self.spheres.source[answer.entry]
 
-    def _answer(self, points: Float64, *wanted: str) -> Answers:
-        return self.field.query(checked_points(points), self.spheres.anchor, wanted)
+    def _answer(self, points: Float64, *names: str) -> Answers:
+        return self.field.query(checked_points(points), self.spheres.anchor, names)
 
     def close(self) -> None:
         self.field.close()

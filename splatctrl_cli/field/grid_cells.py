@@ -250,12 +250,12 @@ class Cubes(Columns):
         Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance minus
         half a cell. Inside: half a cell minus the distance to the nearest known centre.
         """
-        here = np.indices(is_unknown.shape, dtype=np.int32)
+        indices = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
-        away = (here - nearest).astype(np.float32)
+        away = (indices - nearest).astype(np.float32)
         lowest = np.maximum(distance - HALF_DIAGONAL, distance_transform_cdt(~is_unknown, "chessboard") - 0.5)
         distance, nearest = distance_transform_edt(is_unknown, return_indices=True)
-        np.copyto(away, nearest - here, where=is_unknown, casting="same_kind")
+        np.copyto(away, nearest - indices, where=is_unknown, casting="same_kind")
         lowest = np.where(is_unknown, 0.5 - distance, lowest)
         away /= np.sqrt(np.square(away).sum(axis=0))
         return cls(

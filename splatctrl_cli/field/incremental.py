@@ -86,9 +86,9 @@ def _changed(
     """Entries (16 C,) of each set missing in the other, to the bit."""
     rows = [_rows(s, b, with_weights=with_weights) for s, b in zip(splats, bakers, strict=True)]
     _, kinds = np.unique(np.concatenate(rows), return_inverse=True)
-    here, there = np.split(kinds, [len(rows[0])])
+    old_kinds, new_kinds = np.split(kinds, [len(rows[0])])
     laid_out = []
-    for own, other, baker in ((here, there, bakers[0]), (there, here, bakers[1])):
+    for own, other, baker in ((old_kinds, new_kinds, bakers[0]), (new_kinds, old_kinds, bakers[1])):
         changed = np.zeros(len(baker.spheres.source), np.uint8)
         changed[np.flatnonzero(baker.spheres.is_point)] = ~np.isin(own, other)
         laid_out.append(changed)

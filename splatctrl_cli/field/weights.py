@@ -70,14 +70,14 @@ def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
     bounds = np.searchsorted(which.ravel()[order], np.arange(len(blocks) + 1))
     members = {(x, y, z): order[bounds[b] : bounds[b + 1]] for b, (x, y, z) in enumerate(blocks.tolist())}
     steps = list(product((-1, 0, 1), repeat=3))
-    found = []
+    entries = []
     for (x, y, z), own in members.items():
         around = [members.get((x + i, y + j, z + k)) for i, j, k in steps]
         near = np.concatenate([some for some in around if some is not None])
         first = inner * np.array([x, y, z]) - reach
         local = cells[near] - first
-        found.append((first, near[((local >= -1) & (local < NODES)).all(axis=1)], own))
-    return found
+        entries.append((first, near[((local >= -1) & (local < NODES)).all(axis=1)], own))
+    return entries
 
 
 def _sampled_kernel(kernel: KernelValue, voxel: float, reach: int) -> Float64:

@@ -168,16 +168,16 @@ class EdgeRoom:
 def _parts(chain: Chain) -> tuple[Int64, Int64, Float64, Float64]:
     """Part (S,) of each sphere; body (K,), middle (K, 3), radius (K,) [m] of each part."""
     part = np.empty(len(chain.sphere_body), np.int64)
-    found: list[tuple[int, Float64, float]] = []
+    parts: list[tuple[int, Float64, float]] = []
     for body in np.unique(chain.sphere_body):
         for own in _split(chain.offset, np.flatnonzero(chain.sphere_body == body)):
             at = chain.offset[own]
             middle = (at.min(axis=0) + at.max(axis=0)) / 2
-            part[own] = len(found)
-            found.append((int(body), middle, float(np.linalg.norm(at - middle, axis=1).max())))
-    middles = np.array([middle for _, middle, _ in found]).reshape(-1, 3)
-    radii = np.array([radius for _, _, radius in found], np.float64)
-    return part, np.array([body for body, _, _ in found], np.int64), middles, radii
+            part[own] = len(parts)
+            parts.append((int(body), middle, float(np.linalg.norm(at - middle, axis=1).max())))
+    middles = np.array([middle for _, middle, _ in parts]).reshape(-1, 3)
+    radii = np.array([radius for _, _, radius in parts], np.float64)
+    return part, np.array([body for body, _, _ in parts], np.int64), middles, radii
 
 
 def _split(offset: Float64, spheres: Int64) -> list[Int64]:

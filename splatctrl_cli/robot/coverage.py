@@ -258,11 +258,11 @@ def _measure_link(
 
 
 def _measure_part(part: Solid, centers: Float64, radii: Float64) -> Deficit:
-    found = largest_deficit(part.surface.corners, centers, radii - part.slack)
-    proven = found.proven
+    deficit = largest_deficit(part.surface.corners, centers, radii - part.slack)
+    proven = deficit.proven
     if part.ball is not None:
         proven = min(proven, float(np.min(np.linalg.norm(centers - part.ball[0], axis=1) + part.ball[1] - radii)))
-    return Deficit(proven=proven, found=min(proven, found.found - part.slack), place=found.place)
+    return Deficit(proven=proven, found=min(proven, deficit.found - part.slack), place=deficit.place)
 
 
 def _proven(link: LinkCoverage) -> float:

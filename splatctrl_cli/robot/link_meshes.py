@@ -104,18 +104,18 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
             f"{urdf.path}: link '{link}': expected mesh, box, cylinder, capsule or sphere, got <{tag}>",
             remedy="write it as a cylinder and spheres",
         )
-    found: dict[str, list[Solid]] = {link: [] for link in urdf.collision_links}
+    by_link: dict[str, list[Solid]] = {link: [] for link in urdf.collision_links}
     refuse_if(
-        not found,
+        not by_link,
         f"{urdf.path}: expected collision geometry, got none",
         remedy="give a URDF with <collision> elements",
     )
     for shape in urdf.shapes:
-        found[shape.link].append(_primitive(shape))
+        by_link[shape.link].append(_primitive(shape))
     load = cache(load_mesh)
     for mesh in urdf.meshes:
-        found[mesh.link] += mesh_pieces(mesh, load(mesh_path(urdf.path, mesh, folders)))
-    return {link: tuple(solids) for link, solids in found.items()}
+        by_link[mesh.link] += mesh_pieces(mesh, load(mesh_path(urdf.path, mesh, folders)))
+    return {link: tuple(solids) for link, solids in by_link.items()}
 
 
 def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path:

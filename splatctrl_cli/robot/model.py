@@ -111,10 +111,16 @@ class RobotModel:
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
             spheres = spheres_of(file)
-        asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
-        sphere_set, left_out = match_links(asked, file, "sphere set" if asked is spheres else str(spheres))
+        unmatched = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
+        sphere_set, left_out = match_links(unmatched, file, "sphere set" if unmatched is spheres else str(spheres))
         return cls(
-            file, model, sphere_set, T, left_out, are_links_renamed=are_links_renamed(asked, file), packages=packages
+            file,
+            model,
+            sphere_set,
+            T,
+            left_out,
+            are_links_renamed=are_links_renamed(unmatched, file),
+            packages=packages,
         )
 
     def moved_by(self, names: Sequence[str]) -> "RobotModel":
@@ -127,16 +133,16 @@ class RobotModel:
             return self
         middle = dict(zip(self.joint_names, self.middle, strict=True))
         led = {joint.name for joint in self.urdf.joints if joint.mimic is not None and joint.mimic[0] in fingers}
-        held = self.urdf.add_followers({name: float(middle[name]) for name in fingers if name not in led})
+        locked = self.urdf.add_followers({name: float(middle[name]) for name in fingers if name not in led})
         return RobotModel(
             self.urdf,
-            _without(self._model, held, self.urdf.path),
+            _without(self._model, locked, self.urdf.path),
             self.sphere_set,
             self.T_world_base,
             self.left_out,
             are_links_renamed=self.are_links_renamed,
             packages=self._packages,
-            held={name: held[name] for name in self.joint_names if name in held},
+            held={name: locked[name] for name in self.joint_names if name in locked},
         )
 
     def carrying(self, boxes: Sequence[tuple[str, Box]]) -> "RobotModel":
@@ -170,9 +176,9 @@ class RobotModel:
             self._surface = RobotSurface.of(self.urdf, self.sphere_set, self._packages)
         return self._surface
 
-    def join_self_model(self, found: SelfModel) -> "RobotModel":
+    def join_self_model(self, self_model: SelfModel) -> "RobotModel":
         """Robot with a self-model's permanent parts; `surface_at` adds temporary ones."""
-        return self._change(_surface=self.surface.joined(found.pieces()), self_model=found, _surfaces={})
+        return self._change(_surface=self.surface.joined(self_model.pieces()), self_model=self_model, _surfaces={})
 
     @property
     def changes(self) -> list[int]:
@@ -294,9 +300,9 @@ class RobotModel:
         return self._framed(q, frame)[1]
 
     def _framed(self, q: Float64, frame: str) -> tuple[Float64, Float64]:
-        there = self._model.frames[self._frame(frame)]
+        frame_entry = self._model.frames[self._frame(frame)]
         return self.chain.frame(
-            self._check(q), there.parentJoint, np.ascontiguousarray(there.placement.homogeneous[:3])
+            self._check(q), frame_entry.parentJoint, np.ascontiguousarray(frame_entry.placement.homogeneous[:3])
         )
 
     def lever_arms(self) -> Float64:
@@ -395,8 +401,8 @@ class RobotModel:
         return np.asarray(np.max([np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures], axis=0) > 1e-9)
 
     def _frame(self, frame: str) -> int:
-        said, remedy = f"{self.urdf.path}: no frame '{frame}'", f"frames there: {', '.join(self.urdf.links)}"
-        return require(self._frames.get(frame), said, remedy=remedy)
+        what, remedy = f"{self.urdf.path}: no frame '{frame}'", f"frames there: {', '.join(self.urdf.links)}"
+        return require(self._frames.get(frame), what, remedy=remedy)
 
 
 def _without(model: pinocchio.Model, locked: dict[str, float], path: Path) -> pinocchio.Model:

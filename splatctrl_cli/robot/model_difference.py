@@ -24,8 +24,8 @@ def model_difference(one: UrdfFile, other: UrdfFile) -> str:
     for name in sorted(joints[0]):
         limits = [_limits(model, name) for model in models]
         if np.abs(limits[0] - limits[1]).max(initial=0.0) > LIMIT:
-            said = [", ".join(f"{value:g}" for value in values) for values in limits]
-            return f"joint {name}: lower, upper and fastest are {said[0]} in {one.path}, {said[1]} in {other.path}"
+            texts = [", ".join(f"{value:g}" for value in values) for values in limits]
+            return f"joint {name}: lower, upper and fastest are {texts[0]} in {one.path}, {texts[1]} in {other.path}"
     links = [link for link in one.links if link in other.links]
     if not links:
         return f"{one.path} and {other.path} have no link in common"

@@ -104,8 +104,8 @@ def learn(
             configurations = _configurations(placed[:, number], FINE * STEP)
         used = [(view, int(k)) for view, k in zip(views, configurations, strict=True) if k >= 0]
         is_enough = configurations.max(initial=-1) + 1 >= NUM_CONFIGURATIONS
-        found = _grow_link(surface, number, boxes[number], used, reach) if is_enough else []
-        if parts := [part for part in found if len(part.triangles) or not is_fine]:
+        new_parts = _grow_link(surface, number, boxes[number], used, reach) if is_enough else []
+        if parts := [part for part in new_parts if len(part.triangles) or not is_fine]:
             learned += parts
         elif is_fine:
             unknown[link] = f"moves too little ({num} of {NUM_CONFIGURATIONS} configurations)"
@@ -174,10 +174,10 @@ def _views(
 def _grow_link(
     surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
 ) -> list[LearnedLink]:
-    found = _learn_link(surface, number, box, used, reach)
-    if 2 * reach <= MOST_REACH and any(part.outside_most > reach - VOXEL for part in found):
+    parts = _learn_link(surface, number, box, used, reach)
+    if 2 * reach <= MOST_REACH and any(part.outside_most > reach - VOXEL for part in parts):
         return _grow_link(surface, number, box, used, 2 * reach)
-    return found
+    return parts
 
 
 def _learn_link(
@@ -197,7 +197,7 @@ def _learn_link(
     stamps, poses = np.array([v.stamp_ns for v in in_order]), np.array([view.T_world_link for view in in_order])
     intervals = find_intervals(fused, mask, gap, stamps)
     owner = choose_intervals(fused, mask, gap, intervals)
-    found = []
+    parts = []
     for index, interval in enumerate(intervals):
         run = slice(interval.first, interval.last + 1)
         distance, seen, free = fused.within(run)
@@ -219,7 +219,7 @@ def _learn_link(
             place = cells[is_part][heights.argmax()]
             known = np.argmax(np.cumsum(seen[:, is_part], axis=0) >= NUM_CONFIGURATIONS, axis=0)
             since = 1e-9 * float(np.median(stamps[run][known]) - stamps.min())
-        found.append(
+        parts.append(
             LearnedLink(
                 link=surface.links[number],
                 origin=origin,
@@ -238,7 +238,7 @@ def _learn_link(
                 first_ns=int(stamps.min()),
             )
         )
-    return found
+    return parts
 
 
 def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: int) -> Fused:
@@ -268,12 +268,12 @@ def _stays_in_world(
     places, votes = _move(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:
         for m in spread(range(len(poses)), MOST_ASKED):
-            asked = np.flatnonzero(seen[m] & (np.linalg.norm(places[m] - places[k], axis=1) >= AWAY))
-            points = transform_points(view.T_camera_world, places[m, asked])
-            asked, v, u, before = _landing(view, points, asked)
+            moved = np.flatnonzero(seen[m] & (np.linalg.norm(places[m] - places[k], axis=1) >= AWAY))
+            points = transform_points(view.T_camera_world, places[m, moved])
+            moved, v, u, before = _landing(view, points, moved)
             is_unexplained = view.links[v // view.stride, u // view.stride] == UNEXPLAINED
             is_surface = is_unexplained & (np.abs(before) <= TRUNCATION)
-            votes[asked] += is_surface.astype(np.int64) - (before > TRUNCATION)
+            votes[moved] += is_surface.astype(np.int64) - (before > TRUNCATION)
     return votes >= 0, _span(places, seen) >= AWAY
 
 
@@ -290,14 +290,14 @@ def _landing(view: _View, points: Float64, numbers: Index) -> tuple[Index, Index
 def _is_on_other_link(
     surface: RobotSurface, number: int, cells: Float64, seen: Bool, gap: Float64, poses: Float64, reach: float
 ) -> Bool:
-    found = np.zeros(len(cells), bool)
+    is_on_other = np.zeros(len(cells), bool)
     for other, link in enumerate(surface.links):
         places = _move(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
         if other != number and len(cells):
             is_still = _span(places, seen) < STEP
             at = places[seen.argmax(axis=0), np.arange(len(cells))]
-            found |= is_still & (surface.distance_to(link, at, within=reach) < gap)
-    return found
+            is_on_other |= is_still & (surface.distance_to(link, at, within=reach) < gap)
+    return is_on_other
 
 
 def _move(T: Float64, points: Float64) -> Float64:
@@ -351,11 +351,11 @@ def _is_in(box: Float64, points: Float64, reach: float) -> Bool:
 
 def _configurations(placed: Float64, step: float) -> Index:
     newest, num = np.full((8, 3), np.inf), 0
-    found = np.full(len(placed), -1)
+    numbers = np.full(len(placed), -1)
     for number, corners in enumerate(placed):
         gap = np.linalg.norm(corners - newest, axis=1).max()
         if num < 255 and gap >= step:
             newest, num = corners, num + 1
         if gap >= step or gap <= SAME * step:
-            found[number] = num - 1
-    return found
+            numbers[number] = num - 1
+    return numbers

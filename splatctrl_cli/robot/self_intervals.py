@@ -101,8 +101,8 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
     )
     left = own.is_robot(gap, slice(num), NUM_CONFIGURATIONS, FREE_SHARE) & ((before >= 0) | (after < num))
     first, last = np.where(before < 0, 0, first), np.where(after == num, num - 1, last)
-    found = [Interval(first=0, last=num - 1)]
-    while len(found) < MOST_INTERVALS and np.count_nonzero(left) >= LEAST_CELLS:
+    intervals = [Interval(first=0, last=num - 1)]
+    while len(intervals) < MOST_INTERVALS and np.count_nonzero(left) >= LEAST_CELLS:
         fits = np.zeros((num + 1, num + 1))
         for start, sign in ((before + 1, 1), (first + 1, -1)):
             np.add.at(fits, (start[left], last[left]), sign)
@@ -119,7 +119,7 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
         is_gone = min(side.max() for side in sides) >= GONE
         if is_gone and np.bincount(pieces[pieces > 0]).max(initial=0) >= LEAST_CELLS:
             free_before, free_after = int(before[its].max()), int(after[its].min())
-            found.append(
+            intervals.append(
                 Interval(
                     first=run[0],
                     last=run[1],
@@ -127,7 +127,7 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
                     end_ns=ALWAYS[1] if free_after == num else int(stamps[run[1]] + stamps[free_after]) // 2,
                 )
             )
-    return found
+    return intervals
 
 
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:

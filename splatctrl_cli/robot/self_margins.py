@@ -85,9 +85,9 @@ def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
     Exact between triangles, a lower bound for round shapes. An overlap is the deepest vertex's, at least
     LEAST_OVERLAP.
     """
-    here, there = coal.Transform3s(), coal.Transform3s(T_a_b[:3, :3], T_a_b[:3, 3])
+    T_a, T_b = coal.Transform3s(), coal.Transform3s(T_a_b[:3, :3], T_a_b[:3, 3])
     request, result = coal.DistanceRequest(), coal.DistanceResult()
-    gap = float(coal.distance(a.triangles, here, b.triangles, there, request, result)) - a.slack - b.slack
+    gap = float(coal.distance(a.triangles, T_a, b.triangles, T_b, request, result)) - a.slack - b.slack
     T_b_a = invert_transform(T_a_b)
     if gap > 0 and a.depth(transform_points(T_a_b, b.firsts)) == b.depth(transform_points(T_b_a, a.firsts)) == 0.0:
         return gap
@@ -125,9 +125,9 @@ class SelfSurfaces:
             dtype=np.int64,
         ).reshape(-1, 2)
         off = {*disabled, *joined_links(model, tuple(solids))}
-        found = [(a, b) for a, b in combinations(solids, 2) if frozenset((a, b)) not in off]
-        self.fused = self._never_apart(found, recorded)
-        self.pairs: tuple[LinkNames, ...] = tuple(pair for pair in found if pair not in self.fused)
+        candidates = [(a, b) for a, b in combinations(solids, 2) if frozenset((a, b)) not in off]
+        self.fused = self._never_apart(candidates, recorded)
+        self.pairs: tuple[LinkNames, ...] = tuple(pair for pair in candidates if pair not in self.fused)
         self.names = tuple(f"{a} and {b}" for a, b in (*self.pairs, *((links[a], links[b]) for a, b in self._bare)))
 
     def gaps(self, q: Float64, centers: Float64, enough: float) -> Float64:
@@ -145,13 +145,13 @@ class SelfSurfaces:
     def _bounds(self, pairs: Sequence[LinkNames], centers: Float64) -> Float64:
         """Gaps (T, K) [m] of rigid bodies' spheres, grown by the uncovered surface."""
         bodies = np.array([[self._body.get(self._leaders[link], -1) for link in pair] for pair in pairs])
-        found = np.full((len(centers), len(pairs)), -np.inf)
+        bounds = np.full((len(centers), len(pairs)), -np.inf)
         known = np.flatnonzero((bodies.reshape(-1, 2) >= 0).all(axis=1))
         for state, points in enumerate(centers[:, self._order] if len(known) else ()):
             gap = cdist(points, points) - self._reach[:, None] - self._reach
             least = np.minimum.reduceat(np.minimum.reduceat(gap, self._starts, axis=0), self._starts, axis=1)
-            found[state, known] = least[bodies[known, 0], bodies[known, 1]]
-        return found
+            bounds[state, known] = least[bodies[known, 0], bodies[known, 1]]
+        return bounds
 
     def number_of(self, pair: LinkNames) -> int | None:
         """Two links' index in `pairs`, in either order; None if absent."""
@@ -235,20 +235,20 @@ def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None
         return ()
     postures = random_postures(model, SELF_POSTURES, seed=0)
     centers = model.sphere_centers_batch(postures)
-    found = []
+    margins = []
     for links in dict.fromkeys(owners):
         gap = sphere_gaps(model, links, postures)
         if np.mean(gap < margin) > SELF_OFTEN:
             surface = None if surfaces is None else surfaces.gaps_of(links, postures, centers, margin)
             if surfaces is not None and surface is not None and surface.max() < margin / SELF_SHARE:
                 surface = surfaces.gaps_of(links, postures, centers)  # exact, for a share of the largest counts
-            found.append(_fit_margin(links, gap, margin, surface))
-    return tuple(pair for pair in found if pair.margin is None or pair.margin < margin)
+            margins.append(_fit_margin(links, gap, margin, surface))
+    return tuple(pair for pair in margins if pair.margin is None or pair.margin < margin)
 
 
-def apply_kept_margins(model: RobotModel, margin: float, kept: Sequence[KeptMargin]) -> RobotModel:
+def apply_kept_margins(model: RobotModel, margin: float, margins: Sequence[KeptMargin]) -> RobotModel:
     """Robot with self_allowance for these pairs, relative to `margin` [m]."""
-    less = {frozenset(pair.links): margin - pair.margin for pair in kept if pair.margin is not None}
+    less = {frozenset(pair.links): margin - pair.margin for pair in margins if pair.margin is not None}
     names = model.sphere_set.links
     allowance = [less.get(frozenset((names[a], names[b])), 0.0) for a, b in model.self_pairs()]
     return model.replace_self_allowance(np.array(allowance, dtype=np.float64))

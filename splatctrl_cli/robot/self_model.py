@@ -108,12 +108,12 @@ class SelfModel:
         }
 
     @classmethod
-    def from_arrays(cls, found: Mapping[str, Any]) -> Self:
+    def from_arrays(cls, arrays: Mapping[str, Any]) -> Self:
         """Read `arrays`. Raises KeyError, TypeError or ValueError for others."""
         names = [field.name for field in fields(LearnedLink)]
         rows = [
-            {name: found[f"{key}.{name}"] for name in names if f"{key}.{name}" in found or name not in BOUNDS}
-            for key in found["learned"]
+            {name: arrays[f"{key}.{name}"] for name in names if f"{key}.{name}" in arrays or name not in BOUNDS}
+            for key in arrays["learned"]
         ]
         learned = [LearnedLink(**{k: v if v.ndim else v.item() for k, v in row.items()}) for row in rows]
         for part in learned:
@@ -122,8 +122,8 @@ class SelfModel:
                 f"triangles of {part.link}: expected finite (F, 3, 3), got {part.triangles.shape}",
                 error=ValueError,
             )
-        links, unknown = tuple(map(str, found["links"])), {str(link): str(why) for link, why in found["unknown"]}
-        return cls(links=links, digest=str(found["digest"]), learned=tuple(learned), unknown=unknown)
+        links, unknown = tuple(map(str, arrays["links"])), {str(link): str(why) for link, why in arrays["unknown"]}
+        return cls(links=links, digest=str(arrays["digest"]), learned=tuple(learned), unknown=unknown)
 
     def check_robot(self, surface: RobotSurface, links: Sequence[str], path: Path) -> None:
         """Raise InputError if file `path` belongs to a robot of other links or visual surface."""

@@ -28,14 +28,14 @@ RENAMED = (
 
 def spheres_of(urdf: UrdfFile) -> SphereSet:
     """`own_spheres`. Raises InputError without any."""
-    found = own_spheres(urdf)
-    if not len(found.radii):
+    spheres = own_spheres(urdf)
+    if not len(spheres.radii):
         others = len(urdf.meshes) + len(urdf.other_shapes) + sum(shape.kind != "sphere" for shape in urdf.shapes)
         raise InputError(
             f"{urdf.path}: expected collision geometry of spheres only, got {others} other shapes",
             remedy="give a spheres YAML file, or fit one with: splatctrl robot spheres",
         )
-    return found
+    return spheres
 
 
 def own_spheres(urdf: UrdfFile) -> SphereSet:
@@ -72,20 +72,24 @@ def match_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSe
     `fr3_link1`. Raises InputError about `name` if nothing fits.
     """
     names = {link: link for link in urdf.links}
-    asked = spheres.links
+    file_links = spheres.links
     if are_links_renamed(spheres, urdf):
         names = {link.partition("_")[2] or link: link for link in urdf.links}
-        asked = tuple(link.partition("_")[2] or link for link in asked)
-    kept = [index for index, link in enumerate(asked) if link in names]
+        file_links = tuple(link.partition("_")[2] or link for link in file_links)
+    indices = [index for index, link in enumerate(file_links) if link in names]
     refuse_if(
-        asked and not kept,
+        file_links and not indices,
         f"{name}: none of its links is in {urdf.path}",
         remedy=f"links there: {', '.join(urdf.links)}",
     )
     matched = SphereSet(
-        links=tuple(names[asked[index]] for index in kept), centers=spheres.centers[kept], radii=spheres.radii[kept]
+        links=tuple(names[file_links[index]] for index in indices),
+        centers=spheres.centers[indices],
+        radii=spheres.radii[indices],
     )
-    return matched, tuple(sorted({spheres.links[index] for index, link in enumerate(asked) if link not in names}))
+    return matched, tuple(
+        sorted({spheres.links[index] for index, link in enumerate(file_links) if link not in names})
+    )
 
 
 def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:

@@ -170,10 +170,10 @@ class _Link:
             if cover is None:
                 low = t
                 continue
-            found = self.improve(cover)
-            high = min(t, found[1])
-            if found[1] < state[1]:
-                state = found
+            improved = self.improve(cover)
+            high = min(t, improved[1])
+            if improved[1] < state[1]:
+                state = improved
         return state
 
     def improve(self, chosen: Index) -> tuple[Float64, float]:
@@ -225,17 +225,17 @@ class _Link:
 
     def _lattice(self, patches: Float64) -> tuple[Float64, float]:
         lower, upper = self._vertices.min(axis=0), self._vertices.max(axis=0)
-        size, wanted = np.maximum(upper - lower, 1e-3), self._options.num_candidates
-        spacing = float(np.cbrt(np.prod(size) / wanted))
+        size, num_candidates = np.maximum(upper - lower, 1e-3), self._options.num_candidates
+        spacing = float(np.cbrt(np.prod(size) / num_candidates))
         for _ in range(3):  # the body fills only a part of its box
             counts = np.maximum(np.ceil(size / spacing).astype(int), 1)
             axes = [lower[k] + size[k] * (np.arange(counts[k]) + 0.5) / counts[k] for k in range(3)]
             points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
             inside = points[self._distance(points) < 0]
-            if len(inside) > wanted // 2:
+            if len(inside) > num_candidates // 2:
                 break
-            spacing *= float(np.cbrt(max(len(inside), 100) / wanted))
-        if len(inside) < wanted // 20:
+            spacing *= float(np.cbrt(max(len(inside), 100) / num_candidates))
+        if len(inside) < num_candidates // 20:
             inside = np.concatenate([inside, patches.mean(axis=1)])
         return inside, spacing
 

@@ -73,12 +73,12 @@ class RobotSurface:
         shapes = [shape for shape in seen.shapes if shape.link not in by_spheres]
         rows = zip(spheres.links, spheres.centers, spheres.radii, strict=True)
         balls = [_ball(link, center, radius) for link, center, radius in rows if link in by_spheres]
-        kept = [(link, corners) for link, corners in pieces if link not in by_spheres]
+        drawn = [(link, corners) for link, corners in pieces if link not in by_spheres]
         bodies = urdf.rigid_bodies()
         children = {child for _, child in urdf.parents}
         surface = cls.from_parts(
             [*shapes, *balls],
-            kept,
+            drawn,
             by_spheres=by_spheres,
             fixed=tuple(link for link in urdf.links if bodies[link][0] not in children),
         )
@@ -253,13 +253,13 @@ class RobotSurface:
         """
         numbers = [number for number, name in enumerate(self.links) if name == link]
         to_link = np.asarray(np.linalg.inv(T_world_link), np.float64)
-        found = [self.trees[number].gaps(to_link, centers, radii)[0] for number in numbers if number in self.trees]
+        gaps = [self.trees[number].gaps(to_link, centers, radii)[0] for number in numbers if number in self.trees]
         own = np.isin(self.solid_links, numbers)
         if own.any():
             solids = self._solids(np.linalg.inv(self.T_link_solid))[own]
             away = [solid_distance(transform_points(T, centers), solids) - radii for T in to_link]
-            found.append(np.array([gap.min(initial=np.inf) for gap in away]))
-        return np.asarray(np.min(found, axis=0))
+            gaps.append(np.array([gap.min(initial=np.inf) for gap in away]))
+        return np.asarray(np.min(gaps, axis=0))
 
     def _solids(self, T_solid: Floats) -> Float64:
         return np.column_stack([self.kinds, T_solid[:, :3, :3].reshape(-1, 9), T_solid[:, :3, 3], self.sizes])

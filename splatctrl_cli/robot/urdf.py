@@ -119,15 +119,15 @@ class UrdfFile:
         leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
         sliding = Counter(leader[joint.parent] for joint in movable if joint.kind == "prismatic")
         copied = {joint.mimic[0] for joint in movable if joint.mimic is not None}
-        found = {
+        names = {
             joint.name
             for joint in movable
             if joint.mimic is not None
             or joint.name in copied
             or (joint.kind == "prismatic" and sliding[leader[joint.parent]] > 1)
         }
-        carries_others = {name for joint in movable if joint.name not in found for name in self._before(joint)}
-        return tuple(joint.name for joint in movable if joint.name in found - carries_others)
+        carries_others = {name for joint in movable if joint.name not in names for name in self._before(joint)}
+        return tuple(joint.name for joint in movable if joint.name in names - carries_others)
 
     def fingers(self, moved: Collection[str]) -> tuple[str, ...]:
         """`grippers` that stand still while the `moved` joints move.
@@ -183,7 +183,7 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
         remedy="an unexpanded xacro looks like this; expand it first: xacro FILE.xacro > FILE.urdf",
     )
     _check_tree(path, links, joints)
-    found = [
+    shapes = [
         shape
         for link in root.findall("link")
         for collision in link.findall("collision")
@@ -199,9 +199,9 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
         text=text,
         links=links,
         joints=tuple(_joint(path, joint) for joint in joints),
-        shapes=tuple(shape for shape in found if isinstance(shape, Shape)),
-        meshes=tuple(shape for shape in found if isinstance(shape, MeshShape)),
-        other_shapes=tuple(shape for shape in found if isinstance(shape, tuple)),
+        shapes=tuple(shape for shape in shapes if isinstance(shape, Shape)),
+        meshes=tuple(shape for shape in shapes if isinstance(shape, MeshShape)),
+        other_shapes=tuple(shape for shape in shapes if isinstance(shape, tuple)),
         solid_links=solid,
     )
 
@@ -229,8 +229,8 @@ def _check_tree(path: Path, links: tuple[str, ...], joints: list[Any]) -> None:
     children = {joint.find("child").get("link") for joint in joints}
     roots = [link for link in links if link not in children]
     got = ", ".join(roots) or "none (the joints form a loop)"
-    said = f"{path}: expected one root link, got {got}"
-    refuse_if(len(roots) != 1, said, remedy="join the links with fixed joints")
+    what = f"{path}: expected one root link, got {got}"
+    refuse_if(len(roots) != 1, what, remedy="join the links with fixed joints")
 
 
 def _joint(path: Path, joint: Any) -> Joint:

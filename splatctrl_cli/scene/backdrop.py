@@ -36,17 +36,19 @@ def backdrop_seeds(frames: Sequence[RgbdFrame], opacities: Sequence[Float32], ba
     depths = 1 / np.linspace(1 / farthest, 1 / nearest, NUM_DEPTHS)
     for columns in COLUMNS:
         cells = [_Cells(frame, opacity, columns) for frame, opacity in zip(frames, opacities, strict=True)]
-        found = NO_SEEDS
+        seeds = NO_SEEDS
         for one in cells:
-            if len(found) <= most:
-                found = found.joined(_seeds_of(one, cells, found, np.array(background, np.float32), depths))
-        if len(found) <= most:
-            return found
-    return found.select(np.arange(most))
+            if len(seeds) <= most:
+                seeds = seeds.joined(_seeds_of(one, cells, seeds, np.array(background, np.float32), depths))
+        if len(seeds) <= most:
+            return seeds
+    return seeds.select(np.arange(most))
 
 
-def _seeds_of(one: "_Cells", cells: Sequence["_Cells"], found: Seeds, background: Float32, depths: Float64) -> Seeds:
-    is_missing = one.is_blank & ~one.find_covered(found)
+def _seeds_of(
+    one: "_Cells", cells: Sequence["_Cells"], earlier: Seeds, background: Float32, depths: Float64
+) -> Seeds:
+    is_missing = one.is_blank & ~one.find_covered(earlier)
     is_missing &= np.abs(one.color - background).mean(axis=2) > SAME_COLOR
     v, u, size, color = (np.concatenate(parts) for parts in zip(*one.missing_squares(is_missing), strict=True))
     if not len(v):
@@ -110,7 +112,7 @@ class _Cells:
 
     def find_covered(self, seeds: Seeds) -> Bool:
         h, w = self.depth.shape
-        found = np.zeros((h, w), bool)
+        is_covered = np.zeros((h, w), bool)
         u, v, z = self._locate(seeds.centers)
         half = seeds.radii * self.frame.intrinsics.fx / (2 * RADIUS * self.side) / np.maximum(z, 1e-6)
         reach = np.maximum(half, 0.5) + 0.01
@@ -118,8 +120,10 @@ class _Cells:
             rows, columns = (
                 slice(max(int(np.ceil(at[n] - reach[n])), 0), max(int(at[n] + reach[n]) + 1, 0)) for at in (v, u)
             )
-            found[rows, columns] |= np.abs(self.color[rows, columns] - seeds.colors[n]).mean(axis=2) < OTHER_COLOR
-        return found
+            is_covered[rows, columns] |= (
+                np.abs(self.color[rows, columns] - seeds.colors[n]).mean(axis=2) < OTHER_COLOR
+            )
+        return is_covered
 
     def compare(self, points: Float64, colors: Float32) -> tuple[Float64, Bool]:
         """Colour differences (K,) to points (K, 3), 1 before depth, and False behind it or out of view."""

@@ -147,15 +147,16 @@ def take_in_evidence(
     """
     config = occupancy.config
     proving = [
-        found.unproven(drop_pixels(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
+        contradicted.unproven(drop_pixels(*one, PixelKind.CONTRADICTED))
+        for one, contradicted in zip(seen, rays, strict=True)
     ]
     people.take_in(occupancy, proving)
     unanswered = each(
         lambda one: unanswered_points(one[0], one[1].robot_depth, config, last.get(one[0].camera)), seen
     )
-    for (frame, _), found in zip(seen, rays, strict=True):
+    for (frame, _), contradicted in zip(seen, rays, strict=True):
         for reason, is_blank in ((Unseen.CONTRADICTED, False), (Unseen.UNANSWERED, True)):
-            for points in found.points(frame, config, is_blank=is_blank):
+            for points in contradicted.points(frame, config, is_blank=is_blank):
                 occupancy.mark_unseen(points, reason)
     for points in chain.from_iterable(unanswered):
         occupancy.mark_unseen(points, Unseen.UNANSWERED)
@@ -167,8 +168,10 @@ def take_in_evidence(
         explain_unseen(occupancy, seen, robot, each)
 
 
-def mark_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
-    return replace(mask, kinds=np.where(found.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds))
+def mark_contradicted(mask: SelfMask, contradicted: Contradicted) -> SelfMask:
+    return replace(
+        mask, kinds=np.where(contradicted.pixels(mask.kinds.shape), np.uint8(PixelKind.CONTRADICTED), mask.kinds)
+    )
 
 
 def _least(image: NDArray[T], side: int) -> NDArray[T]:
@@ -241,12 +244,12 @@ class _BlockView:
         pixel, z = pixels_at(self.frame, surface.points)
         width = self.frame.intrinsics.width
         v, u = pixel // width // self.side, pixel % width // self.side
-        asked = np.flatnonzero((pixel >= 0) & (v < self.surely.shape[0]) & (u < self.surely.shape[1]))
-        v, u, z = v[asked], u[asked], z[asked]
+        inside = np.flatnonzero((pixel >= 0) & (v < self.surely.shape[0]) & (u < self.surely.shape[1]))
+        v, u, z = v[inside], u[inside], z[inside]
         is_behind = self.surely[v, u] > z + fixed.CONTRADICTED
         is_through = is_behind | (self.is_lost[v, u] & (z < self.frame.depth.max() + fixed.CONTRADICTED))
         until[v[is_through], u[is_through]] = z[is_through]
-        return asked[is_behind]
+        return inside[is_behind]
 
 
 def _side_by_side(depths: Float32, least: int) -> Float32:

@@ -115,13 +115,13 @@ def lost_edges(
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
-    found = dict[str, LostEdges]()
+    by_camera = dict[str, LostEdges]()
     for (frame, _), some in zip(seen, each(lambda one: _edges_of(one[0], one[1], config), seen), strict=True):
         edges = some.select(~points.seen_through(some.centers, cameras, surely, config.see_through))
         if robot is not None and len(edges.radii):
             edges = edges.select(~robot.is_within(edges.centers, config.see_through))
-        found[frame.camera] = edges
-    return found
+        by_camera[frame.camera] = edges
+    return by_camera
 
 
 def _edges_of(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> LostEdges:

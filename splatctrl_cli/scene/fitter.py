@@ -191,8 +191,8 @@ class SceneFitter:
         """Splats for pictures only: the shell beyond the workspace, or the backdrop; None without any."""
         if self.shell is not None:
             return self.shell.splats()
-        found = self.buffer.splats(self.num_threads, self._standing_for(BACKDROP))
-        return replace(found, labels=np.zeros_like(found.labels)) if len(found) else None
+        backdrop = self.buffer.splats(self.num_threads, self._standing_for(BACKDROP))
+        return replace(backdrop, labels=np.zeros_like(backdrop.labels)) if len(backdrop) else None
 
     @property
     def unrepresented(self) -> Balls:
@@ -205,10 +205,10 @@ class SceneFitter:
                 if len(depth)
                 else 0.0
             )
-            found = unrepresented_voxels(self.occupancy, self.splats(), self.config, error)
+            balls = unrepresented_voxels(self.occupancy, self.splats(), self.config, error)
             if self.posture is not None:
-                found = found.select(~self.posture.holds(found.centers, fixed.WELL_INSIDE))
-            self._unrepresented, self.bare = confirm_bare(found, self.bare), found
+                balls = balls.select(~self.posture.holds(balls.centers, fixed.WELL_INSIDE))
+            self._unrepresented, self.bare = confirm_bare(balls, self.bare), balls
         return self._unrepresented
 
     @unrepresented.setter
@@ -233,9 +233,9 @@ class SceneFitter:
         for camera in sorted({frame.camera for frame in frames} - set(self.mounted)):
             known = [view.frame for view in self.window.keyframes]
             seen = spread_views([frame for frame in [*known, *frames] if frame.camera == camera])
-            found = mounted_pixels(seen, self.occupancy.config.min_range)
-            if found is not None:
-                self.mounted[camera] = found
+            is_mounted = mounted_pixels(seen, self.occupancy.config.min_range)
+            if is_mounted is not None:
+                self.mounted[camera] = is_mounted
                 self.window.keyframes = [self.view(view.frame) for view in self.window.keyframes]
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
@@ -288,25 +288,27 @@ class SceneFitter:
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
         """Fill dead slots at M_add's pixels; the first full view sets the density."""
-        found: dict[Label, list[Seeds]] = {Label.OBJECT: [], Label.ROBOT: []}
+        by_label: dict[Label, list[Seeds]] = {Label.OBJECT: [], Label.ROBOT: []}
         shown = [self.descent.rendering(view) for view in views]
         added = list(self._each(lambda v, its: add_mask(v.frame, its, v.mappable, self.config), views, shown))
         every = thinning(added)
 
         def offered(index: int) -> list[Seeds]:
             view, others = views[index], spread(range(len(views)), fixed.SEED_ASKED_VIEWS)
-            asked = [views[(index + k) % len(views)] for k in others]
-            wanted = (thin_mask(added[index] & label_pixels(masks[index], label), every) for label in found)
-            sources = (candidates(view.frame, pixels, self.num_threads) for pixels in wanted)
+            observers = [views[(index + k) % len(views)] for k in others]
+            masks_by_label = (
+                thin_mask(added[index] & label_pixels(masks[index], label), every) for label in by_label
+            )
+            sources = (candidates(view.frame, pixels, self.num_threads) for pixels in masks_by_label)
             return [
-                source.select(self._is_grounded(source.centers, asked, label))
-                for label, source in zip(found, sources, strict=True)
+                source.select(self._is_grounded(source.centers, observers, label))
+                for label, source in zip(by_label, sources, strict=True)
             ]
 
         for offers in self._each(offered, range(len(views))):
-            for sources, source in zip(found.values(), offers, strict=True):
+            for sources, source in zip(by_label.values(), offers, strict=True):
                 sources.append(source)
-        everything = [source for sources in found.values() for source in sources]
+        everything = [source for sources in by_label.values() for source in sources]
         num_candidates = sum(len(source) for source in everything)
         if not num_candidates:
             return Filled()
@@ -315,7 +317,7 @@ class SceneFitter:
             self.density = density_for(everything, count, self.config, self.num_threads)
         reserve = int(self.config.gap_reserve * self.config.max_splats)
         filled = Filled()
-        for label, sources in found.items():
+        for label, sources in by_label.items():
             if not any(len(source) for source in sources):
                 continue
             live = self.buffer.centers[self._standing_for(label)]

@@ -113,19 +113,19 @@ def shrink_radii(
     places = np.array([view.frame.T_world_camera[:3, 3] for view in views], np.float32).reshape(-1, 3)
     towards = places - centers[:, None]
     towards /= np.linalg.norm(towards, axis=2, keepdims=True)
-    kept = np.array(radii, np.float32)
-    left = np.arange(len(kept))
+    shrunk = np.array(radii, np.float32)
+    left = np.arange(len(shrunk))
     while len(left):
-        edge = centers[left, None] + kept[left, None, None] * DIRECTIONS
+        edge = centers[left, None] + shrunk[left, None, None] * DIRECTIONS
         edge = np.ascontiguousarray(edge.reshape(-1, 3))
         floats = points.seen_through(edge, cameras, nearest, tolerance, num_threads).reshape(len(left), -1)
         is_out = floats.any(axis=1)
         for number, camera in enumerate(cameras):  # its own pixel shows what is before a centre
-            before = np.ascontiguousarray(centers[left] + kept[left, None] * towards[left, number])
+            before = np.ascontiguousarray(centers[left] + shrunk[left, None] * towards[left, number])
             is_out |= points.seen_through(before, [camera], [depths[number]], tolerance, num_threads)
-        left = left[is_out & (kept[left] > least)]
-        kept[left] = np.maximum(fixed.SHRINK * kept[left], np.float32(least))
-    return kept
+        left = left[is_out & (shrunk[left] > least)]
+        shrunk[left] = np.maximum(fixed.SHRINK * shrunk[left], np.float32(least))
+    return shrunk
 
 
 class Window:

@@ -31,9 +31,9 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
     deviation = np.median(np.abs(colors - np.median(colors, axis=0)), axis=0).max(axis=-1)
     has_depth = np.mean([frame.depth >= min_range for frame in frames], axis=0, dtype=np.float64)
     depth_share = uniform_filter(has_depth, fixed.MOUNTED_WINDOW)
-    found = (deviation < fixed.MOUNTED_DEVIATION) & (depth_share < fixed.MOUNTED_DEPTH)
-    found &= _texture(frames[0]) > fixed.MOUNTED_TEXTURE
-    entering = _entering(binary_opening(found, np.ones((5, 5), bool)))
+    is_mounted = (deviation < fixed.MOUNTED_DEVIATION) & (depth_share < fixed.MOUNTED_DEPTH)
+    is_mounted &= _texture(frames[0]) > fixed.MOUNTED_TEXTURE
+    entering = _entering(binary_opening(is_mounted, np.ones((5, 5), bool)))
     return np.asarray(binary_dilation(entering, np.ones(2 * (2 * fixed.MOUNTED_MARGIN + 1,), bool)))
 
 

@@ -220,10 +220,10 @@ class OccupancyMap:
     def swept_box(self) -> Box | None:
         """Box of the robot's path so far; None without any."""
         is_swept = self.entity & SWEPT > 0
-        found = [np.flatnonzero(is_swept.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
-        if not len(found[0]):
+        cells = [np.flatnonzero(is_swept.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+        if not len(cells[0]):
             return None
-        lower, upper = (np.array([indices[end] for indices in found]) for end in (0, -1))
+        lower, upper = (np.array([indices[end] for indices in cells]) for end in (0, -1))
         return Box(lower=self.origin + self.config.voxel * lower, upper=self.origin + self.config.voxel * upper)
 
     def centers_of(self, voxels: Index) -> Float32:

@@ -53,8 +53,8 @@ class RobotPosture:
 
     def is_within(self, points_world: Floats, reach: Floats | float, *, to_moving: bool = False) -> Bool:
         """Points (N, 3) at a signed `distance` of at most `reach` (N,) [m]: much faster."""
-        found = self.distance(points_world, to_moving=to_moving, within=np.maximum(reach, 0.0), enough=reach)
-        return np.asarray(found <= reach)
+        distance = self.distance(points_world, to_moving=to_moving, within=np.maximum(reach, 0.0), enough=reach)
+        return np.asarray(distance <= reach)
 
     def holds(self, points_world: Floats, depth: float) -> Bool:
         """Points (N, 3) at least `depth` [m] inside a fully drawn robot: no object is there."""
@@ -80,8 +80,8 @@ def posture_of(
         surface=surface,
         surfaces={stamp: its.add_boxes(carried) if carried else its for stamp, its in surfaces.items()},
         T_world_surface={
-            stamp_ns: surface.poses({link: robot.frame_pose(there, link) for link in surface.links})
-            for stamp_ns, there in at_frames.items()
+            stamp_ns: surface.poses({link: robot.frame_pose(q_frame, link) for link in surface.links})
+            for stamp_ns, q_frame in at_frames.items()
         },
     )
 

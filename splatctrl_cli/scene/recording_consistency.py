@@ -48,12 +48,12 @@ def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) 
     Views of one camera are paired, too. Depth counts from `min_range` to `max_range` [m].
     """
     chosen = spread(list(combinations(range(len(frames)), 2)), fixed.PAIR_MOST)
-    found: dict[tuple[str, str], list[Float64]] = {}
+    by_pair: dict[tuple[str, str], list[Float64]] = {}
     for i, j in chosen:
         a, b = sorted((frames[i], frames[j]), key=lambda frame: frame.camera)
         both = [differences(a, b, min_range, max_range), differences(b, a, min_range, max_range)]
-        found.setdefault((a.camera, b.camera), []).extend(both)
-    rows = {cameras: np.concatenate(parts) for cameras, parts in sorted(found.items())}
+        by_pair.setdefault((a.camera, b.camera), []).extend(both)
+    rows = {cameras: np.concatenate(parts) for cameras, parts in sorted(by_pair.items())}
     pairs = [_agreement(cameras, row) for cameras, row in rows.items() if len(row) >= fixed.PAIR_MIN_PIXELS]
     return [replace(pair, detour=_detour(pair.cameras, pairs)) for pair in pairs]
 

@@ -124,18 +124,18 @@ def find_redundant(
         return np.zeros(0, np.intp)
     reach = splats.radii[order] + tolerance
     of_splat = cKDTree(voxels).query_ball_point(splats.centers[order], reach, workers=num_threads)
-    asked = np.unique(np.concatenate([np.asarray(found, np.intp) for found in of_splat]))
+    candidates = np.unique(np.concatenate([np.asarray(near, np.intp) for near in of_splat]))
     count = np.zeros(len(voxels), np.int64)
     distance, nearest = cKDTree(splats.centers).query(
-        voxels[asked], k=np.arange(1, min(fixed.EVICT_NEAREST, len(splats)) + 1), workers=num_threads
+        voxels[candidates], k=np.arange(1, min(fixed.EVICT_NEAREST, len(splats)) + 1), workers=num_threads
     )
-    count[asked] = (distance - splats.radii[nearest] <= tolerance).sum(axis=1)
+    count[candidates] = (distance - splats.radii[nearest] <= tolerance).sum(axis=1)
     chosen: list[np.intp] = []
-    for splat, found in zip(order, of_splat, strict=True):
+    for splat, near in zip(order, of_splat, strict=True):
         if len(chosen) == num_wanted:
             break
-        if (count[found] > 1).all():
-            count[found] -= 1
+        if (count[near] > 1).all():
+            count[near] -= 1
             chosen.append(splat)
     return np.array(chosen, np.intp)
 
@@ -205,14 +205,14 @@ def use_idle(
     is_alive, reserve = buffer.is_alive, int(config.gap_reserve * config.max_splats)
     if config.when_idle == "leave" or not is_alive.any():
         return Filled(), 0
-    found, shown = ([], None) if config.when_idle == "clone" else misfits()
-    if shown is None or not any(error.any() for _, error in found):  # no depth shows where detail would be
+    misfit_views, shown = ([], None) if config.when_idle == "clone" else misfits()
+    if shown is None or not any(error.any() for _, error in misfit_views):  # no depth shows where detail would be
         return clone(buffer, int((~is_alive).sum()) - reserve, rng), 0
     weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
     is_weak = np.zeros(len(is_alive), bool)
     is_weak[weakest[: int(config.weak_share * is_alive.sum())]] = True
     num_weak = buffer.kill(is_weak)
-    seeds = detail_seeds(found, int((~is_alive).sum()) - reserve, config, rng)
+    seeds = detail_seeds(misfit_views, int((~is_alive).sum()) - reserve, config, rng)
     return buffer.fill(seeds, config.initial_opacity), num_weak
 
 
@@ -232,9 +232,9 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
     count = min(fixed.SEED_OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
     if count == 0:
         return NO_SEEDS
-    found = _pixels([frame for frame, _ in misfits], masks, draw_indices(weight, count, rng))
-    kept = _apart(found.centers, 2.0 * found.radii)[:num_seeds]
-    return replace(found.select(kept), radii=np.clip(found.radii[kept], config.min_radius, config.max_radius))
+    seeds = _pixels([frame for frame, _ in misfits], masks, draw_indices(weight, count, rng))
+    apart = _apart(seeds.centers, 2.0 * seeds.radii)[:num_seeds]
+    return replace(seeds.select(apart), radii=np.clip(seeds.radii[apart], config.min_radius, config.max_radius))
 
 
 def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> Index:
@@ -243,15 +243,15 @@ def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> Index
     As ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, but faster.
     """
     left = weight / weight.sum()
-    found = np.zeros(0, np.intp)
-    while len(found) < count:
-        left[found] = 0.0
+    indices = np.zeros(0, np.intp)
+    while len(indices) < count:
+        left[indices] = 0.0
         reached = np.cumsum(left)
         reached /= reached[-1]
-        more = reached.searchsorted(rng.random(count - len(found)), side="right")
+        more = reached.searchsorted(rng.random(count - len(indices)), side="right")
         _, first = np.unique(more, return_index=True)
-        found = np.concatenate([found, more[np.sort(first)]])
-    return found
+        indices = np.concatenate([indices, more[np.sort(first)]])
+    return indices
 
 
 def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: Index) -> Seeds:
@@ -270,9 +270,9 @@ def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: Index) -
 def _apart(points: Float32, distances: Float32) -> Index:
     is_taken = np.zeros(len(points), bool)
     neighbours = cKDTree(points).query_ball_point(points, distances)
-    kept = []
+    indices = []
     for index, near in enumerate(neighbours):
         if not is_taken[index]:
-            kept.append(index)
+            indices.append(index)
             is_taken[near] = True
-    return np.array(kept, np.intp)
+    return np.array(indices, np.intp)

@@ -79,8 +79,8 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
         linear = np.linalg.qr(np.stack([np.ones_like(u), u, v], axis=1))[0]
         residual = inverse - inverse @ linear @ linear.T
         left.append(np.sqrt(np.sum(residual**2, axis=1) / (side * side - 3)))
-    found = np.concatenate(left) if left else np.zeros(0)
-    return float(np.quantile(found, fixed.NOISE_QUANTILE)) if len(found) >= fixed.NOISE_FEWEST else 0.0
+    residuals = np.concatenate(left) if left else np.zeros(0)
+    return float(np.quantile(residuals, fixed.NOISE_QUANTILE)) if len(residuals) >= fixed.NOISE_FEWEST else 0.0
 
 
 def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:
@@ -125,7 +125,7 @@ def describe_scale(config: Config, depth: RecordedDepth) -> str:
 def scale_lengths(section: Lengths, scale: float) -> Lengths:
     """Multiply defaults by the power of `scale` that a length has in them."""
     powers, default = POWERS[section.section], type(section)()
-    kept = {key: getattr(section, key) for key in powers}
+    values = {key: getattr(section, key) for key in powers}
     return section.derived(
-        **{key: value * scale ** powers[key] for key, value in kept.items() if value == getattr(default, key)}
+        **{key: value * scale ** powers[key] for key, value in values.items() if value == getattr(default, key)}
     )

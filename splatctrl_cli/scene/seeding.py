@@ -76,9 +76,9 @@ def thin_mask(mask: Bool, every: int) -> Bool:
     """Keep the first of each `every` pixels of a mask (H, W), in row order."""
     if every == 1:
         return mask
-    kept = np.zeros(mask.size, bool)
-    kept[np.flatnonzero(mask)[::every]] = True
-    return kept.reshape(mask.shape)
+    thinned = np.zeros(mask.size, bool)
+    thinned[np.flatnonzero(mask)[::every]] = True
+    return thinned.reshape(mask.shape)
 
 
 def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Seeds:
@@ -190,9 +190,9 @@ def seeds_at(
     None is within 0.7 edges of a live splat (L, 3). The paper's radius is min(D/f, r_max), here
     min(max(radius_per_edge * edge, D/f), r_max).
     """
-    found = sources[0].joined(*sources[1:])
-    levels = cube_levels(found.centers, found.colors, density.edge, fixed.SEED_LEVELS, num_threads)
-    pixel, chosen = float(np.median(found.radii)), leaves(levels, density.tolerance)
+    cloud = sources[0].joined(*sources[1:])
+    levels = cube_levels(cloud.centers, cloud.colors, density.edge, fixed.SEED_LEVELS, num_threads)
+    pixel, chosen = float(np.median(cloud.radii)), leaves(levels, density.tolerance)
     parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)]
     return parts[-1].joined(*parts[-2::-1])
 
@@ -231,9 +231,9 @@ def gap_seeds(
         sources.append(_voxel_seeds(forgotten, splats))
     if not sources:
         return NO_SEEDS
-    found = sources[0].joined(*sources[1:])
-    level = cube_levels(found.centers, found.colors, config.max_radius / config.radius_per_edge, 1, num_threads)[0]
-    pixel, no_splats = float(np.median(found.radii)), np.zeros((0, 3), np.float32)
+    cloud = sources[0].joined(*sources[1:])
+    level = cube_levels(cloud.centers, cloud.colors, config.max_radius / config.radius_per_edge, 1, num_threads)[0]
+    pixel, no_splats = float(np.median(cloud.radii)), np.zeros((0, 3), np.float32)
     return _seeds_of(level, np.ones(len(level.points), bool), pixel, no_splats, config)
 
 

@@ -141,8 +141,8 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
         reach=float(np.median(tolerance_at(rendered[is_robot], config))),
         residuals=_group_by_link(offset[is_told], link[is_told], surface.links),
         num_inside={
-            name: len(found)
-            for name, found in _group_by_link(inside[is_inside], inside[is_inside], surface.links).items()
+            name: len(indices)
+            for name, indices in _group_by_link(inside[is_inside], inside[is_inside], surface.links).items()
         },
     )
 
@@ -182,8 +182,8 @@ def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Flo
     robot. Otherwise the unexplained `area` [m^2] decides: mixed below `MASK_SPECK`, doubted below `MASK_ALONE`.
     """
     is_object, shown = kinds == PixelKind.OBJECT, np.empty(depth.shape)
-    asked = is_object & beside
-    native.piece_areas(depth, steps, area, is_object.view(np.uint8), asked.view(np.uint8), shown)
+    doubtful = is_object & beside
+    native.piece_areas(depth, steps, area, is_object.view(np.uint8), doubtful.view(np.uint8), shown)
     kinds[shown < fixed.MASK_ALONE] = PixelKind.DOUBTED
     kinds[shown < fixed.MASK_SPECK] = PixelKind.MIXED
 
@@ -224,16 +224,16 @@ def outvote_objects(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64,
     Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
     object pixels become mixed.
     """
-    beside, found = [], [replace(mask, kinds=mask.kinds.copy()) for _, mask in seen]
+    beside, masks = [], [replace(mask, kinds=mask.kinds.copy()) for _, mask in seen]
     for frame, mask in seen:
         reach = pixels_of(voxel, frame, mask.robot_depth)
         beside.append(cv2.dilate((mask.kinds == PixelKind.ROBOT).view(np.uint8), _window(reach)))
     native.outvote(
         [camera_in_world(frame) for frame, _ in seen], [np.ascontiguousarray(frame.depth) for frame, _ in seen],
-        beside, [mask.kinds for mask in found], origin, voxel, fixed.VOTE_SHARE,
+        beside, [mask.kinds for mask in masks], origin, voxel, fixed.VOTE_SHARE,
         PixelKind.ROBOT, PixelKind.OBJECT, PixelKind.MIXED,
     )  # fmt: skip
-    return found
+    return masks
 
 
 def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float32]:
@@ -331,24 +331,24 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}
     seen = {link for link in links if pixels[link] >= fixed.MASK_PIXELS}
     judged = seen.difference(holding) or seen
-    found = {}
+    by_link = {}
     for link in links:
         of_link = [row.self_mask[link] for row in rows if link in row.self_mask]
         medians, counts = [r["median_mm"] for r in of_link], [r["num_pixels"] for r in of_link]
         order = np.argsort(medians)
         middle = np.searchsorted(np.cumsum(np.array(counts)[order]), 0.5 * sum(counts))
         median = float(medians[order[middle]])
-        found[link] = {
+        by_link[link] = {
             "median_mm": median,
             "sign": int(np.sign(median)),
             "num_pixels": int(pixels[link]),
             "reach_mm": float(np.median([r.get("reach_mm", 0.0) for r in of_link])),
             "is_judged": link in judged,
         }
-    enough = [row["median_mm"] for row in found.values() if row["is_judged"]]
+    enough = [row["median_mm"] for row in by_link.values() if row["is_judged"]]
     first = next(((row.stamp_ns, link) for row in rows for link in row.inside_robot), (None, None))
     return {
-        "self_mask": found,
+        "self_mask": by_link,
         "self_mask_residual_mm": max(map(abs, enough), default=None),
         "inside_robot_points": sum(sum(row.inside_robot.values()) for row in rows),
         "inside_robot_first_ns": first[0],
@@ -358,9 +358,9 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
 
 def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
     """Least depth (H, W) of chosen pixels within `reach` pixels, else inf."""
-    kept = np.full(depth.shape, np.inf, np.float32)
-    cv2.copyTo(depth, chosen.view(np.uint8), kept)
-    return least_within(kept, reach)
+    depths = np.full(depth.shape, np.inf, np.float32)
+    cv2.copyTo(depth, chosen.view(np.uint8), depths)
+    return least_within(depths, reach)
 
 
 def least_within(image: Float32, reach: int) -> Float32:

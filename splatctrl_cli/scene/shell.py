@@ -87,19 +87,21 @@ class Shell:
 
     def _add(self, shown: Masked) -> None:
         """Seed what the shell does not explain; restart coarser if too many are unmet."""
-        asked = [(view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown]
+        unexplained = [
+            (view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown
+        ]
         most = fixed.SHELL_UNMET * self.config.max_splats
-        if self._density is not None and self._fill(_sources(asked), self._density) <= most:
+        if self._density is not None and self._fill(_sources(unexplained), self._density) <= most:
             return
         stands = self.buffer.is_alive.copy()
-        held = Seeds(
+        own_seeds = Seeds(
             centers=self.buffer.centers[stands],
             radii=self.buffer.radii[stands],
             colors=self.buffer.parameters[stands, COLOR],
         )
         self.buffer.kill(stands)
         depth = float(np.median(np.concatenate([view.target.depth[mask] for view, mask in shown])))
-        sources, config = [*_sources(shown), held], scale_lengths(self.config, depth / fixed.SCALE_DEPTH)
+        sources, config = [*_sources(shown), own_seeds], scale_lengths(self.config, depth / fixed.SCALE_DEPTH)
         density = density_for(sources, max(int(config.fill * config.max_splats), 1), config, self._num_threads)
         self._begin(depth, density, self._descent.num_iterations)
         self._fill(sources, density)

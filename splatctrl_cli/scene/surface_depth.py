@@ -57,11 +57,11 @@ def surface_steps(
     residuals match the sensor (`depth_error` [m] at 1 m) and its variance is at most `MASK_UNSURE` of a pixel's.
     """
     steps = np.full(depth.shape, fixed.MASK_STEP, np.float32)
-    beyond, asked = is_object & ~is_edge, is_object & is_edge
+    beyond, at_edge = is_object & ~is_edge, is_object & is_edge
     residual = (fixed.MASK_SIGMAS * depth_error) ** 2
     for times in fixed.MASK_PLANES:
         native.surface_steps(
-            np.ascontiguousarray(depth), tolerance, beyond.view(np.uint8), asked.view(np.uint8), times * edge,
+            np.ascontiguousarray(depth), tolerance, beyond.view(np.uint8), at_edge.view(np.uint8), times * edge,
             fixed.MASK_UNSURE, residual, steps,
         )  # fmt: skip
     return steps

@@ -35,21 +35,21 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     )
 
 
-def confirm_bare(found: Balls, before: Balls | None) -> Balls:
+def confirm_bare(balls: Balls, before: Balls | None) -> Balls:
     """Balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
     before: of the last time step; None in the first, where all count.
     """
-    voxel = 2.0 * found.radius / 3**0.5
-    if before is None or not len(found):
-        return found
-    pairs = cKDTree(found.centers).query_pairs(1.01 * 3**0.5 * voxel, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(found), len(found)))
+    voxel = 2.0 * balls.radius / 3**0.5
+    if before is None or not len(balls):
+        return balls
+    pairs = cKDTree(balls.centers).query_pairs(1.01 * 3**0.5 * voxel, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(balls), len(balls)))
     group = connected_components(graph, directed=False)[1]
     is_kept = np.bincount(group)[group] >= fixed.BARE_GROUP
     if len(before):
-        is_kept |= cKDTree(before.centers).query(found.centers)[0] < 0.5 * voxel
-    return found.select(is_kept)
+        is_kept |= cKDTree(before.centers).query(balls.centers)[0] < 0.5 * voxel
+    return balls.select(is_kept)
 
 
 def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:
@@ -83,8 +83,8 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
     is_near = np.zeros(shape, bool)
     for step in itertools.product((-1, 0, 1), repeat=3):
         farthest = voxel * math.dist(step, [0.5 if s < 0 else -0.5 for s in step])
-        there = (step[0] * shape[1] + step[1]) * shape[2] + step[2]
-        is_near.reshape(-1)[home[radii >= farthest + 1e-6 - reach] + there] = True
+        offset = (step[0] * shape[1] + step[1]) * shape[2] + step[2]
+        is_near.reshape(-1)[home[radii >= farthest + 1e-6 - reach] + offset] = True
     return is_near
 
 

@@ -44,10 +44,10 @@ def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, s
         return Program(code, "c++", options).compile("cubin")
     if known is not None:
         return ObjectCode.from_cubin(known)
-    made = Program(code, "c++", options).compile("cubin")
+    cubin = Program(code, "c++", options).compile("cubin")
     with suppress(OSError):
-        store[key] = made
-    return made
+        store[key] = cubin
+    return cubin
 
 
 MANY = 20  # replays in a graph: a launch costs the host as much as a small map's iteration

@@ -75,8 +75,8 @@ def usable_card(index: int = 0) -> Card:
 
 def _driver_version() -> str:
     with suppress(OSError):
-        if found := re.search(r"\b\d{3,}\.\d+(\.\d+)?\b", VERSION_FILE.read_text()):
-            return found[0]
+        if match := re.search(r"\b\d{3,}\.\d+(\.\d+)?\b", VERSION_FILE.read_text()):
+            return match[0]
     return ""
 
 

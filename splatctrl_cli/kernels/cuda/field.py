@@ -106,8 +106,8 @@ class DeviceField:
     def query(self, points: Float64, anchor: Float64, wanted: Collection[str] = ("gradient",)) -> Answers:
         """`wanted` at points (Q, 3), Q > 0, in anchor's (3,) frame."""
         address = self._put("points", points)
-        asked: dict[str, Array | int] = {"points": address, "num_points": len(points), "anchor": anchor}
-        return self._answered("query", asked, (len(points),), len(points), wanted, 0.0)
+        arguments: dict[str, Array | int] = {"points": address, "num_points": len(points), "anchor": anchor}
+        return self._answered("query", arguments, (len(points),), len(points), wanted, 0.0)
 
     def _answered(
         self, what: str, asked: Mapping[str, Array | int], shape: tuple[int, ...], num_warps: int,

@@ -144,9 +144,9 @@ class DeviceFit:
 
     def keep(self, targets: Sequence[TargetView]) -> None:
         """Free other views' images; view numbers change."""
-        kept = {id(target) for target in targets}
-        gone = [view for view in self.views if id(view.target) not in kept]
-        self.views = [view for view in self.views if id(view.target) in kept]
+        ids = {id(target) for target in targets}
+        gone = [view for view in self.views if id(view.target) not in ids]
+        self.views = [view for view in self.views if id(view.target) in ids]
         for address in [int(address) for view in gone for address in view.row["images"]]:
             self.device.free(address)
             del self._images[address]
